@@ -1,0 +1,79 @@
+"""The settings: YAML and Python agree, and what cannot be is refused with what is allowed."""
+
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from torchrl_l2c2.experiment import ExperimentConfig, TaskConfig
+from torchrl_l2c2.experiment.config import GROUPS
+
+CONF = Path(__file__).parent.parent / "conf"
+
+
+def composed(*overrides):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
+
+
+def test_the_defaults_of_the_files_are_those_of_the_classes():
+    """A script without Hydra has the defaults of the command line."""
+    assert ExperimentConfig.from_dict(composed()) == ExperimentConfig()
+
+
+@pytest.mark.parametrize(
+    ("group", "name"),
+    [(g, p.stem) for g in GROUPS for p in sorted((CONF / g).glob("*.yaml"))],
+)
+def test_every_file_of_every_group_is_a_valid_choice(group, name):
+    """The file's values are the class's defaults, but for a variant's own."""
+    config = getattr(ExperimentConfig.from_dict(composed(f"{group}={name}")), group)
+    assert config.name == name
+    if name not in ("l2c2_policy",):
+        assert config == GROUPS[group][name](name=name)
+
+
+@pytest.mark.parametrize("task", ["swingup", "reacher", "hopper", "ant"])
+def test_the_papers_tasks_have_the_papers_noise(task):
+    """Scale .01 for Swingup and Reacher, .001 for Hopper and Ant."""
+    config = ExperimentConfig.from_dict(composed(f"task={task}")).task
+    assert config.noise_scale == {"swingup": 0.01, "reacher": 0.01}.get(task, 0.001)
+
+
+def test_every_key_of_every_file_has_a_comment():
+    """No setting without a word on what it is."""
+    bare = [
+        f"{path.relative_to(CONF)}: {line}"
+        for path in CONF.rglob("*.yaml")
+        for line in path.read_text().splitlines()
+        if line[:1].isalpha()
+        and not line.startswith(("name:", "defaults:", "hydra:"))
+        and "#" not in line
+    ]
+    assert bare == []
+
+
+def test_settings_survive_a_round_trip():
+    """What a run's folder holds can be read back."""
+    config = ExperimentConfig(task=TaskConfig(episodes=3), seed=7)
+    assert ExperimentConfig.from_dict(config.to_dict()) == config
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"task": {"episode": 3}}, "unknown setting task.episode; allowed here are task.env_id"),
+        ({"task": {"episodes": 0}}, "TaskConfig.episodes must be a whole number of at least 1"),
+        ({"task": {"noise_scale": -1.0}}, "noise_scale must be at least 0, got -1.0"),
+        ({"regularizer": {"name": "lipsnet"}}, "regularizer.name must be one of .*'l2c2'"),
+        ({"algorithm": {"name": "ppo_rpe", "schedule": "now"}}, "schedule must be one of"),
+        ({"replay": {"name": "uniform", "capacity": 8}}, "capacity must be at least the batch"),
+        ({"seed": -1}, "seed must be a whole number of at least 0, got -1"),
+        ({"sed": 1}, "unknown setting sed"),
+    ],
+)
+def test_wrong_settings_are_refused_with_what_is_allowed(settings, message):
+    """The error names the setting, what was given and what is allowed."""
+    with pytest.raises(ValueError, match=message):
+        ExperimentConfig.from_dict(settings)

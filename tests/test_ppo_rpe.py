@@ -1,0 +1,263 @@
+"""PPO-RPE against hand-computed numbers, its stationary point, and the rules of a TorchRL loss."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.modules import IndependentNormal, NormalParamExtractor, ProbabilisticActor
+
+from torchrl_l2c2 import PPORPELoss, TSoftUpdate, make_actor, make_critic
+
+
+class Heads(nn.Module):
+    """A critic whose two heads are known: V(s) = (s, 3 s), so the mean is 2 s."""
+
+    def __init__(self):
+        super().__init__()
+        self.weight = nn.Parameter(torch.tensor([1.0, 3.0]))
+
+    def forward(self, observation):
+        heads = observation * self.weight
+        return heads.mean(-1, keepdim=True), heads
+
+
+def make_loss(**settings):
+    network = nn.Sequential(nn.Linear(1, 2), NormalParamExtractor())
+    actor = ProbabilisticActor(
+        TensorDictModule(network, ["observation"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=IndependentNormal,
+        return_log_prob=True,
+    )
+    critic = TensorDictModule(Heads(), ["observation"], ["state_value", "state_value_heads"])
+    return PPORPELoss(actor, critic, **settings)
+
+
+def make_batch(loss, ratios, rewards, observations=None, next_observations=None, terminated=None):
+    """A batch on which the likelihood ratio of every transition is the given one."""
+    count = len(ratios)
+    observation = torch.tensor(observations or [0.5] * count).view(-1, 1)
+    batch = TensorDict(
+        {
+            "observation": observation,
+            "action": torch.linspace(-0.5, 0.5, count).view(-1, 1),
+            "next": {
+                "observation": torch.tensor(next_observations or [0.25] * count).view(-1, 1),
+                "reward": torch.tensor(rewards).view(-1, 1),
+                "terminated": torch.tensor(terminated or [False] * count).view(-1, 1),
+                "done": torch.tensor(terminated or [False] * count).view(-1, 1),
+            },
+        },
+        [count],
+    )
+    with torch.no_grad(), loss.actor_network_params.to_module(loss.actor_network):
+        log_prob = loss.actor_network.get_dist(batch.clone()).log_prob(batch["action"])
+    batch["action_log_prob"] = log_prob - torch.tensor(ratios).log()
+    return batch
+
+
+def test_both_losses_equal_hand_computed_numbers():
+    """One transition: y = .2 + .5 * .5 = .45, V = 1, A = -.55; rho = 2, so rho_R = 4/3."""
+    loss = make_loss(gamma=0.5, delta_min=0.1)
+    batch = make_batch(loss, [2.0], [0.2])
+    terms = loss(batch)
+    deviation = 1 / 3
+    threshold = 0.5 * deviation
+    gain = 0.55 / (threshold * (0.5 + 0.5 * threshold / 2))
+    expected = 0.55 * 2.0 + gain * 0.5 * 1.5 * deviation**2
+    assert terms["ratio_deviation"].item() == pytest.approx(deviation, rel=1e-5)
+    assert terms["ratio_threshold"].item() == pytest.approx(threshold, rel=1e-5)
+    assert terms["loss_actor"].item() == pytest.approx(expected, rel=1e-4)
+    squares = (0.45 - 0.5) ** 2 + (0.45 - 1.5) ** 2
+    assert terms["loss_critic"].item() == pytest.approx(0.5 * squares * 4 / 3, rel=1e-5)
+    assert batch["td_error"].tolist() == pytest.approx([0.55])
+
+
+def test_without_critic_weighting_the_value_loss_does_not_see_the_ratio():
+    """critic_weighting='none' leaves half the sum of squared errors of the heads."""
+    loss = make_loss(gamma=0.5, critic_weighting="none")
+    terms = loss(make_batch(loss, [2.0], [0.2]))
+    squares = (0.45 - 0.5) ** 2 + (0.45 - 1.5) ** 2
+    assert terms["loss_critic"].item() == pytest.approx(0.5 * squares, rel=1e-5)
+
+
+def test_termination_stops_the_bootstrap():
+    """y is the reward alone where the episode terminated."""
+    loss = make_loss(gamma=0.5)
+    batch = make_batch(loss, [1.0, 1.0], [0.2, 0.2], terminated=[False, True])
+    loss(batch)
+    assert batch["td_error"].tolist() == pytest.approx([abs(0.45 - 1.0), abs(0.2 - 1.0)])
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("beta", [0.3, 0.5, 0.7])
+def test_the_loss_is_stationary_where_the_relative_ratio_meets_the_threshold(sign, beta):
+    """d/d rho (-A rho + C g(rho)) = 0 at rho_R = 1 + sgn(A) * threshold, and not beside it."""
+    epsilon = 0.2
+    relative = 1 + sign * epsilon
+    ratio = (1 - beta) * relative / (1 - beta * relative)
+    reward = 0.75 + sign * 0.6
+
+    def gradient(rho):
+        loss = make_loss(gamma=0.5, kappa=0.4, beta=beta, delta_min=0.5)
+        terms = loss(make_batch(loss, [rho], [reward]))
+        assert terms["ratio_threshold"].item() == pytest.approx(epsilon)
+        terms["loss_actor"].backward()
+        return max(
+            p.grad.abs().max().item() for p in loss.actor_network_params.flatten_keys().values()
+        )
+
+    assert gradient(ratio) < 1e-5
+    assert gradient(ratio * 1.1) > 1e-3
+    assert gradient(ratio / 1.1) > 1e-3
+
+
+def test_the_threshold_decays_and_jumps_with_the_largest_deviation():
+    """Delta = max(delta_min, decay * Delta, max |rho_R - 1|), batch after batch."""
+    loss = make_loss(decay=0.9, delta_min=0.1, kappa=0.5)
+    far, near = make_batch(loss, [1.0, 3.0], [0.0, 0.0]), make_batch(loss, [1.0], [0.0])
+    seen = [loss(batch)["ratio_threshold"].item() for batch in (far, near, near)]
+    assert seen == pytest.approx([0.25, 0.225, 0.2025], rel=1e-5)
+    for _ in range(30):
+        last = loss(near)["ratio_threshold"].item()
+    assert last == pytest.approx(0.05)
+
+
+def test_the_ema_reading_averages_the_mean_deviation():
+    """threshold='ema': Delta <- decay * Delta + (1 - decay) * mean |rho_R - 1|."""
+    loss = make_loss(decay=0.5, delta_min=0.1, kappa=0.5, threshold="ema")
+    terms = loss(make_batch(loss, [1.0, 3.0], [0.0, 0.0]))
+    assert terms["ratio_threshold"].item() == pytest.approx(0.5 * (0.5 * 0.1 + 0.5 * 0.25))
+
+
+def test_priority_weights_weigh_both_losses():
+    """A batch with weights (1, 0) has the losses of its first transition alone."""
+    first = make_loss()
+    settings = {"ratios": [1.5, 0.7], "rewards": [0.3, -2.0]}
+    batch = make_batch(first, **settings)
+    batch["priority_weight"] = torch.tensor([1.0, 0.0])
+    weighted = first(batch)
+    none = make_loss(reduction="none")
+    none.load_state_dict({**first.state_dict(), "delta": torch.tensor(0.1)})
+    each = none(make_batch(none, **settings))
+    assert weighted["loss_actor"].item() == pytest.approx(each["loss_actor"][0].item(), rel=1e-5)
+    assert weighted["loss_critic"].item() == pytest.approx(each["loss_critic"][0].item(), rel=1e-5)
+
+
+def test_the_target_baseline_takes_the_ratio_to_the_target_policy():
+    """baseline='target' needs no stored likelihood; target and policy start equal: ratio 1."""
+    loss = make_loss(baseline="target")
+    batch = make_batch(loss, [5.0], [0.0])
+    del batch["action_log_prob"]
+    assert "action_log_prob" not in loss.in_keys
+    assert loss(batch)["ratio_deviation"].item() == pytest.approx(0.0, abs=1e-6)
+
+
+def test_extreme_ratios_stay_finite():
+    """Stored likelihoods hundreds of nats away give finite losses and gradients."""
+    loss = make_loss()
+    batch = make_batch(loss, [1.0, 1.0], [0.5, -0.5])
+    batch["action_log_prob"] += torch.tensor([400.0, -400.0])
+    terms = loss(batch)
+    (terms["loss_actor"] + terms["loss_critic"]).backward()
+    assert all(p.grad.isfinite().all() for p in loss.parameters())
+
+
+def test_gradients_reach_only_the_network_of_each_term_and_never_the_targets():
+    """The actor's loss trains the actor, the critic's the critic."""
+    loss = make_loss()
+    for term, trained in (("loss_actor", "actor"), ("loss_critic", "critic")):
+        loss.zero_grad()
+        loss(make_batch(loss, [1.4, 0.6], [0.3, -0.7]))[term].backward()
+        for name, parameter in loss.named_parameters():
+            moved = parameter.grad is not None and bool(parameter.grad.abs().sum() > 0)
+            assert moved == name.startswith(trained), name
+    assert not any(name.startswith("target") for name, _ in loss.named_parameters())
+
+
+def test_the_threshold_survives_a_checkpoint():
+    """Delta is in the state_dict."""
+    loss, other = make_loss(), make_loss()
+    loss(make_batch(loss, [3.0], [0.0]))
+    other.load_state_dict(loss.state_dict())
+    assert other.delta.item() == loss.delta.item() == pytest.approx(0.5)
+
+
+def test_compiled_without_a_break_it_gives_the_same_losses():
+    """One graph, the same numbers, with the paper's networks and tanh-squashed actions."""
+    torch.manual_seed(0)
+    loss = PPORPELoss(make_actor(3, 2), make_critic(3))
+    TSoftUpdate(loss)
+    batch = TensorDict(
+        {
+            "observation": torch.randn(8, 3),
+            "action": torch.rand(8, 2) * 1.8 - 0.9,
+            "action_log_prob": torch.randn(8) * 0.1 - 1.0,
+            "priority_weight": torch.rand(8) + 0.1,
+            "next": {
+                "observation": torch.randn(8, 3),
+                "reward": torch.randn(8, 1),
+                "terminated": torch.rand(8, 1) > 0.7,
+                "done": torch.rand(8, 1) > 0.7,
+            },
+        },
+        [8],
+    )
+    delta = loss.delta.clone()
+    eager = loss(batch.clone())
+    loss.delta.copy_(delta)
+    compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")(batch.clone())
+    for key in loss.out_keys:
+        torch.testing.assert_close(compiled[key], eager[key])
+
+
+def test_dispatch_takes_keyword_arguments():
+    """The loss can be called without a TensorDict, as any TorchRL loss."""
+    loss = make_loss()
+    batch = make_batch(loss, [1.2, 0.9], [0.1, 0.2])
+    keywords = {
+        "_".join(key) if isinstance(key, tuple) else key: batch[key] for key in loss.in_keys
+    }
+    outputs = loss(**keywords)
+    assert outputs[0].item() == pytest.approx(make_loss_terms(loss, batch), rel=1e-5)
+
+
+def make_loss_terms(loss, batch):
+    return loss(batch)["loss_actor"].item()
+
+
+def test_renamed_keys_are_read():
+    """set_keys moves every key, the value estimator's among them."""
+    loss = make_loss()
+    batch = make_batch(loss, [1.2], [0.3])
+    expected = loss(batch.clone())["loss_critic"].item()
+    loss.set_keys(reward="payoff", action="move", sample_log_prob="likelihood")
+    renamed = batch.rename_key_("action", "move").rename_key_("action_log_prob", "likelihood")
+    renamed["next"].rename_key_("reward", "payoff")
+    assert loss(renamed)["loss_critic"].item() == pytest.approx(expected, rel=1e-5)
+    assert "move" in loss.in_keys and ("next", "payoff") in loss.in_keys
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("gamma", 1.0),
+        ("gamma", math.nan),
+        ("kappa", 0.0),
+        ("kappa", 2.5),
+        ("beta", 1.0),
+        ("decay", 1.5),
+        ("delta_min", 0.0),
+        ("threshold", "median"),
+        ("critic_weighting", "advantage"),
+        ("baseline", "old"),
+        ("reduction", "max"),
+    ],
+)
+def test_wrong_settings_are_refused_with_what_is_allowed(setting, value):
+    """The error names the setting, what was given and what is allowed."""
+    with pytest.raises(ValueError, match=rf"{setting} must be .*, got"):
+        make_loss(**{setting: value})

@@ -1,0 +1,36 @@
+"""The paper's experiment, built from the components: needs the ``experiment`` extra."""
+
+from torchrl_l2c2.experiment.config import (
+    AdamConfig,
+    AdaTermConfig,
+    CAPSConfig,
+    ExperimentConfig,
+    L2C2Config,
+    LoggerConfig,
+    NoRegularizerConfig,
+    PPORPEConfig,
+    PrioritizedReplayConfig,
+    TaskConfig,
+    UniformReplayConfig,
+)
+from torchrl_l2c2.experiment.environments import make_env
+from torchrl_l2c2.experiment.evaluate import Evaluation, evaluate_policy
+from torchrl_l2c2.experiment.training import Experiment
+
+__all__ = [
+    "AdaTermConfig",
+    "AdamConfig",
+    "CAPSConfig",
+    "Evaluation",
+    "Experiment",
+    "ExperimentConfig",
+    "L2C2Config",
+    "LoggerConfig",
+    "NoRegularizerConfig",
+    "PPORPEConfig",
+    "PrioritizedReplayConfig",
+    "TaskConfig",
+    "UniformReplayConfig",
+    "evaluate_policy",
+    "make_env",
+]

@@ -1,0 +1,204 @@
+"""Collecting at nearly the speed of the simulator: TorchRL's collector with a plain inner loop."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+from torchrl.collectors import Collector
+from torchrl.envs import (
+    Compose,
+    EnvBase,
+    ExplorationType,
+    GymEnv,
+    Transform,
+    TransformedEnv,
+    set_exploration_type,
+)
+
+from torchrl_l2c2.experiment.compilation import compiled
+from torchrl_l2c2.transforms import ObservationNoise
+
+
+class EpisodeCollector(Collector):
+    """A TorchRL :class:`~torchrl.collectors.Collector` for one Gymnasium simulator on the CPU.
+
+    It gives the batches that the collector gives, to the bit, but for the ``collector`` entry.
+    What it leaves out is the work around every step: specs, nested TensorDicts and their copies.
+    An episode's entries are kept in lists and stacked once.
+
+    Args:
+        env (EnvBase): a ``GymEnv``, or one transformed by :class:`ObservationNoise` alone, with
+            one tensor of observations under ``"observation"``.
+        policy (TensorDictModule): reads ``"observation"``.
+
+    Keyword Args:
+        frames_per_batch (int): frames of a batch.
+        stop_at_done (bool): whether a batch ends with the episode, even if it is shorter.
+            Learning at the end of every episode needs this. Default ``True``.
+        compile_policy (bool): whether to compile the policy. Random numbers are drawn as without.
+            Default ``False``.
+        exploration_type (ExplorationType): default ``RANDOM``.
+
+    Raises:
+        TypeError: an environment of another kind.
+
+    Examples:
+        >>> from torchrl.envs import GymEnv
+        >>> from torchrl_l2c2 import make_actor
+        >>> env = GymEnv("Pendulum-v1", max_episode_steps=7)
+        >>> actor = make_actor(3, env.action_spec)
+        >>> collector = EpisodeCollector(env, actor, frames_per_batch=100)
+        >>> [next(iter(collector)).shape for _ in range(2)]
+        [torch.Size([7]), torch.Size([7])]
+        >>> collector.shutdown()
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        policy: TensorDictModule,
+        *,
+        frames_per_batch: int,
+        stop_at_done: bool = True,
+        compile_policy: bool = False,
+        exploration_type: ExplorationType = ExplorationType.RANDOM,
+    ) -> None:
+        self._simulator, self._noise = _parts(env)
+        self._gymnasium = self._simulator._env
+        self._dtype = self._simulator.observation_spec["observation"].dtype
+        super().__init__(
+            env,
+            policy,
+            frames_per_batch=frames_per_batch,
+            total_frames=-1,
+            track_traj_ids=False,
+            exploration_type=exploration_type,
+        )
+        self.stop_at_done = stop_at_done
+        # The collector has reset the environment when it was made.
+        self._observation: Tensor | None = self._carrier.get("observation")
+        self._policy_keys = [key for key in policy.out_keys if not key.startswith("_")]
+        self._act = _on_tensors(policy, self._policy_keys, compile_policy)
+        continuous = self._simulator.action_spec.dtype.is_floating_point
+        self._to_action = Tensor.numpy if continuous else self._simulator.read_action
+
+    @torch.no_grad()
+    def rollout(self) -> TensorDictBase:
+        """Plays up to ``frames_per_batch`` frames; what iterating over the collector calls."""
+        action_index = self._policy_keys.index("action")
+        observation = self._observation
+        steps = []
+        with set_exploration_type(self.exploration_type):
+            for _ in range(self.frames_per_batch):
+                # Late, so that between episodes nothing of the next one has happened yet: the
+                # generators' states are then all there is to save.
+                if observation is None:
+                    observation = self._observe(self._gymnasium.reset()[0])
+                outputs = self._act(observation)
+                action = self._to_action(outputs[action_index])
+                seen, reward, terminated, truncated, _ = self._gymnasium.step(action)
+                following = self._observe(seen)
+                steps.append((observation, following, reward, terminated, truncated, outputs))
+                observation = following
+                if terminated or truncated:
+                    observation = None
+                    if self.stop_at_done:
+                        break
+        self._observation = observation
+        return self._stack(steps)
+
+    def generator_state(self) -> dict[str, Any]:
+        """The states of the simulator's and the noise's random generators, between episodes.
+
+        Raises:
+            RuntimeError: in the middle of an episode, whose simulator's state cannot be saved.
+        """
+        if self._observation is not None:
+            raise RuntimeError("an episode is being played; a run can be saved between episodes.")
+        simulator = self._gymnasium.unwrapped.np_random.bit_generator.state
+        noise = None if self._noise is None else self._noise.generator.get_state()
+        return {"simulator": json.dumps(simulator), "noise": noise}
+
+    def set_generator_state(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`generator_state` gave; the next episode starts with a reset."""
+        simulator = json.loads(state["simulator"])
+        self._gymnasium.unwrapped.np_random.bit_generator.state = simulator
+        if self._noise is not None:
+            self._noise.generator.set_state(state["noise"])
+        self._observation = None
+
+    def _observe(self, seen: np.ndarray) -> Tensor:
+        observation = torch.as_tensor(seen, dtype=self._dtype)
+        return observation if self._noise is None else self._noise._apply_transform(observation)
+
+    def _stack(self, steps: list[tuple[Any, ...]]) -> TensorDictBase:
+        observations, following, rewards, terminated, truncated, outputs = zip(*steps, strict=True)
+        ends = [torch.tensor(flags).unsqueeze(-1) for flags in (terminated, truncated)]
+        written = [torch.stack(values) for values in zip(*outputs, strict=True)]
+        false = torch.zeros_like(ends[0])
+        return TensorDict(
+            {
+                "observation": torch.stack(observations),
+                "done": false,
+                "terminated": false.clone(),
+                "truncated": false.clone(),
+                **dict(zip(self._policy_keys, written, strict=True)),
+                "next": {
+                    "observation": torch.stack(following),
+                    "reward": torch.tensor(rewards, dtype=torch.float32).unsqueeze(-1),
+                    "done": ends[0] | ends[1],
+                    "terminated": ends[0],
+                    "truncated": ends[1],
+                },
+            },
+            [len(steps)],
+        )
+
+
+def _parts(env: EnvBase) -> tuple[GymEnv, ObservationNoise | None]:
+    """The simulator and its noise."""
+    transforms: list = []
+    simulator = env
+    if isinstance(env, TransformedEnv):
+        transforms, simulator = list(_flat(env.transform)), env.base_env
+    if not isinstance(simulator, GymEnv) or simulator.batch_size:
+        raise TypeError(
+            f"EpisodeCollector takes one GymEnv, got {type(simulator).__name__} of batch size "
+            f"{tuple(simulator.batch_size)}; use torchrl.collectors.Collector for any other."
+        )
+    if len(transforms) > 1 or not all(isinstance(t, ObservationNoise) for t in transforms):
+        names = [type(t).__name__ for t in transforms]
+        raise TypeError(
+            f"EpisodeCollector takes no transform but one ObservationNoise, got {names}; use "
+            "torchrl.collectors.Collector for any other."
+        )
+    return simulator, transforms[0] if transforms else None
+
+
+def _flat(transform: Transform) -> Iterator[Transform]:
+    if isinstance(transform, Compose):
+        for inner in transform:
+            yield from _flat(inner)
+    else:
+        yield transform
+
+
+def _on_tensors(
+    policy: TensorDictModule, keys: list[str], compile_policy: bool
+) -> Callable[[Tensor], tuple[Tensor, ...]]:
+    """The policy as a function from an observation to the tensors it writes."""
+
+    def act(observation: Tensor) -> tuple[Tensor, ...]:
+        written = policy(TensorDict({"observation": observation}))
+        return tuple(written.get(key) for key in keys)
+
+    if not compile_policy:
+        return act
+    return compiled(act)

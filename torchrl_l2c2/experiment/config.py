@@ -1,0 +1,281 @@
+"""The experiment's settings: one frozen dataclass per group of ``conf/``, checked when made.
+
+The YAML files of ``conf/`` choose values; these classes name and check them, so that a script or
+a notebook has the same defaults without Hydra: ``ExperimentConfig()`` is ``python train.py``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+BULLET = "pybullet_envs_gymnasium"
+
+
+@dataclass(frozen=True)
+class TaskConfig:
+    """What is learned: a Gymnasium task with noisy observations. Comments: ``conf/task/``."""
+
+    name: str = "swingup"
+    env_id: str = f"{BULLET}:InvertedPendulumSwingupBulletEnv-v0"
+    noise_scale: float = 0.01
+    episodes: int = 200
+    max_steps: int = 1000
+    solved_at: float | None = 800.0
+
+    def __post_init__(self) -> None:
+        _nonnegative(self, "noise_scale")
+        _whole(self, "episodes", "max_steps")
+
+
+@dataclass(frozen=True)
+class PPORPEConfig:
+    """PPO-RPE, its networks and its updates. Comments: ``conf/algorithm/ppo_rpe.yaml``."""
+
+    name: str = "ppo_rpe"
+    gamma: float = 0.99
+    kappa: float = 0.5
+    beta: float = 0.5
+    decay: float = 0.999
+    delta_min: float = 0.1
+    threshold: str = "max"
+    critic_weighting: str = "ratio"
+    baseline: str = "stored"
+    acting_policy: str = "target"
+    reward_scale: float | None = None
+    squash: str = "tanh"
+    hidden: tuple[int, ...] = (100, 100)
+    num_heads: int = 5
+    squish_b: float = 4.0
+    schedule: str = "episode"
+    updates: int | None = None
+    tau: float = 0.1
+    nu: float = 1.0
+
+    def __post_init__(self) -> None:
+        _choice(self, "acting_policy", "target", "online")
+        _choice(self, "schedule", "episode", "step")
+        _choice(self, "squash", "tanh", "none")
+        _whole(self, "num_heads")
+        if self.updates is not None:
+            _whole(self, "updates")
+
+
+@dataclass(frozen=True)
+class NoRegularizerConfig:
+    """The loss as it is: the paper's vanilla."""
+
+    name: str = "none"
+
+
+@dataclass(frozen=True)
+class CAPSConfig:
+    """The baseline. Comments: ``conf/regularizer/caps.yaml``."""
+
+    name: str = "caps"
+    sigma: float = 0.2
+    lambda_temporal: float = 0.01
+    lambda_spatial: float = 0.05
+
+
+@dataclass(frozen=True)
+class L2C2Config:
+    """The paper's method. Comments: ``conf/regularizer/l2c2.yaml``."""
+
+    name: str = "l2c2"
+    sigma: float = 1.0
+    lambda_min: float = 0.01
+    lambda_max: float = 1.0
+    beta: float = 0.1
+    num_samples: int = 1
+
+
+@dataclass(frozen=True)
+class PrioritizedReplayConfig:
+    """Prioritized experience replay. Comments: ``conf/replay/prioritized.yaml``."""
+
+    name: str = "prioritized"
+    capacity: int = 10_000
+    batch_size: int = 32
+    alpha: float = 1.0
+    beta: float = 0.5
+
+    def __post_init__(self) -> None:
+        _whole(self, "capacity", "batch_size")
+        _nonnegative(self, "alpha", "beta")
+        _fits(self)
+
+
+@dataclass(frozen=True)
+class UniformReplayConfig:
+    """Uniform experience replay. Comments: ``conf/replay/uniform.yaml``."""
+
+    name: str = "uniform"
+    capacity: int = 10_000
+    batch_size: int = 32
+
+    def __post_init__(self) -> None:
+        _whole(self, "capacity", "batch_size")
+        _fits(self)
+
+
+@dataclass(frozen=True)
+class AdaTermConfig:
+    """The paper's optimizer. Comments: ``conf/optimizer/adaterm.yaml``."""
+
+    name: str = "adaterm"
+    lr: float = 1e-3
+    beta: float = 0.9
+    eps: float = 1e-5
+    nu_min: float = 1.0
+
+
+@dataclass(frozen=True)
+class AdamConfig:
+    """Adam. Comments: ``conf/optimizer/adam.yaml``."""
+
+    name: str = "adam"
+    lr: float = 3e-4
+    betas: tuple[float, float] = (0.9, 0.999)
+    eps: float = 1e-8
+
+
+@dataclass(frozen=True)
+class LoggerConfig:
+    """Where metrics go. Comments: ``conf/logger/``."""
+
+    name: str = "csv"
+
+
+AlgorithmConfig = PPORPEConfig
+RegularizerConfig = NoRegularizerConfig | CAPSConfig | L2C2Config
+ReplayConfig = PrioritizedReplayConfig | UniformReplayConfig
+OptimizerConfig = AdaTermConfig | AdamConfig
+
+# group -> name -> its class; what a group's `name` may be.
+GROUPS: dict[str, dict[str, type]] = {
+    "algorithm": {"ppo_rpe": PPORPEConfig},
+    "regularizer": {
+        "none": NoRegularizerConfig,
+        "caps": CAPSConfig,
+        "l2c2": L2C2Config,
+        "l2c2_policy": L2C2Config,
+    },
+    "replay": {"prioritized": PrioritizedReplayConfig, "uniform": UniformReplayConfig},
+    "optimizer": {"adaterm": AdaTermConfig, "adam": AdamConfig},
+    "logger": {"csv": LoggerConfig, "tensorboard": LoggerConfig},
+}
+
+
+@dataclass(frozen=True)
+class ExperimentConfig:
+    """Everything one run depends on; the defaults are those of ``python train.py``.
+
+    Raises:
+        ValueError: a setting that is not known or lies outside its range.
+
+    Examples:
+        >>> config = ExperimentConfig(task=TaskConfig(episodes=5), regularizer=CAPSConfig())
+        >>> config.task.episodes, config.regularizer.name, config.replay.batch_size
+        (5, 'caps', 32)
+    """
+
+    task: TaskConfig = field(default_factory=TaskConfig)
+    algorithm: AlgorithmConfig = field(default_factory=PPORPEConfig)
+    regularizer: RegularizerConfig = field(default_factory=L2C2Config)
+    replay: ReplayConfig = field(default_factory=PrioritizedReplayConfig)
+    optimizer: OptimizerConfig = field(default_factory=AdaTermConfig)
+    logger: LoggerConfig = field(default_factory=LoggerConfig)
+    seed: int = 0
+    threads: int = 1
+    compile: bool = True
+    on_nonfinite: str = "stop"
+    test_episodes: int = 100
+    checkpoint_interval: float = 60.0
+    checkpoint_keep: int = 2
+
+    def __post_init__(self) -> None:
+        _whole(self, "threads", "test_episodes", "checkpoint_keep")
+        _nonnegative(self, "checkpoint_interval")
+        _choice(self, "on_nonfinite", "stop", "skip")
+        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
+            raise ValueError(f"seed must be a whole number of at least 0, got {self.seed!r}.")
+
+    @classmethod
+    def from_dict(cls, settings: Mapping[str, Any]) -> ExperimentConfig:
+        """Reads nested mappings, such as a resolved Hydra configuration.
+
+        Args:
+            settings (Mapping): the groups and keys of ``conf/``; ``outputs``, ``resume``
+                and ``experiment``, which steer where and how often runs happen, are passed over.
+
+        Raises:
+            ValueError: an unknown key, an unknown name, or a value outside its range.
+        """
+        values = {k: v for k, v in settings.items() if k not in ("outputs", "experiment", "resume")}
+        for group, names in GROUPS.items():
+            if group in values:
+                values[group] = _read_group(group, names, values[group])
+        if "task" in values:
+            values["task"] = _construct(TaskConfig, values["task"], "task.")
+        return _construct(cls, values, "")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Nested dictionaries of plain values: ``from_dict`` reads them back."""
+        return dataclasses.asdict(self)
+
+
+def _read_group(group: str, names: Mapping[str, type], values: Mapping[str, Any]) -> Any:
+    name = values.get("name")
+    if name not in names:
+        raise ValueError(f"{group}.name must be one of {sorted(names)}, got {name!r}.")
+    return _construct(names[name], values, f"{group}.")
+
+
+def _construct(cls: type, values: Mapping[str, Any], prefix: str) -> Any:
+    allowed = {f.name for f in dataclasses.fields(cls)}
+    unknown = sorted(set(values) - allowed)
+    if unknown:
+        raise ValueError(
+            f"unknown setting {prefix}{unknown[0]}; allowed here are "
+            f"{', '.join(prefix + name for name in sorted(allowed))}."
+        )
+    return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+
+
+def _where(config: object, name: str) -> str:
+    return f"{type(config).__name__}.{name}"
+
+
+def _nonnegative(config: object, *names: str) -> None:
+    for name in names:
+        value = getattr(config, name)
+        if not (math.isfinite(value) and value >= 0):
+            raise ValueError(f"{_where(config, name)} must be at least 0, got {value!r}.")
+
+
+def _whole(config: object, *names: str) -> None:
+    for name in names:
+        value = getattr(config, name)
+        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+            raise ValueError(
+                f"{_where(config, name)} must be a whole number of at least 1, got {value!r}."
+            )
+
+
+def _choice(config: object, name: str, *allowed: str) -> None:
+    if getattr(config, name) not in allowed:
+        raise ValueError(
+            f"{_where(config, name)} must be one of {allowed}, got {getattr(config, name)!r}."
+        )
+
+
+def _fits(config: PrioritizedReplayConfig | UniformReplayConfig) -> None:
+    if config.capacity < config.batch_size:
+        raise ValueError(
+            f"{_where(config, 'capacity')} must be at least the batch_size "
+            f"({config.batch_size}), got {config.capacity}."
+        )

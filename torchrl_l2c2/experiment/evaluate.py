@@ -1,0 +1,157 @@
+"""Test episodes with a policy's mean, and the paper's two figures of merit on them.
+
+``python -m torchrl_l2c2.experiment.evaluate FOLDER`` plays them again with a run's policy.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from tensordict.nn import TensorDictModule
+from torchrl.envs import EnvBase, ExplorationType
+from tqdm.auto import tqdm
+
+from torchrl_l2c2.experiment.collection import EpisodeCollector
+from torchrl_l2c2.metrics import action_variation
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What a policy's mean does over test episodes; one entry per episode in every list.
+
+    Attributes:
+        returns: sums of rewards. Larger is better.
+        action_variations: mean L2 norm of the change of the mean action from step to step, the
+            paper's "L2 norm of temporal actions". Smaller is smoother.
+        lengths: steps of the episodes.
+    """
+
+    returns: list[float]
+    action_variations: list[float]
+    lengths: list[int]
+
+    def summary(self) -> dict[str, float | int]:
+        """Means and standard deviations over the episodes."""
+        return {
+            "episodes": len(self.returns),
+            "return_mean": statistics.fmean(self.returns),
+            "return_std": statistics.pstdev(self.returns),
+            "action_variation_mean": statistics.fmean(self.action_variations),
+            "action_variation_std": statistics.pstdev(self.action_variations),
+        }
+
+
+def evaluate_policy(
+    policy: TensorDictModule,
+    env: EnvBase,
+    episodes: int,
+    *,
+    max_steps: int = 1000,
+    compile_policy: bool = False,
+    progress: bool = False,
+) -> Evaluation:
+    """Plays episodes with the policy's mean action.
+
+    Args:
+        policy (TensorDictModule): acts deterministically under ``ExplorationType.DETERMINISTIC``.
+        env (EnvBase): one Gymnasium environment, as :class:`EpisodeCollector` takes it.
+        episodes (int): how many, at least 1. More give a surer mean.
+        max_steps (int): longest episode. Default 1000.
+        compile_policy (bool): whether to compile the policy. Default ``False``.
+        progress (bool): whether to show a progress bar.
+
+    Raises:
+        ValueError: fewer than one episode.
+
+    Examples:
+        >>> from torchrl.envs import GymEnv
+        >>> from torchrl_l2c2 import make_actor
+        >>> env = GymEnv("Pendulum-v1", max_episode_steps=5)
+        >>> result = evaluate_policy(make_actor(3, env.action_spec), env, 2)
+        >>> result.lengths
+        [5, 5]
+    """
+    if episodes < 1:
+        raise ValueError(f"episodes must be at least 1, got {episodes}.")
+    returns, variations, lengths = [], [], []
+    collector = EpisodeCollector(
+        env,
+        policy,
+        frames_per_batch=max_steps,
+        compile_policy=compile_policy,
+        exploration_type=ExplorationType.DETERMINISTIC,
+    )
+    bar = tqdm(range(episodes), "test", unit="episode", disable=not progress, leave=False)
+    for _ in bar:
+        episode = collector.rollout()
+        returns.append(episode["next", "reward"].sum().item())
+        variations.append(_variation(episode["action"]))
+        lengths.append(episode.shape[-1])
+        bar.set_postfix_str(f"return {statistics.fmean(returns):.1f}")
+    collector.shutdown(close_env=False)
+    return Evaluation(returns, variations, lengths)
+
+
+def _variation(actions: torch.Tensor) -> float:
+    """Zero for an episode of a single step, which has no change of action."""
+    return action_variation(actions.float()).item() if actions.shape[-2] > 1 else 0.0
+
+
+def load_policy(folder: str | Path) -> tuple[TensorDictModule, EnvBase, int]:
+    """A run's acting policy and a fresh environment of its task, from its folder alone.
+
+    Args:
+        folder (str or Path): of a run, finished or not.
+
+    Returns:
+        The policy, the environment and the longest episode.
+
+    Raises:
+        FileNotFoundError: the folder is not a run's, or holds neither a policy nor a checkpoint.
+        CheckpointError: its checkpoints are damaged.
+    """
+    from torchrl_l2c2.experiment.agents import make_agent
+    from torchrl_l2c2.experiment.checkpoints import load_newest
+    from torchrl_l2c2.experiment.config import ExperimentConfig
+    from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
+
+    folder = Path(folder)
+    if not (folder / "config.json").exists():
+        raise FileNotFoundError(f"{str(folder)!r} is not the folder of a run: no config.json.")
+    config = ExperimentConfig.from_dict(json.loads((folder / "config.json").read_text()))
+    env = make_env(config.task, config.seed + TEST_SEED)
+    agent = make_agent(config, env)
+    if (folder / "policy.pt").exists():
+        agent.policy.load_state_dict(torch.load(folder / "policy.pt", weights_only=True))
+    elif newest := load_newest(folder):
+        agent.loss.load_state_dict(newest[1]["loss"])
+    else:
+        raise FileNotFoundError(f"{str(folder)!r} holds neither policy.pt nor a checkpoint yet.")
+    return agent.policy, env, config.task.max_steps
+
+
+def main(arguments: Iterable[str] | None = None) -> None:
+    """The command line: plays test episodes and prints their summary as JSON."""
+    parser = argparse.ArgumentParser(
+        prog="python -m torchrl_l2c2.experiment.evaluate", description="Plays test episodes."
+    )
+    parser.add_argument("folder", help="a run's folder, finished or not")
+    parser.add_argument("--episodes", type=int, default=100, help="how many (default: 100)")
+    chosen = parser.parse_args(arguments)
+    try:
+        policy, env, max_steps = load_policy(chosen.folder)
+        result = evaluate_policy(policy, env, chosen.episodes, max_steps=max_steps, progress=True)
+    except (ValueError, OSError, RuntimeError) as error:
+        sys.exit(f"error: {error}")
+    print(json.dumps(result.summary(), indent=2))
+
+
+if __name__ == "__main__":
+    main()

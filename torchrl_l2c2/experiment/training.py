@@ -1,0 +1,521 @@
+"""One run of the experiment: collect, replay, update, log; then test and report."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import random
+import signal
+import statistics
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Iterator
+from dataclasses import asdict
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torchrl.data import (
+    LazyTensorStorage,
+    TensorDictPrioritizedReplayBuffer,
+    TensorDictReplayBuffer,
+)
+from torchrl.envs import RewardScaling
+from tqdm.auto import tqdm
+
+from torchrl_l2c2.experiment.agents import make_agent, make_update
+from torchrl_l2c2.experiment.checkpoints import (
+    CheckpointError,
+    global_rng_state,
+    list_checkpoints,
+    load_newest,
+    load_replay_state,
+    replay_state,
+    save_checkpoint,
+    set_global_rng_state,
+)
+from torchrl_l2c2.experiment.collection import EpisodeCollector
+from torchrl_l2c2.experiment.compilation import compiler_available
+from torchrl_l2c2.experiment.config import (
+    ExperimentConfig,
+    L2C2Config,
+    PrioritizedReplayConfig,
+)
+from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
+from torchrl_l2c2.experiment.evaluate import Evaluation, evaluate_policy
+from torchrl_l2c2.experiment.files import make_folder, write_atomically, write_json
+from torchrl_l2c2.experiment.metrics_log import MetricsLog
+from torchrl_l2c2.experiment.reports import FinishedRun, draw_learning_curves
+from torchrl_l2c2.metrics import action_variation
+from torchrl_l2c2.neighborhood import Neighborhood
+from torchrl_l2c2.transforms import NeighborTransform
+
+VERSIONED = ("torchrl-l2c2", "torch", "torchrl", "tensordict", "gymnasium", "pybullet", "numpy")
+
+
+class Experiment:
+    """One run of the paper's experiment, in the order in which things happen.
+
+    Args:
+        config (ExperimentConfig): every setting. Default: the paper's L2C2 on Swingup.
+        folder (str or Path, optional): where results are written; ``None`` writes nothing. Where
+            it holds a checkpoint of the same run, the run continues from it.
+
+    Keyword Args:
+        resume (str or Path, optional): another run's folder to continue from, in ``folder``.
+
+    Raises:
+        ValueError: a setting that cannot be, or that differs from the checkpoint's.
+        CheckpointError: there are checkpoints, but none can be read.
+        OSError: a folder that cannot be written to.
+
+    Examples:
+        >>> from torchrl_l2c2.experiment import Experiment, ExperimentConfig, TaskConfig
+        >>> task = TaskConfig("pendulum", "Pendulum-v1", episodes=2, max_steps=20)
+        >>> experiment = Experiment(ExperimentConfig(task=task, compile=False))
+        >>> metrics = experiment.train()
+        >>> [row["frames"] for row in metrics]
+        [20, 40]
+        >>> len(experiment.test(episodes=3).returns)
+        3
+    """
+
+    def __init__(
+        self,
+        config: ExperimentConfig | None = None,
+        folder: str | Path | None = None,
+        *,
+        resume: str | Path | None = None,
+    ) -> None:
+        self.config = config or ExperimentConfig()
+        self.folder = None if folder is None else make_folder(folder)
+        torch.set_num_threads(self.config.threads)
+        seed_everything(self.config.seed)
+
+        self.env = make_env(self.config.task, self.config.seed)
+        self.agent = make_agent(self.config, self.env)
+        self.replay = make_replay(self.config)
+        self._compile = self.config.compile and compiler_available()
+        self.update = make_update(
+            self.agent,
+            compile=self._compile,
+            skip_nonfinite=self.config.on_nonfinite == "skip",
+        )
+        self.collector = self._make_collector()
+        self.metrics: list[dict[str, float]] = []
+        self.frames = 0
+        self.updates = 0
+        self.skipped_updates = 0
+        self._log = MetricsLog(self.folder, tensorboard=self.config.logger.name == "tensorboard")
+        self._resume(resume)
+        if self.folder is not None:
+            write_json(self.folder / "config.json", self.config.to_dict())
+            write_json(self.folder / "versions.json", versions())
+
+    def train(self, *, progress: bool = False) -> list[dict[str, float]]:
+        """Trains for the task's episodes, from where a checkpoint left off.
+
+        SIGTERM and SIGINT end the training after the episode that is being played, with a
+        checkpoint; a second one ends it at once.
+
+        Args:
+            progress (bool): whether to show a progress bar.
+
+        Returns:
+            list: a dictionary of metrics per episode.
+
+        Raises:
+            FloatingPointError: NaN or infinity in what the environment gave, in a loss or in a
+                gradient; names the key and the step, and the last good checkpoint.
+            Interrupted: a signal ended the training.
+        """
+        started, first_frame = time.monotonic(), self.frames
+        total, done = self.config.task.episodes, len(self.metrics)
+        bar = tqdm(total=total, initial=done, unit="episode", disable=not progress)
+        saved = time.monotonic()
+        with bar, stop_on_signals() as signals:
+            while len(self.metrics) < total:
+                row = self._play_episode()
+                row["frames_per_second"] = (self.frames - first_frame) / (
+                    time.monotonic() - started
+                )
+                self.metrics.append(row)
+                self._log.write(row)
+                bar.update()
+                bar.set_postfix_str(describe(self.metrics[-10:]))
+                ended = len(self.metrics) == total
+                if ended or signals or time.monotonic() - saved > self.config.checkpoint_interval:
+                    self.save()
+                    saved = time.monotonic()
+                if signals and not ended:
+                    raise Interrupted(signals[0], len(self.metrics), self.folder)
+        return self.metrics
+
+    def save(self) -> Path | None:
+        """Writes a checkpoint of everything that the rest of the run depends on."""
+        if self.folder is None:
+            return None
+        for name, parameter in self.agent.loss.named_parameters():
+            if not parameter.isfinite().all():
+                raise FloatingPointError(
+                    f"{name} is not finite after update {self.updates}: a gradient was not. "
+                    f"{self._last_checkpoint()}"
+                )
+        return save_checkpoint(
+            self.folder, len(self.metrics), self.state_dict(), self.config.checkpoint_keep
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that the rest of the run depends on, between two episodes."""
+        return {
+            "config": json.dumps(self.config.to_dict()),
+            "loss": self.agent.loss.state_dict(),
+            "optimizer": self.agent.optimizer.state_dict(),
+            "target_updater": self.agent.target_updater.state_dict(),
+            "replay": replay_state(self.replay),
+            "collector": self.collector.generator_state(),
+            "global_rng": global_rng_state(),
+            "counters": [self.frames, self.updates, self.skipped_updates],
+            "metrics": json.dumps(self.metrics),
+            "metrics_log": self._log.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`state_dict` gave.
+
+        Raises:
+            ValueError: the state is of a run with other settings.
+        """
+        check_same_settings(json.loads(state["config"]), self.config.to_dict())
+        self.agent.loss.load_state_dict(state["loss"])
+        self.agent.optimizer.load_state_dict(state["optimizer"])
+        self.agent.target_updater.load_state_dict(state["target_updater"])
+        load_replay_state(self.replay, state["replay"])
+        self.collector.set_generator_state(state["collector"])
+        self.frames, self.updates, self.skipped_updates = state["counters"]
+        self.metrics = json.loads(state["metrics"])
+        self._log.load_state_dict(state["metrics_log"])
+        # Last: making and loading the above may have drawn from the global generators.
+        set_global_rng_state(state["global_rng"])
+
+    def _resume(self, elsewhere: str | Path | None) -> None:
+        source = elsewhere or self.folder
+        found = load_newest(source) if source is not None else None
+        if found is None:
+            if elsewhere is not None:
+                raise CheckpointError(f"resume={str(elsewhere)!r} holds no checkpoint_*.pt.")
+            return
+        path, state, damaged = found
+        for message in damaged:
+            warnings.warn(f"{message} The one before it is used.", stacklevel=3)
+        self.load_state_dict(state)
+        print(f"continuing after episode {len(self.metrics)} from {path}", file=sys.stderr)
+
+    def _play_episode(self) -> dict[str, float]:
+        """One episode and the updates that belong to it; its metrics."""
+        parts: list[TensorDictBase] = []
+        terms: list[torch.Tensor] = []
+        ended = False
+        while not ended:
+            batch = self.collector.rollout()
+            self._check_finite(batch)
+            self.frames += batch.numel()
+            self.replay.extend(self._remembered(batch))
+            parts.append(batch)
+            ended = bool(batch["next", "done"][-1])
+            for _ in range(self._due_updates(ended)):
+                self._one_update(terms)
+        episode = torch.cat(parts)
+        return {
+            "episode": len(self.metrics) + 1,
+            "frames": self.frames,
+            "updates": self.updates,
+            "skipped_updates": self.skipped_updates,
+            "return": episode["next", "reward"].sum().item(),
+            "action_variation": self._action_variation(episode),
+            "length": episode.numel(),
+            **self._mean_terms(terms),
+        }
+
+    def test(self, episodes: int | None = None, *, progress: bool = False) -> Evaluation:
+        """Plays test episodes with the policy's mean, in a fresh environment with its own seed.
+
+        Args:
+            episodes (int, optional): how many. Default: the settings' ``test_episodes``.
+            progress (bool): whether to show a progress bar.
+
+        Returns:
+            Evaluation: also written to ``evaluation.json``, beside the picture of the run.
+        """
+        env = make_env(self.config.task, self.config.seed + TEST_SEED)
+        result = evaluate_policy(
+            self.agent.policy,
+            env,
+            episodes or self.config.test_episodes,
+            max_steps=self.config.task.max_steps,
+            compile_policy=self._compile,
+            progress=progress,
+        )
+        env.close()
+        return result
+
+    def finish(self, result: Evaluation) -> FinishedRun:
+        """Writes what a finished run's folder holds: policy, test episodes and picture."""
+        if self.folder is None:
+            raise ValueError("this experiment has no folder to write to; give it one when made.")
+        save_policy(self.agent.policy, self.folder / "policy.pt")
+        config = self.config
+        write_json(
+            self.folder / "evaluation.json",
+            {
+                "run": {
+                    "task": config.task.name,
+                    "algorithm": config.algorithm.name,
+                    "regularizer": config.regularizer.name,
+                    "seed": config.seed,
+                    "solved_at": config.task.solved_at,
+                },
+                "summary": result.summary(),
+                "episodes": asdict(result),
+            },
+        )
+        run = FinishedRun.read(self.folder)
+        draw_learning_curves([run], self.folder / "learning_curves.png")
+        return run
+
+    def _make_collector(self) -> EpisodeCollector:
+        by_step = self.config.algorithm.schedule == "step"
+        return EpisodeCollector(
+            self.env,
+            self.agent.policy,
+            frames_per_batch=1 if by_step else self.config.task.max_steps,
+            compile_policy=self._compile,
+        )
+
+    def _remembered(self, batch: TensorDictBase) -> TensorDictBase:
+        """The entries that the loss reads, and no others: sampling copies every one of them."""
+        return batch.select(*self.agent.loss.in_keys, strict=False)
+
+    def _due_updates(self, ended: bool) -> int:
+        """How many updates the schedule asks for now."""
+        replay, algorithm = self.config.replay, self.config.algorithm
+        if len(self.replay) < replay.batch_size:
+            return 0
+        if algorithm.schedule == "step":
+            return algorithm.updates or 1
+        if not ended:
+            return 0
+        return algorithm.updates or len(self.replay) // replay.batch_size
+
+    def _one_update(self, terms: list[torch.Tensor]) -> None:
+        batch = self.replay.sample()
+        values = self.update(batch)
+        if values is None:
+            self.skipped_updates += 1
+            return
+        if isinstance(self.replay, TensorDictPrioritizedReplayBuffer):
+            self.replay.update_tensordict_priority(batch)
+        self.updates += 1
+        terms.append(values)
+
+    def _mean_terms(self, terms: list[torch.Tensor]) -> dict[str, float]:
+        """The mean of every entry of the loss over an episode's updates.
+
+        A ``share_*`` is the part that a term has of the sum of all terms' sizes: it says at a
+        glance whether a regularizer is on, and how much of the loss it is.
+        """
+        keys = self.agent.loss.out_keys
+        if not terms:
+            values = torch.full((len(keys),), float("nan"))
+        else:
+            values = torch.stack(terms)
+            self._check_terms(values)
+            values = values.mean(0)
+        means = dict(zip(keys, values.tolist(), strict=True))
+        losses = {k: abs(v) for k, v in means.items() if k.startswith("loss_")}
+        total = sum(losses.values())
+        shares = {
+            k.replace("loss_", "share_"): v / total if total else 0.0 for k, v in losses.items()
+        }
+        return {**means, **shares}
+
+    def _check_finite(self, batch: TensorDictBase) -> None:
+        try:
+            check_finite(batch, self.frames)
+        except FloatingPointError as error:
+            raise FloatingPointError(f"{error} {self._last_checkpoint()}") from None
+
+    def _check_terms(self, values: torch.Tensor) -> None:
+        bad = ~values.isfinite()
+        if bad.any():
+            step, column = bad.nonzero()[0].tolist()
+            raise FloatingPointError(
+                f"{self.agent.loss.out_keys[column]} is {values[step, column].item()} at update "
+                f"{self.updates - len(values) + step + 1} (frame {self.frames}). "
+                f"{self._last_checkpoint()}"
+            )
+
+    def _last_checkpoint(self) -> str:
+        paths = list_checkpoints(self.folder) if self.folder is not None else []
+        return f"Last good checkpoint: {paths[0] if paths else 'none was written yet'}."
+
+    @torch.no_grad()
+    def _action_variation(self, episode: TensorDictBase) -> float:
+        """Of the policy's mean, from the distribution parameters that it wrote while acting."""
+        if episode.numel() < 2:
+            return 0.0
+        mean = self.agent.policy.build_dist_from_params(episode).deterministic_sample
+        return action_variation(mean).item()
+
+
+class Interrupted(Exception):
+    """A signal ended the training; a checkpoint was written."""
+
+    def __init__(self, signal_number: int, episode: int, folder: Path | None) -> None:
+        name = signal.Signals(signal_number).name
+        super().__init__(
+            f"{name} ended the training after episode {episode}; the same command continues it "
+            f"from {folder}."
+        )
+        self.exit_status = 128 + signal_number
+
+
+@contextlib.contextmanager
+def stop_on_signals() -> Iterator[list[int]]:
+    """Collects SIGTERM and SIGINT in a list instead of dying; a second one acts as usual."""
+    received: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield received
+        return
+
+    def receive(number: int, frame: Any) -> None:
+        received.append(number)
+        restore()
+
+    previous = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+
+    def restore() -> None:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+    for number in previous:
+        signal.signal(number, receive)
+    try:
+        yield received
+    finally:
+        restore()
+
+
+# What may differ between a run and its continuation: it changes none of the numbers.
+FREE_SETTINGS = {"test_episodes", "threads", "checkpoint_interval", "checkpoint_keep"}
+# More episodes are a longer run of the same kind.
+FREE_TASK_SETTINGS = {"episodes", "solved_at"}
+
+
+def check_same_settings(saved: dict[str, Any], now: dict[str, Any]) -> None:
+    """Refuses to continue a run with settings that would change its numbers.
+
+    Raises:
+        ValueError: names the first setting that differs, with both values.
+    """
+    for key in (key for key in saved if key not in FREE_SETTINGS):
+        pairs = {key: (saved[key], now.get(key))}
+        if isinstance(saved[key], dict):
+            names = {*saved[key], *now[key]} - (FREE_TASK_SETTINGS if key == "task" else set())
+            pairs = {
+                f"{key}.{name}": (saved[key].get(name), now[key].get(name))
+                for name in sorted(names)
+            }
+        for name, (was, is_now) in pairs.items():
+            # As JSON, where a tuple and a list are the same.
+            if json.dumps(was) != json.dumps(is_now):
+                raise ValueError(
+                    f"this folder's checkpoint was made with {name}={was}, not {is_now}: choose "
+                    "another folder with outputs=FOLDER, or delete this one. Nothing was changed."
+                )
+
+
+def seed_everything(seed: int) -> None:
+    """Seeds Python, NumPy and PyTorch; environments and transforms have generators of their own."""
+    random.seed(seed)
+    np.random.seed(seed)
+    torch.manual_seed(seed)
+
+
+def make_replay(config: ExperimentConfig) -> TensorDictReplayBuffer:
+    """The replay buffer, with the reward's scale and, for L2C2, the neighbors as transforms."""
+    replay, algorithm = config.replay, config.algorithm
+    common: dict[str, Any] = {
+        "storage": LazyTensorStorage(replay.capacity),
+        "batch_size": replay.batch_size,
+        "generator": torch.Generator().manual_seed(config.seed),
+    }
+    if isinstance(replay, PrioritizedReplayConfig):
+        buffer = TensorDictPrioritizedReplayBuffer(
+            alpha=replay.alpha, beta=replay.beta, priority_key="td_error", **common
+        )
+    else:
+        buffer = TensorDictReplayBuffer(**common)
+    scale = 1.0 - algorithm.gamma if algorithm.reward_scale is None else algorithm.reward_scale
+    buffer.append_transform(RewardScaling(loc=0.0, scale=scale, in_keys=[("next", "reward")]))
+    if isinstance(config.regularizer, L2C2Config):
+        regularizer = config.regularizer
+        buffer.append_transform(
+            NeighborTransform(
+                Neighborhood(regularizer.sigma, regularizer.lambda_min, regularizer.lambda_max),
+                num_samples=regularizer.num_samples,
+                generator=torch.Generator().manual_seed(config.seed),
+            )
+        )
+    return buffer
+
+
+def check_finite(batch: TensorDictBase, first_frame: int) -> None:
+    """Stops at the first NaN or infinity that the environment gave.
+
+    Raises:
+        FloatingPointError: names the key and the frame.
+    """
+    for key in ("observation", ("next", "observation"), ("next", "reward")):
+        bad = ~batch[key].isfinite()
+        if bad.any():
+            step = int(bad.flatten(1).any(1).nonzero()[0])
+            value = batch[key][step].flatten().tolist()
+            raise FloatingPointError(
+                f"{key} is not finite at frame {first_frame + step}: {value}. "
+                "The environment gave it; nothing was learned from this episode."
+            )
+
+
+def save_policy(policy: torch.nn.Module, path: Path) -> None:
+    """Writes the policy's ``state_dict``; read it with ``torch.load(path, weights_only=True)``."""
+    import io
+
+    content = io.BytesIO()
+    torch.save({k: v.detach().clone() for k, v in policy.state_dict().items()}, content)
+    write_atomically(path, content.getvalue())
+
+
+def versions() -> dict[str, str]:
+    """Versions of the packages that decide the numbers."""
+    found = {}
+    for name in VERSIONED:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def describe(rows: list[dict[str, float]]) -> str:
+    """The progress bar's words: means over the latest episodes, and the speed."""
+    mean = {k: statistics.fmean(row[k] for row in rows) for k in ("return", "action_variation")}
+    return (
+        f"return {mean['return']:.1f}, action variation {mean['action_variation']:.3f}, "
+        f"{rows[-1]['frames_per_second']:.0f} frames/s"
+    )

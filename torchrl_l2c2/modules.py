@@ -1,0 +1,245 @@
+"""The paper's networks: the Squish activation, the stochastic actor and the ensemble critic."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from tensordict import NestedKey
+from tensordict.nn import NormalParamExtractor, TensorDictModule
+from torch import Tensor, nn
+from torchrl.data import Bounded, Composite, TensorSpec
+from torchrl.envs import ExplorationType
+from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, TanhNormal
+
+
+class Squish(nn.Module):
+    r"""The paper's activation: the input times the derivative of squareplus.
+
+    .. math::
+        \mathrm{squish}(x) = \frac{x}{2} \Big(1 + \frac{x}{\sqrt{x^2 + b}}\Big), \qquad
+        \mathrm{squareplus}(x) = \frac{1}{2} \big(x + \sqrt{x^2 + b}\big)
+
+    as swish is the input times the derivative of softplus (Kobayashi, L2C2, 2022, "Setup").
+
+    Args:
+        b (float): bend, greater than 0. Larger values bend more gently around 0; towards 0 it
+            becomes a ReLU. [inferred] Default 4.0, where squareplus has softplus's curvature at 0
+            and Squish so follows swish there to second order.
+
+    Raises:
+        ValueError: ``b`` is not finite or not greater than 0.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_l2c2 import Squish
+        >>> Squish()(torch.tensor([-1.5, 0.0, 1.5]))
+        tensor([-0.3000,  0.0000,  1.2000])
+    """
+
+    def __init__(self, b: float = 4.0) -> None:
+        super().__init__()
+        if not (math.isfinite(b) and b > 0.0):
+            raise ValueError(f"Squish: b must be finite and greater than 0, got {b!r}.")
+        self.b = b
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Applies the activation to every element."""
+        return 0.5 * x * (1.0 + x * torch.rsqrt(x.square() + self.b))
+
+    def extra_repr(self) -> str:
+        """The bend, for ``repr``."""
+        return f"b={self.b}"
+
+
+class NormalNetwork(nn.Module):
+    """Maps observations to the location and the positive scale of a diagonal normal."""
+
+    def __init__(self, body: nn.Module, extractor: nn.Module) -> None:
+        super().__init__()
+        self.body = body
+        self.extractor = extractor
+
+    def forward(self, *observations: Tensor) -> tuple[Tensor, Tensor]:
+        """Observations ``[*B, F_i]`` to location and scale, each ``[*B, A]``."""
+        return self.extractor(self.body(*observations))
+
+
+class EnsembleNetwork(nn.Module):
+    """Maps observations to the mean of several values and to the values themselves."""
+
+    def __init__(self, body: nn.Module) -> None:
+        super().__init__()
+        self.body = body
+
+    def forward(self, *observations: Tensor) -> tuple[Tensor, Tensor]:
+        """Observations ``[*B, F_i]`` to their value ``[*B, 1]`` and its heads ``[*B, K]``."""
+        heads = self.body(*observations)
+        return heads.mean(-1, keepdim=True), heads
+
+
+def make_actor(
+    observation_size: int,
+    action: TensorSpec | int,
+    *,
+    hidden: Sequence[int] = (100, 100),
+    squash: Literal["tanh", "none"] = "tanh",
+    scale_mapping: str = "biased_softplus_1.0",
+    squish_b: float = 4.0,
+    in_keys: Sequence[NestedKey] = ("observation",),
+) -> ProbabilisticActor:
+    r"""Builds the paper's policy: a diagonal normal from layers of ``Linear, LayerNorm, Squish``.
+
+    It writes ``loc``, ``scale``, ``action`` and ``action_log_prob``, and samples unless told
+    otherwise; under ``set_exploration_type(ExplorationType.DETERMINISTIC)`` the action is ``loc``,
+    squashed like a sample is.
+
+    Args:
+        observation_size (int): number of observed values: the sum of the last dimensions of
+            ``in_keys``.
+        action (TensorSpec or int): the environment's (unbatched) action spec, whose bounds the
+            squashing takes; or the number of actions, with bounds ``[-1, 1]``.
+
+    Keyword Args:
+        hidden (sequence of int): neurons of each hidden layer. More can represent more and cost
+            more. Default ``(100, 100)``.
+        squash (str): ``"tanh"`` maps the normal sample into the action's bounds; ``"none"`` leaves
+            it unbounded, for an environment that clips. [inferred] Default ``"tanh"``.
+        scale_mapping (str): how the scale is made positive, a name that
+            :class:`~tensordict.nn.NormalParamExtractor` knows. [inferred] Default
+            ``"biased_softplus_1.0"``, TorchRL's own: 1 where the network's output is 0.
+        squish_b (float): bend of :class:`Squish`. Default 4.0.
+        in_keys (sequence of NestedKey): observations to read; several are concatenated. Default
+            ``("observation",)``.
+
+    Returns:
+        ProbabilisticActor: the policy, for any leading batch dimensions.
+
+    Raises:
+        TypeError: the action is not a single continuous tensor.
+        ValueError: a size or a choice that is not allowed, or bounds that cannot be squashed into.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import Bounded
+        >>> from torchrl_l2c2 import make_actor
+        >>> actor = make_actor(3, Bounded(low=-2.0, high=2.0, shape=(1,)))
+        >>> batch = actor(TensorDict({"observation": torch.zeros(8, 3)}, batch_size=[8]))
+        >>> batch["action"].shape, batch["action_log_prob"].shape
+        (torch.Size([8, 1]), torch.Size([8]))
+    """
+    if squash not in ("tanh", "none"):
+        raise ValueError(f"make_actor: squash must be 'tanh' or 'none', got {squash!r}.")
+    spec = action if isinstance(action, TensorSpec) else None
+    size = action if spec is None else _action_size(spec)
+    _check_whole("make_actor: the number of actions", size)
+    network = NormalNetwork(
+        _body(observation_size, hidden, 2 * size, squish_b), NormalParamExtractor(scale_mapping)
+    )
+    return ProbabilisticActor(
+        TensorDictModule(network, in_keys=list(in_keys), out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        spec=spec,
+        distribution_class=TanhNormal if squash == "tanh" else IndependentNormal,
+        distribution_kwargs=_bounds(spec) if squash == "tanh" and spec is not None else {},
+        return_log_prob=True,
+        log_prob_key="action_log_prob",
+        default_interaction_type=ExplorationType.RANDOM,
+    )
+
+
+def make_critic(
+    observation_size: int,
+    *,
+    num_heads: int = 5,
+    hidden: Sequence[int] = (100, 100),
+    squish_b: float = 4.0,
+    in_keys: Sequence[NestedKey] = ("observation",),
+) -> TensorDictModule:
+    """Builds the paper's critic: an ensemble of values that share all layers but the last.
+
+    It writes ``state_value`` ``[*B, 1]``, the mean of the ensemble, and ``state_value_heads``
+    ``[*B, num_heads]``, the ensemble itself.
+
+    Args:
+        observation_size (int): number of observed values: the sum of the last dimensions of
+            ``in_keys``.
+
+    Keyword Args:
+        num_heads (int): size of the ensemble. A larger one has a steadier mean. Default 5.
+        hidden (sequence of int): neurons of each hidden layer. More can represent more and cost
+            more. Default ``(100, 100)``.
+        squish_b (float): bend of :class:`Squish`. Default 4.0.
+        in_keys (sequence of NestedKey): observations to read; several are concatenated. Default
+            ``("observation",)``.
+
+    Returns:
+        TensorDictModule: the critic, for any leading batch dimensions.
+
+    Raises:
+        ValueError: a size that is not allowed.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_l2c2 import make_critic
+        >>> critic = make_critic(3)
+        >>> batch = critic(TensorDict({"observation": torch.zeros(8, 3)}, batch_size=[8]))
+        >>> batch["state_value"].shape, batch["state_value_heads"].shape
+        (torch.Size([8, 1]), torch.Size([8, 5]))
+    """
+    _check_whole("make_critic: num_heads", num_heads)
+    return TensorDictModule(
+        EnsembleNetwork(_body(observation_size, hidden, num_heads, squish_b)),
+        in_keys=list(in_keys),
+        out_keys=["state_value", "state_value_heads"],
+    )
+
+
+def _body(in_features: int, hidden: Sequence[int], out_features: int, squish_b: float) -> MLP:
+    _check_whole("observation_size", in_features)
+    for cells in hidden:
+        _check_whole("every entry of hidden", cells)
+    return MLP(
+        in_features=in_features,
+        out_features=out_features,
+        num_cells=list(hidden),
+        norm_class=nn.LayerNorm,
+        norm_kwargs=[{"normalized_shape": cells} for cells in hidden],
+        activation_class=Squish,
+        activation_kwargs={"b": squish_b},
+    )
+
+
+def _action_size(spec: TensorSpec) -> int:
+    if isinstance(spec, Composite):
+        raise TypeError(
+            f"make_actor: the action must be a single tensor, got a Composite of {list(spec)}: "
+            "pass the spec of one action."
+        )
+    if not spec.dtype.is_floating_point:
+        raise TypeError(f"make_actor: the action must be continuous, got {spec}.")
+    if spec.ndim != 1:
+        raise ValueError(
+            f"make_actor: the action spec must have one dimension, got shape {tuple(spec.shape)}: "
+            "pass the environment's action_spec_unbatched."
+        )
+    return spec.shape[0]
+
+
+def _bounds(spec: TensorSpec) -> dict[str, Tensor]:
+    low, high = spec.space.low, spec.space.high
+    if not (isinstance(spec, Bounded) and low.isfinite().all() and high.isfinite().all()):
+        raise ValueError(
+            f"make_actor: squash='tanh' needs finite bounds of the action, got {spec}: "
+            "use squash='none'."
+        )
+    return {"low": low, "high": high}
+
+
+def _check_whole(name: str, value: int) -> None:
+    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+        raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}.")

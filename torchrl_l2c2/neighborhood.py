@@ -1,0 +1,193 @@
+"""The neighborhood of a state: where its neighbors are drawn and how far away they count."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from numbers import Real
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Neighborhood:
+    r"""The local box around a state that its transition spans, with its distance and its gain.
+
+    A transition :math:`s \to s'` spans a box with :math:`s` at its center and :math:`s'` at a
+    corner. Neighbors are drawn from it and measured relative to the transition (Kobayashi, L2C2,
+    2022, "Implementation"):
+
+    .. math::
+        \tilde s = s + (s' - s)\, u, \qquad
+        u_i \sim \mathcal U(-r, r), \qquad
+        d(s, \tilde s; s') = \max_i |u_i| + \epsilon,
+
+    .. math::
+        \epsilon = \frac{\sigma \lambda_{\min}}{\lambda_{\max} - \sigma \lambda_{\min}}, \qquad
+        r = \sigma + (\sigma - 1)\, \epsilon, \qquad
+        \lambda = \lambda_{\max}\, \epsilon .
+
+    The gain :math:`\lambda / d` is then ``lambda_max`` at the center and ``lambda_min`` at the
+    edge, for every ``sigma``.
+
+    .. note::
+        The largest of ``n`` uniform draws has mean ``n / (n + 1)`` of the radius, so most neighbors
+        of a high-dimensional state lie close to the edge and the applied gain close to
+        ``lambda_min``: with the default values its mean is about ``4.7 * lambda_min`` for one
+        dimension, ``1.25 * lambda_min`` for five and ``1.04 * lambda_min`` for 28.
+
+    Args:
+        sigma: size of the box relative to the transition, greater than 0. Above 1 neighbors reach
+            past :math:`s'`; smaller values regularize a smaller surrounding. Defaults to ``1.0``.
+        lambda_min: gain at the edge of the box, greater than 0. Larger values smooth everywhere
+            in it. Defaults to ``0.01``.
+        lambda_max: gain at its center, greater than ``lambda_min`` and than
+            ``sigma * lambda_min``. Larger values smooth more where the neighbor is close to the
+            state, and change nothing at the edge. Defaults to ``1.0``.
+
+    Raises:
+        TypeError: if a value is not a real number.
+        ValueError: if a value is not finite or out of its range.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_l2c2 import Neighborhood
+        >>> near = Neighborhood(sigma=1.0, lambda_min=0.2, lambda_max=1.0)
+        >>> near.epsilon, near.radius, near.scale
+        (0.25, 1.0, 0.25)
+        >>> near.gain(torch.tensor([0.25, 1.25]))
+        tensor([1.0000, 0.2000])
+        >>> state, next_state = torch.zeros(32, 5), torch.ones(32, 5)
+        >>> neighbor, distance = near.sample(state, next_state, num_samples=4)
+        >>> neighbor.shape, distance.shape
+        (torch.Size([32, 4, 5]), torch.Size([32, 4]))
+    """
+
+    sigma: float = 1.0
+    lambda_min: float = 0.01
+    lambda_max: float = 1.0
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not isinstance(value, Real) or isinstance(value, bool):
+                raise TypeError(
+                    f"{field.name} must be a real number, got {value!r} ({type(value).__name__})."
+                )
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(
+                    f"{field.name} must be finite and greater than 0, got {value!r}. To switch "
+                    "the regularization off, leave it out instead of setting its gain to 0."
+                )
+        if self.lambda_max <= self.sigma * self.lambda_min:
+            raise ValueError(
+                f"lambda_max must be greater than sigma * lambda_min, got lambda_max="
+                f"{self.lambda_max!r} and sigma * lambda_min={self.sigma * self.lambda_min!r}: "
+                "raise lambda_max, or lower sigma or lambda_min."
+            )
+        # For sigma < 1 the radius is positive exactly when the gains are in order.
+        if self.lambda_max <= self.lambda_min:
+            raise ValueError(
+                f"lambda_max must be greater than lambda_min, got lambda_max={self.lambda_max!r} "
+                f"and lambda_min={self.lambda_min!r}: the neighborhood's radius would be "
+                f"{self.radius!r}. Raise lambda_max or lower lambda_min."
+            )
+
+    @property
+    def epsilon(self) -> float:
+        """The distance of a state to itself; keeps the gain at the center finite."""
+        edge = self.sigma * self.lambda_min
+        return edge / (self.lambda_max - edge)
+
+    @property
+    def radius(self) -> float:
+        """Half the width of the box, in units of the transition's displacement."""
+        return self.sigma + (self.sigma - 1.0) * self.epsilon
+
+    @property
+    def scale(self) -> float:
+        r"""The constant gain :math:`\lambda_\pi` in front of the regularization."""
+        return self.lambda_max * self.epsilon
+
+    def gain(self, distance: Tensor) -> Tensor:
+        """The gain applied at a distance: :attr:`scale` over it.
+
+        Args:
+            distance: distances as :meth:`sample` returns them, any shape, in
+                ``[epsilon, radius + epsilon]``.
+
+        Returns:
+            A tensor of the same shape, in ``[lambda_min, lambda_max]``.
+        """
+        return self.scale / distance
+
+    def sample(
+        self,
+        state: Tensor,
+        next_state: Tensor,
+        num_samples: int = 1,
+        generator: torch.Generator | None = None,
+        *,
+        batch_dims: int = 1,
+    ) -> tuple[Tensor, Tensor]:
+        """Draws neighbors of each state and their distances.
+
+        The distance follows from the draw, not from the quotient of displacements, so it is
+        right for coordinates that did not move. Coordinates of ``next_state`` that are not finite,
+        as at the ends of some episodes, count as not having moved.
+
+        Args:
+            state: states, shape ``[*B, *F]`` with features of any shape, floating point.
+            next_state: their successors, the same shape.
+            num_samples: neighbors ``K`` per state, at least 1. More give a less noisy estimate at
+                ``K`` times the network evaluations. Defaults to ``1``.
+            generator: source of the randomness, on the device of ``state``. Defaults to
+                PyTorch's global generator, the only choice that compiles with ``fullgraph=True``.
+            batch_dims: how many leading dimensions are batch dimensions. Defaults to ``1``.
+
+        Returns:
+            The neighbors, shape ``[*B, K, *F]`` in the dtype of ``state``, and their distances,
+            shape ``[*B, K]``.
+
+        Raises:
+            TypeError: if the states are not floating point.
+            ValueError: if the shapes differ, or ``num_samples`` or ``batch_dims`` is out of range.
+        """
+        check_num_samples(num_samples)
+        _check_states(state, next_state, batch_dims)
+        batch, features = state.shape[:batch_dims], state.shape[batch_dims:]
+        shape = (*batch, num_samples, *features)
+        uniform = torch.rand(shape, generator=generator, dtype=state.dtype, device=state.device)
+        u = (2.0 * uniform - 1.0) * self.radius
+        displacement = (next_state - state).to(state.dtype)
+        displacement = torch.nan_to_num(displacement, nan=0.0, posinf=0.0, neginf=0.0)
+        neighbor = state.unsqueeze(batch_dims) + displacement.unsqueeze(batch_dims) * u
+        # An explicit size: -1 is ambiguous for empty batches.
+        extent = u.abs().reshape(*batch, num_samples, features.numel()).amax(-1)
+        return neighbor, extent + self.epsilon
+
+
+def check_num_samples(num_samples: int) -> None:
+    """Raises a ``ValueError`` unless the number of samples is a positive integer."""
+    if not isinstance(num_samples, int) or num_samples < 1:
+        raise ValueError(f"num_samples must be an integer of at least 1, got {num_samples!r}.")
+
+
+def _check_states(state: Tensor, next_state: Tensor, batch_dims: int) -> None:
+    for name, tensor in (("state", state), ("next_state", next_state)):
+        if not tensor.is_floating_point():
+            raise TypeError(
+                f"{name} must be floating point to have neighbors, got {tensor.dtype}: convert "
+                "it first if its values are quantities, leave it out if they are labels."
+            )
+    if state.shape != next_state.shape:
+        raise ValueError(
+            f"state and next_state must have the same shape, got {tuple(state.shape)} and "
+            f"{tuple(next_state.shape)}."
+        )
+    if not 0 <= batch_dims <= state.ndim:
+        raise ValueError(
+            f"batch_dims must lie between 0 and {state.ndim} for a state of shape "
+            f"{tuple(state.shape)}, got {batch_dims!r}."
+        )

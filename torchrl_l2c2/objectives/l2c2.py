@@ -1,0 +1,284 @@
+"""L2C2: policies and values that change little within the neighborhood of a transition."""
+
+from __future__ import annotations
+
+import warnings
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor
+from torch.distributions import Categorical
+from torchrl.objectives import DistributionalDQNLoss, LossModule
+
+from torchrl_l2c2.distances import squared_error, squared_hellinger
+from torchrl_l2c2.neighborhood import Neighborhood
+from torchrl_l2c2.objectives.regularized import VALUE_NETWORKS, RegularizedLoss
+
+
+class L2C2Loss(RegularizedLoss):
+    r"""A loss under the locally Lipschitz continuous constraint (Kobayashi, L2C2, 2022).
+
+    Adds to any TorchRL loss with a policy, a value function or both
+
+    .. math::
+        \lambda_\pi\, \mathbb E\left[\frac{d_\pi(\pi(\cdot|s), \pi(\cdot|\tilde s))}
+        {d(s, \tilde s; s')}\right]
+        + \lambda_V\, \mathbb E\left[\frac{d_V(V(s), V(\tilde s))}{d(s, \tilde s; s')}\right],
+        \qquad \lambda_V = \beta\lambda_\pi,
+
+    with the neighbors :math:`\tilde s`, their distances :math:`d` and :math:`\lambda_\pi` of a
+    :class:`~torchrl_l2c2.Neighborhood`. :math:`d_\pi` is the squared Hellinger distance
+    (:func:`~torchrl_l2c2.squared_hellinger`) or, for deterministic policies, half the squared
+    distance of the actions. :math:`d_V = \tfrac12\lVert V(s) - V(\tilde s)\rVert_2^2` is taken over
+    all heads or members of an ensemble; of action values over all (discrete) actions, or at the
+    batch's action; of the value distributions of :class:`~torchrl.objectives.DistributionalDQNLoss`
+    it is the squared Hellinger distance, summed over the actions.
+
+    Gradients flow into the policy's parameters from the one term, into the value function's from
+    the other, through both :math:`s` and :math:`\tilde s`, and nowhere else: not into targets,
+    nor from a value into the policy except through a trunk that the plain loss trains so as well.
+    Both terms are reduced as the loss reduces its own: with its ``reduction``, its masks and, where
+    it uses them, the weights of prioritized replay.
+
+    Neighbors are read from the batch where :class:`~torchrl_l2c2.NeighborTransform` has written
+    them, and otherwise drawn from the observations and next observations with torch's global
+    generator. Drawn here, the floating-point inputs of all regularized networks that have a
+    successor in the batch are moved, and the distance is the largest of theirs.
+
+    ``forward`` adds these entries to the loss's own:
+
+    * ``loss_l2c2_actor``, the policy term, and one value term for each value function, named after
+      its network: ``loss_l2c2_critic``, ``loss_l2c2_qvalue``, ``loss_l2c2_value``, ...
+    * ``l2c2_distance``, the mean :math:`d`, and ``l2c2_gain``, the mean :math:`\lambda_\pi / d` that
+      is applied;
+    * ``l2c2_hellinger`` (``l2c2_action_distance`` for deterministic policies) and
+      ``l2c2_value_distance``, the mean :math:`d_\pi` and, summed over the value functions,
+      :math:`d_V`. With ``reduction="none"`` diagnostics are not averaged either.
+
+    .. note:: The gains are buffers that can be assigned to, as in ``loss.l2c2_coeff = 0.5``, also
+        between calls of a compiled loss. They are not part of the ``state_dict``.
+
+    Args:
+        base_loss (LossModule): the loss; see :class:`RegularizedLoss` for how it is wrapped.
+        neighborhood (Neighborhood, optional): where neighbors are drawn and what they count.
+            Defaults to the paper's, ``Neighborhood()``.
+        beta (float): gain of the value terms relative to the policy term, at least 0. Larger values
+            smooth the value functions more; 0 leaves their terms out altogether (the paper's
+            ablation). Scheduled as ``l2c2_beta``. Defaults to ``0.1``.
+
+    Keyword Args:
+        coeff (float): multiplies all terms, at least 0; 0 leaves the plain loss's values and
+            gradients. Scheduled as ``l2c2_coeff``. Defaults to ``1.0``.
+        num_samples (int): neighbors per state where they are drawn here, at least 1. More give a
+            less noisy estimate at so many times the network evaluations. Defaults to ``1``.
+        hellinger_samples (int, optional): actions drawn from each policy for the paper's Monte
+            Carlo estimate of :math:`d_\pi`, at least 1. Defaults to ``None``, its closed form.
+        neighbor_key (NestedKey): the entry that ``NeighborTransform`` writes. Defaults to
+            ``"neighbor"``.
+
+    Raises:
+        TypeError: the loss has neither a policy nor a value function, cannot be regularized, or an
+            argument has the wrong type.
+        ValueError: an argument is out of its range.
+
+    Warns:
+        UserWarning: the loss lacks a policy or a trained value function, so that one term is left
+            out; not with ``beta=0``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.modules import Actor, ValueOperator
+        >>> from torchrl.objectives import DDPGLoss, SoftUpdate
+        >>> from torchrl_l2c2 import L2C2Loss, Neighborhood
+        >>> actor = Actor(torch.nn.Linear(3, 1))
+        >>> value = ValueOperator(torch.nn.Linear(4, 1), in_keys=["observation", "action"])
+        >>> loss = L2C2Loss(DDPGLoss(actor, value), Neighborhood(sigma=1.0), beta=0.1)
+        >>> isinstance(loss, DDPGLoss), isinstance(loss, L2C2Loss)
+        (True, True)
+        >>> updater = SoftUpdate(loss, tau=0.01)
+        >>> batch = TensorDict(
+        ...     {
+        ...         "observation": torch.randn(32, 3),
+        ...         "action": torch.randn(32, 1),
+        ...         "next": {
+        ...             "observation": torch.randn(32, 3),
+        ...             "reward": torch.randn(32, 1),
+        ...             "done": torch.zeros(32, 1, dtype=torch.bool),
+        ...             "terminated": torch.zeros(32, 1, dtype=torch.bool),
+        ...         },
+        ...     },
+        ...     batch_size=[32],
+        ... )
+        >>> terms = loss(batch)
+        >>> [key for key in terms.keys() if key.startswith("loss_")]
+        ['loss_actor', 'loss_value', 'loss_l2c2_actor', 'loss_l2c2_value']
+    """
+
+    _schedulable_buffers = frozenset({"l2c2_beta", "l2c2_coeff"})
+
+    def __init__(
+        self,
+        base_loss: LossModule,
+        neighborhood: Neighborhood | None = None,
+        beta: float = 0.1,
+        *,
+        coeff: float = 1.0,
+        num_samples: int = 1,
+        hellinger_samples: int | None = None,
+        neighbor_key: NestedKey = "neighbor",
+    ) -> None:
+        neighborhood = Neighborhood() if neighborhood is None else neighborhood
+        if not isinstance(neighborhood, Neighborhood):
+            raise TypeError(
+                f"neighborhood must be a Neighborhood, got a {type(neighborhood).__name__}."
+            )
+        _check_count("num_samples", num_samples)
+        if hellinger_samples is not None:
+            _check_count("hellinger_samples", hellinger_samples)
+        self.l2c2_neighborhood = neighborhood
+        self.l2c2_num_samples = num_samples
+        self.l2c2_hellinger_samples = hellinger_samples
+        self.l2c2_neighbor_key = neighbor_key
+        self._l2c2_policies = self._policy_networks()
+        self._l2c2_values = self._value_networks() if beta else []
+        self._register_coefficient("l2c2_coeff", coeff)
+        self._register_coefficient("l2c2_beta", beta, used=bool(self._l2c2_values))
+        _check_terms(type(base_loss).__name__, self._l2c2_policies, self._l2c2_values, beta)
+        self._regularize([*self._l2c2_policies, *self._l2c2_values])
+        self.out_keys = [*self.out_keys, *self._l2c2_out_keys()]
+
+    def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
+        terms = super().policy_regularizer(tensordict)
+        if not self._l2c2_policies:
+            return terms
+        states, distance = self._neighbors(tensordict)
+        here, there = self._policies_at(tensordict, states)
+        if isinstance(here, Tensor):
+            difference = squared_error(here, there)
+        else:
+            difference = squared_hellinger(here, there, num_samples=self.l2c2_hellinger_samples)
+        terms.set("loss_l2c2_actor", self._penalty(difference, distance, tensordict))
+        terms.set(self._policy_diagnostic(), self._diagnostic(difference.mean(0), tensordict))
+        return terms.update(self._gain_diagnostics(distance, tensordict))
+
+    def value_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
+        terms = super().value_regularizer(tensordict)
+        if not self._l2c2_values:
+            return terms
+        states, distance = self._neighbors(tensordict)
+        diagnostics = []
+        for network in self._l2c2_values:
+            difference = self._value_difference(network, tensordict, states)
+            penalty = self._penalty(difference, distance, tensordict)
+            terms.set(_value_term(network), self.l2c2_beta * penalty)
+            diagnostics.append(self._diagnostic(difference.mean(0), tensordict))
+        terms.set("l2c2_value_distance", sum(diagnostics))
+        return terms.update(self._gain_diagnostics(distance, tensordict))
+
+    def _value_difference(
+        self, network: str, tensordict: TensorDictBase, states: TensorDictBase
+    ) -> Tensor:
+        here, there = self._values_at(network, tensordict, states)
+        if isinstance(self, DistributionalDQNLoss):
+            # Logarithms of the atoms' probabilities, [K, *B, atoms, actions].
+            policies = (Categorical(logits=value.transpose(-1, -2)) for value in (here, there))
+            return squared_hellinger(*policies).sum(-1)
+        difference = squared_error(here, there)
+        return difference.sum(0) if self._is_ensemble(network) else difference
+
+    def _penalty(self, difference: Tensor, distance: Tensor, tensordict: TensorDictBase) -> Tensor:
+        gain = self.l2c2_neighborhood.gain(_match(distance, difference))
+        return self.l2c2_coeff * self._reduce_term((gain * difference).mean(0), tensordict)
+
+    def _prepare(self, tensordict: TensorDictBase) -> TensorDictBase:
+        tensordict = super()._prepare(tensordict)
+        if tensordict.get(self.l2c2_neighbor_key, None) is None:
+            tensordict = tensordict.copy().set(self.l2c2_neighbor_key, self._draw(tensordict))
+        return tensordict
+
+    def _draw(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """What NeighborTransform would have written."""
+        neighbor = TensorDict(batch_size=tensordict.batch_size)
+        distances = []
+        networks = [*self._l2c2_policies, *self._l2c2_values]
+        for key, (state, successor) in self._transitions(tensordict, networks).items():
+            drawn, distance = self.l2c2_neighborhood.sample(
+                state, successor, self.l2c2_num_samples, batch_dims=tensordict.batch_dims
+            )
+            neighbor.set(key, drawn)
+            distances.append(distance)
+        return neighbor.set("distance", torch.stack(distances).amax(0))
+
+    def _neighbors(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
+        """The neighbors and their distances, both ``[K, *B]``."""
+        neighbor = tensordict.get(self.l2c2_neighbor_key, None)
+        if neighbor is None:
+            neighbor = self._draw(tensordict)
+        entries = {
+            key: value.movedim(tensordict.batch_dims, 0)
+            for key, value in neighbor.items(include_nested=True, leaves_only=True)
+        }
+        if "distance" not in entries:
+            raise KeyError(
+                f"{self.l2c2_neighbor_key!r} holds {list(entries)}, but no 'distance': write it with "
+                "NeighborTransform, or name another neighbor_key."
+            )
+        distance = entries.pop("distance")
+        return TensorDict(entries, batch_size=distance.shape), distance
+
+    def _gain_diagnostics(self, distance: Tensor, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        gain = self.l2c2_coeff * self.l2c2_neighborhood.gain(distance)
+        return {
+            "l2c2_distance": self._diagnostic(distance.mean(0), tensordict),
+            "l2c2_gain": self._diagnostic(gain.mean(0), tensordict),
+        }
+
+    def _policy_diagnostic(self) -> str:
+        return "l2c2_hellinger" if self._has_stochastic_policy() else "l2c2_action_distance"
+
+    def _l2c2_out_keys(self) -> list[str]:
+        keys = ["loss_l2c2_actor"] if self._l2c2_policies else []
+        keys += [_value_term(network) for network in self._l2c2_values]
+        keys += ["l2c2_distance", "l2c2_gain"]
+        keys += [self._policy_diagnostic()] if self._l2c2_policies else []
+        return keys + (["l2c2_value_distance"] if self._l2c2_values else [])
+
+
+def _value_term(network: str) -> str:
+    return "loss_l2c2_" + network.removesuffix("_network")
+
+
+def _match(distance: Tensor, difference: Tensor) -> Tensor:
+    """Distances ``[K, *B]`` for differences with one more dimension (agents) or one less."""
+    while distance.ndim > difference.ndim:
+        distance = distance.amax(-1)
+    return distance[(...,) + (None,) * (difference.ndim - distance.ndim)]
+
+
+def _check_terms(loss: str, policies: list[str], values: list[str], beta: float) -> None:
+    if not (policies or values):
+        what = "trained value function" if beta else "value function to regularize, with beta=0,"
+        raise TypeError(
+            f"L2C2Loss finds nothing to regularize: {loss} has no actor_network, and no {what} "
+            f"among {', '.join(VALUE_NETWORKS)}."
+        )
+    if not policies:
+        warnings.warn(
+            f"{loss} has no policy network: L2C2Loss leaves out the policy term and regularizes "
+            f"{', '.join(values)} alone.",
+            stacklevel=3,
+        )
+    if beta and not values:
+        warnings.warn(
+            f"{loss} trains no value function: L2C2Loss leaves out the value term and regularizes "
+            "the policy alone. Pass beta=0 to say so.",
+            stacklevel=3,
+        )
+
+
+def _check_count(name: str, value: int) -> None:
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise TypeError(f"{name} must be an integer, got {value!r} ({type(value).__name__}).")
+    if value < 1:
+        raise ValueError(f"{name} must be at least 1, got {value!r}.")

@@ -1,0 +1,292 @@
+"""TorchRL transforms: neighbors for replayed batches, noise for observations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
+from torch import Tensor
+from torchrl.data import Composite, Unbounded
+from torchrl.envs import Transform
+
+from torchrl_l2c2.neighborhood import Neighborhood, check_num_samples
+
+
+def _listed(entries: TensorDictBase | Composite) -> str:
+    return ", ".join(sorted(map(str, entries.keys(True, True)))) or "no entries"
+
+
+class _RandomTransform(Transform):
+    """A transform whose own generator, if it has one, is part of its ``state_dict``."""
+
+    def __init__(
+        self,
+        in_keys: Sequence[NestedKey] | None,
+        out_keys: Sequence[NestedKey] | None,
+        generator: torch.Generator | None,
+    ) -> None:
+        if generator is not None and not isinstance(generator, torch.Generator):
+            raise TypeError(
+                f"generator must be a torch.Generator or None, got {generator!r}: pass "
+                "torch.Generator().manual_seed(seed)."
+            )
+        super().__init__(in_keys=in_keys, out_keys=out_keys)
+        self.generator = generator
+
+    def get_extra_state(self) -> Tensor:
+        # Not None: some ways of saving take tensors only.
+        return torch.empty(0) if self.generator is None else self.generator.get_state()
+
+    def set_extra_state(self, state: Tensor) -> None:
+        saved, present = state.numel() > 0, self.generator is not None
+        if saved != present:
+            with_or_without = {True: "with", False: "without"}
+            raise ValueError(
+                f"{type(self).__name__} was saved {with_or_without[saved]} a generator and built "
+                f"{with_or_without[present]} one: build it as it was built then."
+            )
+        if present:
+            self.generator.set_state(state)
+
+
+class NeighborTransform(_RandomTransform):
+    r"""Draws neighbors of each sampled state, where the batch is drawn.
+
+    Appended to a replay buffer, it adds to every batch the states
+    :math:`\tilde s = s + (s' - s)\, u` of a :class:`Neighborhood` and their distances (Kobayashi,
+    L2C2, 2022, "Implementation"). It can equally be called on any tensordict with states and
+    successors. The batch keeps its size; with batch size ``[*B]`` and ``K`` samples the new entry
+    is, with the same batch size::
+
+        neighbor = {
+            "observation": [*B, K, *F],   # one per key of in_keys, nested as there
+            "distance": [*B, K],
+        }
+
+    Several keys are parts of one state: their displacements are drawn independently and the
+    distance is that of the whole, the largest of the parts'.
+
+    .. note::
+        A transform that widens the step from :math:`s` to :math:`s'`, such as
+        :class:`~torchrl.envs.transforms.MultiStepTransform`, widens the neighborhood with it.
+
+    Args:
+        neighborhood: where neighbors are drawn and how far away they count.
+        in_keys: the entries that make up the state; their successors are read from ``("next",
+            key)``. Defaults to ``["observation"]``.
+        out_key: the entry to write. Defaults to ``"neighbor"``.
+        num_samples: neighbors ``K`` per state, at least 1. More give a less noisy regularization
+            at ``K`` times its network evaluations. Defaults to ``1``.
+        generator: source of the randomness, on the device of the batches. It is saved and
+            restored with the ``state_dict`` of the transform, hence of the buffer. Defaults to
+            PyTorch's global generator. A buffer's own generator does not reach its transforms, so
+            a buffer that prefetches needs one here to be reproducible, and a ``prefetch`` of 1:
+            several threads draw in any order.
+
+    Raises:
+        TypeError: if ``neighborhood`` or ``generator`` is of another type, or, in use, if an
+            entry is not floating point.
+        ValueError: if ``num_samples`` is not positive, a key is reserved, or the transform is
+            appended to an environment, which does not know :math:`s'` when it shows :math:`s`.
+        KeyError: in use, if an entry or its successor is missing.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+        >>> from torchrl_l2c2 import Neighborhood, NeighborTransform
+        >>> replay = TensorDictReplayBuffer(storage=LazyTensorStorage(100), batch_size=32)
+        >>> _ = replay.append_transform(NeighborTransform(Neighborhood(), num_samples=4))
+        >>> state = torch.randn(50, 3)
+        >>> _ = replay.extend(
+        ...     TensorDict({"observation": state, "next": {"observation": state + 0.1}}, [50])
+        ... )
+        >>> batch = replay.sample()
+        >>> batch["neighbor", "observation"].shape, batch["neighbor", "distance"].shape
+        (torch.Size([32, 4, 3]), torch.Size([32, 4]))
+    """
+
+    def __init__(
+        self,
+        neighborhood: Neighborhood,
+        in_keys: Sequence[NestedKey] | None = None,
+        out_key: NestedKey = "neighbor",
+        num_samples: int = 1,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        if not isinstance(neighborhood, Neighborhood):
+            raise TypeError(f"neighborhood must be a Neighborhood, got {neighborhood!r}.")
+        check_num_samples(num_samples)
+        super().__init__(
+            in_keys=["observation"] if in_keys is None else in_keys,
+            out_keys=[out_key],
+            generator=generator,
+        )
+        roots = [key if isinstance(key, str) else key[0] for key in self.in_keys]
+        if not roots or "distance" in roots:
+            raise ValueError(
+                f"in_keys must name at least one entry and none called 'distance', which holds "
+                f"the neighbors' distances; got {self.in_keys}."
+            )
+        self.neighborhood = neighborhood
+        self.num_samples = num_samples
+
+    @property
+    def out_key(self) -> NestedKey:
+        """The entry that is written."""
+        return self.out_keys[0]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the neighbors and their distances into the tensordict.
+
+        Args:
+            tensordict: states and successors, with any number of batch dimensions.
+
+        Returns:
+            The same tensordict.
+        """
+        drawn = {key: self._draw(tensordict, key) for key in self.in_keys}
+        neighbors = TensorDict(batch_size=tensordict.batch_size, device=tensordict.device)
+        for key, (neighbor, _) in drawn.items():
+            neighbors.set(key, neighbor)
+        distances = torch.stack([distance for _, distance in drawn.values()])
+        neighbors.set("distance", distances.amax(0))
+        return tensordict.set(self.out_key, neighbors)
+
+    def _draw(self, tensordict: TensorDictBase, key: NestedKey) -> tuple[Tensor, Tensor]:
+        next_key = unravel_key(("next", key))
+        state, next_state = tensordict.get(key, None), tensordict.get(next_key, None)
+        for name, entry in ((key, state), (next_key, next_state)):
+            if entry is None:
+                raise KeyError(
+                    f"NeighborTransform needs {name!r}, which the tensordict lacks; it has "
+                    f"{_listed(tensordict)}. Store it, or name the state's entries in in_keys."
+                )
+        return self.neighborhood.sample(
+            state,
+            next_state,
+            self.num_samples,
+            self.generator,
+            batch_dims=tensordict.batch_dims,
+        )
+
+    def set_container(self, container: Any) -> None:
+        super().set_container(container)
+        if self.parent is not None:
+            raise ValueError(
+                "NeighborTransform belongs to a replay buffer, not to an environment: neighbors "
+                "need the successor of the state. Append it to the buffer with append_transform."
+            )
+
+    def __repr__(self) -> str:
+        return (
+            f"{type(self).__name__}({self.neighborhood}, keys={self.in_keys}, "
+            f"out_key={self.out_key!r}, num_samples={self.num_samples})"
+        )
+
+
+class ObservationNoise(_RandomTransform):
+    """Adds white Gaussian noise to the observations of an environment.
+
+    The noise is drawn once per observation, at every step and reset, so the successor of a state
+    and the state that follows it are the same noisy observation, as with a real sensor.
+    Environments of a batch that are not reset keep theirs.
+
+    The paper states a "scale" of its white noise (Kobayashi, L2C2, 2022, "Setup"), read here as the
+    standard deviation of a Gaussian [inferred].
+
+    The noise leaves the bounds of the observations, so their spec becomes unbounded.
+
+    Args:
+        scale: standard deviation of the noise, in units of the observation, finite and at least 0;
+            a number, or a tensor that broadcasts to the observation. Larger values make the task
+            harder; the paper uses 0.01 and 0.001.
+        in_keys: the observations to perturb. Defaults to ``["observation"]``; others, also
+            floating-point ones such as the episode's reward sum, stay exact unless named.
+        generator: source of the randomness, on the device of the observations. It is saved and
+            restored with the ``state_dict`` of the environment. Defaults to PyTorch's global
+            generator. TorchRL gives the seed of ``env.set_seed`` to the simulator and not to
+            transforms: seed a generator of its own, or call :func:`torch.manual_seed`. In the
+            workers of a :class:`~torchrl.envs.ParallelEnv` ``set_seed`` does seed the global
+            generator, each worker's with another seed, which a generator made in the environment's
+            constructor would share between the workers.
+
+    Raises:
+        TypeError: if ``generator`` is not a generator, or, when an environment takes the
+            transform, if an observation is not floating point.
+        ValueError: if ``scale`` is negative or not finite, or, likewise, does not broadcast to an
+            observation.
+        KeyError: likewise, if the environment has no such observation.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl.envs import GymEnv, TransformedEnv
+        >>> from torchrl_l2c2 import ObservationNoise
+        >>> noise = ObservationNoise(scale=0.01, generator=torch.Generator().manual_seed(0))
+        >>> env = TransformedEnv(GymEnv("Pendulum-v1"), noise)
+        >>> rollout = env.rollout(10)
+        >>> torch.equal(rollout["next", "observation"][:-1], rollout["observation"][1:])
+        True
+    """
+
+    def __init__(
+        self,
+        scale: float | Tensor,
+        in_keys: Sequence[NestedKey] | None = None,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        in_keys = ["observation"] if in_keys is None else in_keys
+        super().__init__(in_keys=in_keys, out_keys=in_keys, generator=generator)
+        scale = torch.as_tensor(scale, dtype=torch.get_default_dtype())
+        if not (scale.isfinite() & (scale >= 0)).all():
+            raise ValueError(f"scale must be finite and at least 0, got {scale.tolist()!r}.")
+        # A setting, not a state: a checkpoint must not overrule it.
+        self.register_buffer("scale", scale, persistent=False)
+
+    def _apply_transform(self, obs: Tensor) -> Tensor:
+        noise = torch.randn(obs.shape, generator=self.generator, dtype=obs.dtype, device=obs.device)
+        # In place, so that the observation keeps its dtype.
+        return noise.mul_(self.scale).add_(obs)
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+    def set_container(self, container: Any) -> None:
+        super().set_container(container)
+        # TorchRL works specs out when they are first asked for, which may be after a step.
+        if self.parent is not None:
+            self.transform_observation_spec(self.parent.observation_spec.clone())
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        for key in self.in_keys:
+            if key not in observation_spec.keys(True, True):
+                raise KeyError(
+                    f"ObservationNoise finds no observation {key!r}; the environment has "
+                    f"{_listed(observation_spec)}. Name those to perturb in in_keys."
+                )
+            spec = observation_spec[key]
+            self._check_leaf(key, spec.dtype, spec.shape)
+            observation_spec[key] = Unbounded(spec.shape, device=spec.device, dtype=spec.dtype)
+        return observation_spec
+
+    def _check_leaf(self, key: NestedKey, dtype: torch.dtype, shape: torch.Size) -> None:
+        if not dtype.is_floating_point:
+            raise TypeError(
+                f"ObservationNoise needs floating-point observations, {key!r} has dtype {dtype}: "
+                "convert it with a transform before this one, or leave it out of in_keys."
+            )
+        trailing = shape[len(shape) - self.scale.ndim :]
+        if self.scale.ndim > len(shape) or any(
+            size not in (1, full) for size, full in zip(self.scale.shape, trailing, strict=True)
+        ):
+            raise ValueError(
+                f"scale of shape {tuple(self.scale.shape)} does not broadcast to the observation "
+                f"{key!r} of shape {tuple(shape)}."
+            )
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}(scale={self.scale.tolist()}, keys={self.in_keys})"

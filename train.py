@@ -1,0 +1,44 @@
+"""Trains one run of the paper's experiment: `python train.py task=swingup regularizer=l2c2`.
+
+`python train.py --help` lists every setting; `-m` runs several values of some one after another.
+"""
+
+import sys
+from pathlib import Path
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+from torchrl_l2c2.experiment import Experiment, ExperimentConfig
+from torchrl_l2c2.experiment.checkpoints import CheckpointError
+from torchrl_l2c2.experiment.reports import compare_with_paper
+from torchrl_l2c2.experiment.training import Interrupted
+
+
+@hydra.main(version_base="1.3", config_path="conf", config_name="config")
+def main(settings: DictConfig) -> None:
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    try:
+        config = ExperimentConfig.from_dict(OmegaConf.to_container(settings, resolve=True))
+        experiment = Experiment(config, folder, resume=settings.resume)
+        print(f"{describe(config)}: {folder}")
+        experiment.train(progress=True)
+        run = experiment.finish(experiment.test(progress=True))
+    except Interrupted as interruption:
+        print(interruption, file=sys.stderr)
+        sys.exit(interruption.exit_status)
+    except (ValueError, OSError, CheckpointError, FloatingPointError) as error:
+        sys.exit(f"error: {error}")
+    print(compare_with_paper(run))
+    print(f"picture: {folder / 'learning_curves.png'}")
+
+
+def describe(config: ExperimentConfig) -> str:
+    return ", ".join(
+        (config.task.name, config.algorithm.name, config.regularizer.name, f"seed {config.seed}")
+    )
+
+
+if __name__ == "__main__":
+    main()
