@@ -3,7 +3,9 @@
 `python train.py --help` lists every setting; `-m` runs several values of some one after another.
 """
 
+import logging
 import sys
+import warnings
 from pathlib import Path
 
 import hydra
@@ -13,18 +15,23 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig
 from torchrl_l2c2.experiment.checkpoints import CheckpointError
 from torchrl_l2c2.experiment.reports import compare_with_paper
-from torchrl_l2c2.experiment.training import Interrupted
+from torchrl_l2c2.experiment.training import Interrupted, finished_run
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="config")
 def main(settings: DictConfig) -> None:
+    for chatty in ("torchrl", "matplotlib", "torch"):
+        logging.getLogger(chatty).setLevel(logging.ERROR)
+    warnings.simplefilter("ignore", FutureWarning)
     folder = Path(HydraConfig.get().runtime.output_dir)
     try:
         config = ExperimentConfig.from_dict(OmegaConf.to_container(settings, resolve=True))
-        experiment = Experiment(config, folder, resume=settings.resume)
         print(f"{describe(config)}: {folder}")
-        experiment.train(progress=True)
-        run = experiment.finish(experiment.test(progress=True))
+        run = finished_run(folder, config)
+        if run is None:
+            experiment = Experiment(config, folder, resume=settings.resume)
+            experiment.train(progress=True)
+            run = experiment.finish(experiment.test(progress=True))
     except Interrupted as interruption:
         print(interruption, file=sys.stderr)
         sys.exit(interruption.exit_status)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import (
     CompositeDistribution,
     TensorDictModule,
@@ -24,8 +24,8 @@ from torchrl.modules import (
     NormalParamExtractor,
     OneHotCategorical,
     ProbabilisticActor,
-    QValueModule,
     QValueActor,
+    QValueModule,
     TanhNormal,
     ValueOperator,
     VDNMixer,
@@ -82,6 +82,12 @@ class Case:
         return self.name
 
     @property
+    def observation(self) -> NestedKey:
+        """The key of the state."""
+        team = self.batch in (agents_batch, discrete_agents_batch)
+        return ("agents", "observation") if team else "observation"
+
+    @property
     def terms(self) -> list[str]:
         """The keys that start with ``loss_l2c2``."""
         policy = [] if self.policy is None else ["loss_l2c2_actor"]
@@ -128,7 +134,11 @@ def composite_actor() -> ProbabilisticActor:
             normal, logits = self.net(observation).split([2 * ACTION, ACTIONS], -1)
             return *self.normal(normal), logits
 
-    parameters = [("params", "move", "loc"), ("params", "move", "scale"), ("params", "pick", "logits")]
+    parameters = [
+        ("params", "move", "loc"),
+        ("params", "move", "scale"),
+        ("params", "pick", "logits"),
+    ]
     return ProbabilisticActor(
         TensorDictModule(Heads(), ["observation"], parameters),
         in_keys=["params"],
@@ -225,21 +235,27 @@ def one_hot_batch(*shape: int) -> TensorDict:
     return transitions(*shape, action=action.float())
 
 
-def agents_batch(*shape: int, discrete: bool = False) -> TensorDict:
+def agents_batch(*shape: int) -> TensorDict:
     """A team's transitions: observations and actions of the agents, one reward."""
     team = (*shape, AGENTS)
-    if discrete:
-        entries = {"action": nn.functional.one_hot(torch.randint(ACTIONS, team), ACTIONS)}
-    else:
-        entries = {
-            "action": torch.rand(*team, ACTION) - 0.5,
-            "action_log_prob": torch.randn(*team) / 10,
-        }
     batch = transitions(*shape).exclude("observation", "action", ("next", "observation"))
     for root in (batch, batch["next"]):
         observation = torch.randn(*team, OBSERVATION)
         root["agents"] = TensorDict({"observation": observation}, batch_size=team)
-    batch["agents"].update(entries)
+    batch["agents"].update(
+        {
+            "action": torch.rand(*team, ACTION) - 0.5,
+            "action_log_prob": torch.randn(*team) / 10,
+        }
+    )
+    return batch
+
+
+def discrete_agents_batch(*shape: int) -> TensorDict:
+    """The same with one-hot actions."""
+    batch = agents_batch(*shape)
+    actions = torch.randint(ACTIONS, (*shape, AGENTS))
+    batch["agents", "action"] = nn.functional.one_hot(actions, ACTIONS)
     return batch
 
 
@@ -510,7 +526,7 @@ CASES = [
     Case(
         "QMixer",
         make_qmixer,
-        lambda *shape: agents_batch(*shape, discrete=True),
+        discrete_agents_batch,
         None,
         ("local_value",),
         reductions=("mean",),

@@ -28,10 +28,19 @@ def test_the_defaults_of_the_files_are_those_of_the_classes():
 )
 def test_every_file_of_every_group_is_a_valid_choice(group, name):
     """The file's values are the class's defaults, but for a variant's own."""
-    config = getattr(ExperimentConfig.from_dict(composed(f"{group}={name}")), group)
+    # The frames of one rollout are what on-policy learning alone can use.
+    extra = ["algorithm=ppo"] if name == "rollout" else []
+    config = getattr(ExperimentConfig.from_dict(composed(f"{group}={name}", *extra)), group)
     assert config.name == name
     if name not in ("l2c2_policy",):
         assert config == GROUPS[group][name](name=name)
+
+
+@pytest.mark.parametrize("algorithm", GROUPS["algorithm"])
+def test_an_algorithm_brings_its_usual_replay_and_optimizer(algorithm):
+    """From the files as from the classes."""
+    files = ExperimentConfig.from_dict(composed(f"algorithm={algorithm}"))
+    assert files == ExperimentConfig(algorithm=GROUPS["algorithm"][algorithm]())
 
 
 @pytest.mark.parametrize("task", ["swingup", "reacher", "hopper", "ant"])

@@ -91,10 +91,10 @@ class TSoftUpdate(TargetNetUpdater):
         """Sets the targets to their sources and the statistics to their start."""
         super().init_()
         # One name and one tensor per parameter: tensordicts are slow to walk at every step.
-        sources = self._sources.flatten_keys(".")
+        sources, targets = self._sources.flatten_keys("."), self._targets.flatten_keys(".")
         self._names = list(sources.keys())
         self._source_list = [sources[name] for name in self._names]
-        self._target_list = [self._targets.flatten_keys(".")["target_" + n] for n in self._names]
+        self._target_list = [targets[f"target_{name}"] for name in self._names]
         first = self._target_list[0]
         self._weight = first.new_full((len(self._names),), (1.0 - self.tau) / self.tau)
         self._scale = torch.full_like(self._weight, INITIAL_SCALE)
@@ -139,9 +139,9 @@ class TSoftUpdate(TargetNetUpdater):
                     f"unexpected {unexpected}. Load the state of an updater of the same networks."
                 )
         super().load_state_dict(state_dict)
-        # In place, so that a compiled step keeps seeing these tensors.
+        # In place: a state may come from another device or dtype.
         for entry, vector in (("weight", self._weight), ("scale", self._scale)):
-            vector.copy_(torch.stack([torch.as_tensor(state_dict[entry][n]) for n in self._names]))
+            vector.copy_(torch.stack([state_dict[entry][name] for name in self._names]))
 
     def _follow_loss_module(self) -> None:
         """Takes the statistics to where the loss was moved."""

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from copy import deepcopy
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictParams
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
-from torchrl.objectives.utils import TargetNetUpdater
 
+from torchrl_l2c2.experiment.algorithms import Parts, make_algorithm
 from torchrl_l2c2.experiment.compilation import compiled
 from torchrl_l2c2.experiment.config import (
     AdamConfig,
@@ -22,50 +21,45 @@ from torchrl_l2c2.experiment.config import (
     ExperimentConfig,
     L2C2Config,
     OptimizerConfig,
-    PPORPEConfig,
     RegularizerConfig,
 )
-from torchrl_l2c2.modules import make_actor, make_critic
 from torchrl_l2c2.neighborhood import Neighborhood
-from torchrl_l2c2.objectives import CAPSLoss, L2C2Loss, PPORPELoss
+from torchrl_l2c2.objectives import CAPSLoss, L2C2Loss
 from torchrl_l2c2.optim import AdaTerm
 from torchrl_l2c2.updaters import TSoftUpdate
 
 
 @dataclass
-class Agent:
-    """Everything that learns in a run.
+class Agent(Parts):
+    """Everything that learns in a run: an algorithm's parts, their optimizer and its limits.
 
     Attributes:
-        loss: the algorithm's loss, regularized.
-        policy: acts; shares its parameters with ``loss``, so it is always the current one.
         optimizer: of all of the loss's parameters.
-        target_updater: moves the target networks after every update.
+        max_grad_norm: norm that gradients are scaled down to; ``None`` leaves them.
+        policy_delay: updates of the values per update of the policy.
     """
 
-    loss: LossModule
-    policy: TensorDictModule
-    optimizer: torch.optim.Optimizer
-    target_updater: TargetNetUpdater
+    optimizer: torch.optim.Optimizer | None = None
+    max_grad_norm: float | None = None
+    policy_delay: int = 1
 
 
 def make_agent(config: ExperimentConfig, env: EnvBase) -> Agent:
     """Builds the agent for an environment's observation and action.
 
     Raises:
-        ValueError: a setting outside its range, or an action that the algorithm cannot take.
+        ValueError: a setting outside its range, or actions that the algorithm cannot take.
     """
-    loss, policy = _make_ppo_rpe(config.algorithm, env)
-    loss = regularize(loss, config.regularizer)
+    parts = make_algorithm(config.algorithm, env, partial(regularize, config.regularizer))
     return Agent(
-        loss=loss,
-        policy=policy,
-        optimizer=_make_optimizer(config.optimizer, loss),
-        target_updater=TSoftUpdate(loss, tau=config.algorithm.tau, nu=config.algorithm.nu),
+        **vars(parts),
+        optimizer=_make_optimizer(config.optimizer, parts.loss),
+        max_grad_norm=getattr(config.algorithm, "max_grad_norm", None),
+        policy_delay=getattr(config.algorithm, "policy_delay", 1),
     )
 
 
-def regularize(loss: LossModule, regularizer: RegularizerConfig) -> LossModule:
+def regularize(regularizer: RegularizerConfig, loss: LossModule) -> LossModule:
     """Wraps a loss with the chosen regularizer; ``none`` gives the loss itself."""
     if isinstance(regularizer, L2C2Config):
         near = Neighborhood(regularizer.sigma, regularizer.lambda_min, regularizer.lambda_max)
@@ -74,52 +68,13 @@ def regularize(loss: LossModule, regularizer: RegularizerConfig) -> LossModule:
         )
     if isinstance(regularizer, CAPSConfig):
         return CAPSLoss(
-            loss, regularizer.sigma, regularizer.lambda_temporal, regularizer.lambda_spatial
+            loss,
+            regularizer.sigma,
+            regularizer.lambda_temporal,
+            regularizer.lambda_spatial,
+            mean=regularizer.mean,
         )
     return loss
-
-
-def _make_ppo_rpe(algorithm: PPORPEConfig, env: EnvBase) -> tuple[LossModule, TensorDictModule]:
-    size = env.observation_spec["observation"].shape[-1]
-    if not env.action_spec.dtype.is_floating_point:
-        raise ValueError(
-            f"algorithm=ppo_rpe needs continuous actions, this task's are {env.action_spec}."
-        )
-    actor = make_actor(
-        size,
-        env.action_spec,
-        hidden=algorithm.hidden,
-        squash=algorithm.squash,
-        squish_b=algorithm.squish_b,
-    )
-    critic = make_critic(
-        size, num_heads=algorithm.num_heads, hidden=algorithm.hidden, squish_b=algorithm.squish_b
-    )
-    loss = PPORPELoss(
-        actor,
-        critic,
-        gamma=algorithm.gamma,
-        kappa=algorithm.kappa,
-        beta=algorithm.beta,
-        decay=algorithm.decay,
-        delta_min=algorithm.delta_min,
-        threshold=algorithm.threshold,
-        critic_weighting=algorithm.critic_weighting,
-        baseline=algorithm.baseline,
-    )
-    acts = (
-        loss.target_actor_network_params
-        if algorithm.acting_policy == "target"
-        else loss.actor_network_params
-    )
-    return loss, sharing(actor, acts)
-
-
-def sharing(network: TensorDictModule, parameters: TensorDictParams) -> TensorDictModule:
-    """A copy of a network on a loss's own parameters: it changes as they do."""
-    copy = deepcopy(network)
-    parameters.data.to_module(copy)
-    return copy
 
 
 def _make_optimizer(optimizer: OptimizerConfig, loss: LossModule) -> torch.optim.Optimizer:
@@ -139,48 +94,72 @@ def _make_optimizer(optimizer: OptimizerConfig, loss: LossModule) -> torch.optim
 
 def make_update(
     agent: Agent, *, compile: bool, skip_nonfinite: bool = False
-) -> Callable[[TensorDictBase], Tensor | None]:
+) -> Callable[[TensorDictBase, bool], Tensor | None]:
     """One gradient step as a function of a batch: loss, gradients, optimizer, target networks.
 
     Args:
         agent (Agent): what is updated, in place.
-        compile (bool): whether to compile: the whole step is one graph then.
+        compile (bool): whether to compile: with AdaTerm and the t-soft update the whole step is
+            one graph; with others, loss and gradients are.
         skip_nonfinite (bool): whether a batch with a loss or gradient that is NaN or infinite
             changes nothing and gives ``None``. The step is two graphs then.
 
     Returns:
-        Callable: takes a batch, writes the new priorities into it and returns the values of
-        ``agent.loss.out_keys``, in their order, as one tensor.
+        Callable: takes a batch and whether the policy is updated too; writes the new priorities
+        into the batch and returns the means of ``agent.loss.out_keys``, in their order, as one
+        tensor.
     """
     parameters = [p for group in agent.optimizer.param_groups for p in group["params"]]
+    keys = agent.loss.out_keys
 
-    def differentiate(batch: TensorDictBase) -> tuple[Tensor, tuple[Tensor, ...]]:
+    def differentiate(
+        batch: TensorDictBase, with_policy: bool
+    ) -> tuple[Tensor, tuple[Tensor | None, ...]]:
         terms = agent.loss(batch)
-        total = sum(terms[key] for key in agent.loss.out_keys if key.startswith("loss_"))
-        gradients = torch.autograd.grad(total, parameters)
-        return torch.stack([terms[key].detach() for key in agent.loss.out_keys]), gradients
+        total = sum(terms[key] for key in keys if is_loss(key) and (with_policy or on_values(key)))
+        gradients = torch.autograd.grad(total, parameters, allow_unused=True)
+        return torch.stack([terms[key].detach().float().mean() for key in keys]), gradients
 
-    def apply(gradients: tuple[Tensor, ...]) -> None:
+    def apply(gradients: tuple[Tensor | None, ...]) -> None:
         for parameter, gradient in zip(parameters, gradients, strict=True):
             parameter.grad = gradient
+        if agent.max_grad_norm is not None:
+            torch.nn.utils.clip_grad_norm_(parameters, agent.max_grad_norm)
         agent.optimizer.step()
-        agent.target_updater.step()
+        if agent.target_updater is not None:
+            agent.target_updater.step()
 
-    def update(batch: TensorDictBase) -> Tensor:
-        values, gradients = differentiate(batch)
+    def update(batch: TensorDictBase, with_policy: bool) -> Tensor:
+        values, gradients = differentiate(batch, with_policy)
         apply(gradients)
         return values
 
-    if not skip_nonfinite:
-        return compiled(update) if compile else update
+    # torch's own optimizers and TorchRL's updaters break the graph.
+    whole = isinstance(agent.optimizer, AdaTerm) and isinstance(agent.target_updater, TSoftUpdate)
+    if compile and whole and not skip_nonfinite:
+        return compiled(update)
     if compile:
-        differentiate, apply = compiled(differentiate), compiled(apply)
+        differentiate = compiled(differentiate)
+        apply = compiled(apply) if whole else apply
+    if not skip_nonfinite:
+        return update
 
-    def checked_update(batch: TensorDictBase) -> Tensor | None:
-        values, gradients = differentiate(batch)
-        if not all(bool(tensor.isfinite().all()) for tensor in (values, *gradients)):
+    def checked_update(batch: TensorDictBase, with_policy: bool) -> Tensor | None:
+        values, gradients = differentiate(batch, with_policy)
+        tensors = (values, *(g for g in gradients if g is not None))
+        if not all(bool(tensor.isfinite().all()) for tensor in tensors):
             return None
         apply(gradients)
         return values
 
     return checked_update
+
+
+def is_loss(key: str) -> bool:
+    """Whether an entry of a loss's output is one of the terms that are summed."""
+    return key == "loss" or key.startswith("loss_")
+
+
+def on_values(key: str) -> bool:
+    """Whether a term trains value functions alone."""
+    return not (key.endswith("_actor") or key.startswith("loss_caps_"))

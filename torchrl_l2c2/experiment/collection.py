@@ -44,6 +44,8 @@ class EpisodeCollector(Collector):
             Learning at the end of every episode needs this. Default ``True``.
         compile_policy (bool): whether to compile the policy. Random numbers are drawn as without.
             Default ``False``.
+        random_frames (int): first frames whose actions are drawn from the action's bounds
+            instead. Default 0.
         exploration_type (ExplorationType): default ``RANDOM``.
 
     Raises:
@@ -68,6 +70,7 @@ class EpisodeCollector(Collector):
         frames_per_batch: int,
         stop_at_done: bool = True,
         compile_policy: bool = False,
+        random_frames: int = 0,
         exploration_type: ExplorationType = ExplorationType.RANDOM,
     ) -> None:
         self._simulator, self._noise = _parts(env)
@@ -79,9 +82,11 @@ class EpisodeCollector(Collector):
             frames_per_batch=frames_per_batch,
             total_frames=-1,
             track_traj_ids=False,
+            auto_register_policy_transforms=False,
             exploration_type=exploration_type,
         )
         self.stop_at_done = stop_at_done
+        self._random_frames_left = random_frames
         # The collector has reset the environment when it was made.
         self._observation: Tensor | None = self._carrier.get("observation")
         self._policy_keys = [key for key in policy.out_keys if not key.startswith("_")]
@@ -102,6 +107,9 @@ class EpisodeCollector(Collector):
                 if observation is None:
                     observation = self._observe(self._gymnasium.reset()[0])
                 outputs = self._act(observation)
+                if self._random_frames_left > 0:
+                    self._random_frames_left -= 1
+                    outputs[action_index].copy_(self._simulator.action_spec.rand())
                 action = self._to_action(outputs[action_index])
                 seen, reward, terminated, truncated, _ = self._gymnasium.step(action)
                 following = self._observe(seen)
@@ -124,7 +132,11 @@ class EpisodeCollector(Collector):
             raise RuntimeError("an episode is being played; a run can be saved between episodes.")
         simulator = self._gymnasium.unwrapped.np_random.bit_generator.state
         noise = None if self._noise is None else self._noise.generator.get_state()
-        return {"simulator": json.dumps(simulator), "noise": noise}
+        return {
+            "simulator": json.dumps(simulator),
+            "noise": noise,
+            "random_frames_left": self._random_frames_left,
+        }
 
     def set_generator_state(self, state: dict[str, Any]) -> None:
         """Restores what :meth:`generator_state` gave; the next episode starts with a reset."""
@@ -132,6 +144,7 @@ class EpisodeCollector(Collector):
         self._gymnasium.unwrapped.np_random.bit_generator.state = simulator
         if self._noise is not None:
             self._noise.generator.set_state(state["noise"])
+        self._random_frames_left = state["random_frames_left"]
         self._observation = None
 
     def _observe(self, seen: np.ndarray) -> Tensor:

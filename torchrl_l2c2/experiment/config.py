@@ -65,6 +65,88 @@ class PPORPEConfig:
 
 
 @dataclass(frozen=True)
+class SACConfig:
+    """Soft actor-critic. Comments: ``conf/algorithm/sac.yaml``."""
+
+    name: str = "sac"
+    gamma: float = 0.99
+    tau: float = 0.005
+    alpha_init: float = 1.0
+    hidden: tuple[int, ...] = (256, 256)
+    random_frames: int = 1000
+    reward_scale: float | None = 1.0
+    schedule: str = "step"
+    updates: int | None = 1
+
+    def __post_init__(self) -> None:
+        _off_policy(self)
+
+
+@dataclass(frozen=True)
+class TD3Config:
+    """Twin delayed DDPG. Comments: ``conf/algorithm/td3.yaml``."""
+
+    name: str = "td3"
+    gamma: float = 0.99
+    tau: float = 0.005
+    exploration_noise: float = 0.1
+    policy_noise: float = 0.2
+    noise_clip: float = 0.5
+    policy_delay: int = 2
+    hidden: tuple[int, ...] = (256, 256)
+    random_frames: int = 1000
+    reward_scale: float | None = 1.0
+    schedule: str = "step"
+    updates: int | None = 1
+
+    def __post_init__(self) -> None:
+        _off_policy(self)
+        _whole(self, "policy_delay")
+
+
+@dataclass(frozen=True)
+class DQNConfig:
+    """Double deep Q-learning, for discrete actions. Comments: ``conf/algorithm/dqn.yaml``."""
+
+    name: str = "dqn"
+    gamma: float = 0.99
+    tau: float = 0.005
+    epsilon_end: float = 0.05
+    epsilon_frames: int = 10_000
+    hidden: tuple[int, ...] = (120, 84)
+    random_frames: int = 1000
+    reward_scale: float | None = 1.0
+    schedule: str = "step"
+    updates: int | None = 1
+
+    def __post_init__(self) -> None:
+        _off_policy(self)
+        _whole(self, "epsilon_frames")
+
+
+@dataclass(frozen=True)
+class PPOConfig:
+    """Proximal policy optimization with a clipped ratio. Comments: ``conf/algorithm/ppo.yaml``."""
+
+    name: str = "ppo"
+    gamma: float = 0.99
+    gae_lambda: float = 0.95
+    clip_epsilon: float = 0.2
+    entropy_coeff: float = 0.0
+    critic_coeff: float = 0.5
+    max_grad_norm: float = 0.5
+    frames: int = 2048
+    epochs: int = 10
+    hidden: tuple[int, ...] = (64, 64)
+    reward_scale: float | None = 1.0
+    schedule: str = "rollout"
+
+    def __post_init__(self) -> None:
+        _choice(self, "schedule", "rollout")
+        _whole(self, "frames", "epochs")
+
+
+@dataclass(frozen=True)
 class NoRegularizerConfig:
     """The loss as it is: the paper's vanilla."""
 
@@ -79,6 +161,7 @@ class CAPSConfig:
     sigma: float = 0.2
     lambda_temporal: float = 0.01
     lambda_spatial: float = 0.05
+    mean: str = "loc"
 
 
 @dataclass(frozen=True)
@@ -114,12 +197,23 @@ class UniformReplayConfig:
     """Uniform experience replay. Comments: ``conf/replay/uniform.yaml``."""
 
     name: str = "uniform"
-    capacity: int = 10_000
-    batch_size: int = 32
+    capacity: int = 100_000
+    batch_size: int = 256
 
     def __post_init__(self) -> None:
         _whole(self, "capacity", "batch_size")
         _fits(self)
+
+
+@dataclass(frozen=True)
+class RolloutReplayConfig:
+    """The frames of one rollout, for on-policy learning. Comments: ``conf/replay/rollout.yaml``."""
+
+    name: str = "rollout"
+    batch_size: int = 64
+
+    def __post_init__(self) -> None:
+        _whole(self, "batch_size")
 
 
 @dataclass(frozen=True)
@@ -150,21 +244,31 @@ class LoggerConfig:
     name: str = "csv"
 
 
-AlgorithmConfig = PPORPEConfig
+AlgorithmConfig = PPORPEConfig | SACConfig | TD3Config | DQNConfig | PPOConfig
 RegularizerConfig = NoRegularizerConfig | CAPSConfig | L2C2Config
-ReplayConfig = PrioritizedReplayConfig | UniformReplayConfig
+ReplayConfig = PrioritizedReplayConfig | UniformReplayConfig | RolloutReplayConfig
 OptimizerConfig = AdaTermConfig | AdamConfig
 
 # group -> name -> its class; what a group's `name` may be.
 GROUPS: dict[str, dict[str, type]] = {
-    "algorithm": {"ppo_rpe": PPORPEConfig},
+    "algorithm": {
+        "ppo_rpe": PPORPEConfig,
+        "sac": SACConfig,
+        "td3": TD3Config,
+        "dqn": DQNConfig,
+        "ppo": PPOConfig,
+    },
     "regularizer": {
         "none": NoRegularizerConfig,
         "caps": CAPSConfig,
         "l2c2": L2C2Config,
         "l2c2_policy": L2C2Config,
     },
-    "replay": {"prioritized": PrioritizedReplayConfig, "uniform": UniformReplayConfig},
+    "replay": {
+        "prioritized": PrioritizedReplayConfig,
+        "uniform": UniformReplayConfig,
+        "rollout": RolloutReplayConfig,
+    },
     "optimizer": {"adaterm": AdaTermConfig, "adam": AdamConfig},
     "logger": {"csv": LoggerConfig, "tensorboard": LoggerConfig},
 }
@@ -173,6 +277,8 @@ GROUPS: dict[str, dict[str, type]] = {
 @dataclass(frozen=True)
 class ExperimentConfig:
     """Everything one run depends on; the defaults are those of ``python train.py``.
+
+    Left at ``None``, ``replay`` and ``optimizer`` are the algorithm's usual ones.
 
     Raises:
         ValueError: a setting that is not known or lies outside its range.
@@ -186,8 +292,8 @@ class ExperimentConfig:
     task: TaskConfig = field(default_factory=TaskConfig)
     algorithm: AlgorithmConfig = field(default_factory=PPORPEConfig)
     regularizer: RegularizerConfig = field(default_factory=L2C2Config)
-    replay: ReplayConfig = field(default_factory=PrioritizedReplayConfig)
-    optimizer: OptimizerConfig = field(default_factory=AdaTermConfig)
+    replay: ReplayConfig | None = None
+    optimizer: OptimizerConfig | None = None
     logger: LoggerConfig = field(default_factory=LoggerConfig)
     seed: int = 0
     threads: int = 1
@@ -198,6 +304,16 @@ class ExperimentConfig:
     checkpoint_keep: int = 2
 
     def __post_init__(self) -> None:
+        replay, optimizer = _usual(self.algorithm)
+        # Frozen: this is how a default that depends on another field is set.
+        object.__setattr__(self, "replay", self.replay or replay)
+        object.__setattr__(self, "optimizer", self.optimizer or optimizer)
+        on_policy = isinstance(self.algorithm, PPOConfig)
+        if on_policy != isinstance(self.replay, RolloutReplayConfig):
+            raise ValueError(
+                f"algorithm={self.algorithm.name} cannot learn from replay={self.replay.name}: "
+                "ppo needs replay=rollout, the others replay=prioritized or replay=uniform."
+            )
         _whole(self, "threads", "test_episodes", "checkpoint_keep")
         _nonnegative(self, "checkpoint_interval")
         _choice(self, "on_nonfinite", "stop", "skip")
@@ -226,6 +342,14 @@ class ExperimentConfig:
     def to_dict(self) -> dict[str, Any]:
         """Nested dictionaries of plain values: ``from_dict`` reads them back."""
         return dataclasses.asdict(self)
+
+
+def _usual(algorithm: AlgorithmConfig) -> tuple[ReplayConfig, OptimizerConfig]:
+    if isinstance(algorithm, PPORPEConfig):
+        return PrioritizedReplayConfig(), AdaTermConfig()
+    if isinstance(algorithm, PPOConfig):
+        return RolloutReplayConfig(), AdamConfig()
+    return UniformReplayConfig(), AdamConfig()
 
 
 def _read_group(group: str, names: Mapping[str, type], values: Mapping[str, Any]) -> Any:
@@ -264,6 +388,13 @@ def _whole(config: object, *names: str) -> None:
             raise ValueError(
                 f"{_where(config, name)} must be a whole number of at least 1, got {value!r}."
             )
+
+
+def _off_policy(config: SACConfig | TD3Config | DQNConfig) -> None:
+    _choice(config, "schedule", "step", "episode")
+    _nonnegative(config, "random_frames")
+    if config.updates is not None:
+        _whole(config, "updates")
 
 
 def _choice(config: object, name: str, *allowed: str) -> None:

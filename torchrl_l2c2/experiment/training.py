@@ -22,13 +22,15 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import (
     LazyTensorStorage,
+    SamplerWithoutReplacement,
     TensorDictPrioritizedReplayBuffer,
     TensorDictReplayBuffer,
 )
-from torchrl.envs import RewardScaling
+from torchrl.envs import ExplorationType, RewardScaling, set_exploration_type
+from torchrl.modules import EGreedyModule
 from tqdm.auto import tqdm
 
-from torchrl_l2c2.experiment.agents import make_agent, make_update
+from torchrl_l2c2.experiment.agents import is_loss, make_agent, make_update
 from torchrl_l2c2.experiment.checkpoints import (
     CheckpointError,
     global_rng_state,
@@ -42,9 +44,11 @@ from torchrl_l2c2.experiment.checkpoints import (
 from torchrl_l2c2.experiment.collection import EpisodeCollector
 from torchrl_l2c2.experiment.compilation import compiler_available
 from torchrl_l2c2.experiment.config import (
+    AlgorithmConfig,
     ExperimentConfig,
     L2C2Config,
     PrioritizedReplayConfig,
+    RolloutReplayConfig,
 )
 from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
 from torchrl_l2c2.experiment.evaluate import Evaluation, evaluate_policy
@@ -176,7 +180,8 @@ class Experiment:
             "config": json.dumps(self.config.to_dict()),
             "loss": self.agent.loss.state_dict(),
             "optimizer": self.agent.optimizer.state_dict(),
-            "target_updater": self.agent.target_updater.state_dict(),
+            "target_updater": _state_of(self.agent.target_updater),
+            "exploration": _state_of(self.agent.exploration),
             "replay": replay_state(self.replay),
             "collector": self.collector.generator_state(),
             "global_rng": global_rng_state(),
@@ -194,7 +199,9 @@ class Experiment:
         check_same_settings(json.loads(state["config"]), self.config.to_dict())
         self.agent.loss.load_state_dict(state["loss"])
         self.agent.optimizer.load_state_dict(state["optimizer"])
-        self.agent.target_updater.load_state_dict(state["target_updater"])
+        for part in ("target_updater", "exploration"):
+            if state[part] is not None:
+                getattr(self.agent, part).load_state_dict(state[part])
         load_replay_state(self.replay, state["replay"])
         self.collector.set_generator_state(state["collector"])
         self.frames, self.updates, self.skipped_updates = state["counters"]
@@ -204,11 +211,16 @@ class Experiment:
         set_global_rng_state(state["global_rng"])
 
     def _resume(self, elsewhere: str | Path | None) -> None:
-        source = elsewhere or self.folder
-        found = load_newest(source) if source is not None else None
-        if found is None:
-            if elsewhere is not None:
+        # The folder's own checkpoint first: the same command again continues what it began.
+        found = None if self.folder is None else load_newest(self.folder)
+        if found is None and elsewhere is not None:
+            found = load_newest(elsewhere)
+            if found is None:
                 raise CheckpointError(f"resume={str(elsewhere)!r} holds no checkpoint_*.pt.")
+            if self.folder is not None:
+                log = (Path(elsewhere) / "metrics.csv").read_bytes()
+                write_atomically(self.folder / "metrics.csv", log)
+        if found is None:
             return
         path, state, damaged = found
         for message in damaged:
@@ -220,17 +232,20 @@ class Experiment:
         """One episode and the updates that belong to it; its metrics."""
         parts: list[TensorDictBase] = []
         terms: list[torch.Tensor] = []
-        ended = False
-        while not ended:
+        while not parts or not parts[-1]["next", "done"][-1]:
             batch = self.collector.rollout()
             self._check_finite(batch)
-            self.frames += batch.numel()
-            self.replay.extend(self._remembered(batch))
             parts.append(batch)
-            ended = bool(batch["next", "done"][-1])
-            for _ in range(self._due_updates(ended)):
-                self._one_update(terms)
+            self.frames += batch.numel()
+            if isinstance(self.agent.exploration, EGreedyModule):
+                self.agent.exploration.step(batch.numel())
+            if self.config.algorithm.schedule == "step":
+                self.replay.extend(self._remembered(batch))
+                self._replay_updates(self.config.algorithm.updates or 1, terms)
         episode = torch.cat(parts)
+        if self.config.algorithm.schedule != "step":
+            self.replay.extend(self._remembered(episode))
+            self._updates_after_episode(terms)
         return {
             "episode": len(self.metrics) + 1,
             "frames": self.frames,
@@ -294,27 +309,42 @@ class Experiment:
             self.env,
             self.agent.policy,
             frames_per_batch=1 if by_step else self.config.task.max_steps,
-            compile_policy=self._compile,
+            # Modules that only explore take decisions that cannot be compiled.
+            compile_policy=self._compile and self.agent.exploration is None,
+            random_frames=self._random_frames,
         )
 
+    @property
+    def _random_frames(self) -> int:
+        return getattr(self.config.algorithm, "random_frames", 0)
+
+    @torch.no_grad()
     def _remembered(self, batch: TensorDictBase) -> TensorDictBase:
         """The entries that the loss reads, and no others: sampling copies every one of them."""
+        if self.agent.advantage is not None:
+            batch = self.agent.advantage(scale_reward(batch, self.config.algorithm))
         return batch.select(*self.agent.loss.in_keys, strict=False)
 
-    def _due_updates(self, ended: bool) -> int:
-        """How many updates the schedule asks for now."""
-        replay, algorithm = self.config.replay, self.config.algorithm
-        if len(self.replay) < replay.batch_size:
-            return 0
-        if algorithm.schedule == "step":
-            return algorithm.updates or 1
-        if not ended:
-            return 0
-        return algorithm.updates or len(self.replay) // replay.batch_size
+    def _updates_after_episode(self, terms: list[torch.Tensor]) -> None:
+        algorithm = self.config.algorithm
+        if algorithm.schedule == "episode":
+            one_pass = len(self.replay) // self.config.replay.batch_size
+            self._replay_updates(algorithm.updates or one_pass, terms)
+        elif len(self.replay) >= algorithm.frames:
+            for _ in range(algorithm.epochs):
+                for batch in self.replay:
+                    self._one_update(batch, terms)
+            self.replay.empty()
 
-    def _one_update(self, terms: list[torch.Tensor]) -> None:
-        batch = self.replay.sample()
-        values = self.update(batch)
+    def _replay_updates(self, count: int, terms: list[torch.Tensor]) -> None:
+        if len(self.replay) < self.config.replay.batch_size or self.frames < self._random_frames:
+            return
+        for _ in range(count):
+            self._one_update(self.replay.sample(), terms)
+
+    def _one_update(self, batch: TensorDictBase, terms: list[torch.Tensor]) -> None:
+        with_policy = (self.updates + 1) % self.agent.policy_delay == 0
+        values = self.update(batch, with_policy)
         if values is None:
             self.skipped_updates += 1
             return
@@ -337,10 +367,10 @@ class Experiment:
             self._check_terms(values)
             values = values.mean(0)
         means = dict(zip(keys, values.tolist(), strict=True))
-        losses = {k: abs(v) for k, v in means.items() if k.startswith("loss_")}
+        losses = {k: abs(v) for k, v in means.items() if is_loss(k)}
         total = sum(losses.values())
         shares = {
-            k.replace("loss_", "share_"): v / total if total else 0.0 for k, v in losses.items()
+            k.replace("loss", "share"): v / total if total else 0.0 for k, v in losses.items()
         }
         return {**means, **shares}
 
@@ -366,11 +396,16 @@ class Experiment:
 
     @torch.no_grad()
     def _action_variation(self, episode: TensorDictBase) -> float:
-        """Of the policy's mean, from the distribution parameters that it wrote while acting."""
+        """Of the policy's mean, at the states of an episode in which it explored."""
         if episode.numel() < 2:
             return 0.0
-        mean = self.agent.policy.build_dist_from_params(episode).deterministic_sample
-        return action_variation(mean).item()
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            mean = self.agent.policy(episode.select("observation"))["action"]
+        return action_variation(mean.float()).item()
+
+
+def _state_of(part: Any) -> dict[str, Any] | None:
+    return None if part is None else part.state_dict()
 
 
 class Interrupted(Exception):
@@ -409,6 +444,16 @@ def stop_on_signals() -> Iterator[list[int]]:
         yield received
     finally:
         restore()
+
+
+def finished_run(folder: str | Path, config: ExperimentConfig) -> FinishedRun | None:
+    """The finished run of these very settings in a folder; ``None`` where there is none."""
+    folder = Path(folder)
+    if not (folder / "evaluation.json").exists():
+        return None
+    saved = json.loads((folder / "config.json").read_text())
+    # As JSON, where a tuple and a list are the same.
+    return FinishedRun.read(folder) if saved == json.loads(json.dumps(config.to_dict())) else None
 
 
 # What may differ between a run and its continuation: it changes none of the numbers.
@@ -450,19 +495,34 @@ def seed_everything(seed: int) -> None:
 def make_replay(config: ExperimentConfig) -> TensorDictReplayBuffer:
     """The replay buffer, with the reward's scale and, for L2C2, the neighbors as transforms."""
     replay, algorithm = config.replay, config.algorithm
-    common: dict[str, Any] = {
-        "storage": LazyTensorStorage(replay.capacity),
-        "batch_size": replay.batch_size,
-        "generator": torch.Generator().manual_seed(config.seed),
-    }
-    if isinstance(replay, PrioritizedReplayConfig):
+    generator = torch.Generator().manual_seed(config.seed)
+    if isinstance(replay, RolloutReplayConfig):
+        # The last episode may go past the rollout's frames.
+        storage = LazyTensorStorage(algorithm.frames + config.task.max_steps)
+        buffer = TensorDictReplayBuffer(
+            storage=storage,
+            sampler=SamplerWithoutReplacement(),
+            batch_size=replay.batch_size,
+            generator=generator,
+        )
+    elif isinstance(replay, PrioritizedReplayConfig):
         buffer = TensorDictPrioritizedReplayBuffer(
-            alpha=replay.alpha, beta=replay.beta, priority_key="td_error", **common
+            alpha=replay.alpha,
+            beta=replay.beta,
+            priority_key="td_error",
+            storage=LazyTensorStorage(replay.capacity),
+            batch_size=replay.batch_size,
+            generator=generator,
         )
     else:
-        buffer = TensorDictReplayBuffer(**common)
-    scale = 1.0 - algorithm.gamma if algorithm.reward_scale is None else algorithm.reward_scale
-    buffer.append_transform(RewardScaling(loc=0.0, scale=scale, in_keys=[("next", "reward")]))
+        buffer = TensorDictReplayBuffer(
+            storage=LazyTensorStorage(replay.capacity),
+            batch_size=replay.batch_size,
+            generator=generator,
+        )
+    if not isinstance(replay, RolloutReplayConfig):
+        scaling = RewardScaling(0.0, reward_scale(algorithm), in_keys=[("next", "reward")])
+        buffer.append_transform(scaling)
     if isinstance(config.regularizer, L2C2Config):
         regularizer = config.regularizer
         buffer.append_transform(
@@ -473,6 +533,17 @@ def make_replay(config: ExperimentConfig) -> TensorDictReplayBuffer:
             )
         )
     return buffer
+
+
+def reward_scale(algorithm: AlgorithmConfig) -> float:
+    """Factor on rewards while learning."""
+    return 1.0 - algorithm.gamma if algorithm.reward_scale is None else algorithm.reward_scale
+
+
+def scale_reward(batch: TensorDictBase, algorithm: AlgorithmConfig) -> TensorDictBase:
+    """A batch with the rewards that are learned from."""
+    reward = batch["next", "reward"] * reward_scale(algorithm)
+    return batch.copy().set(("next", "reward"), reward)
 
 
 def check_finite(batch: TensorDictBase, first_frame: int) -> None:

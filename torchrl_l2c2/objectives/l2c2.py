@@ -41,16 +41,17 @@ class L2C2Loss(RegularizedLoss):
     it uses them, the weights of prioritized replay.
 
     Neighbors are read from the batch where :class:`~torchrl_l2c2.NeighborTransform` has written
-    them, and otherwise drawn from the observations and next observations with torch's global
-    generator. Drawn here, the floating-point inputs of all regularized networks that have a
-    successor in the batch are moved, and the distance is the largest of theirs.
+    them (give it the same neighborhood), and otherwise drawn from the observations and next
+    observations with torch's global generator. Drawn here, those floating-point inputs of the
+    regularized networks are moved that have a successor in the batch, and the distance is the
+    largest of theirs.
 
     ``forward`` adds these entries to the loss's own:
 
     * ``loss_l2c2_actor``, the policy term, and one value term for each value function, named after
       its network: ``loss_l2c2_critic``, ``loss_l2c2_qvalue``, ``loss_l2c2_value``, ...
-    * ``l2c2_distance``, the mean :math:`d`, and ``l2c2_gain``, the mean :math:`\lambda_\pi / d` that
-      is applied;
+    * ``l2c2_distance``, the mean :math:`d`, and ``l2c2_gain``, the mean gain applied,
+      :math:`\lambda_\pi / d`;
     * ``l2c2_hellinger`` (``l2c2_action_distance`` for deterministic policies) and
       ``l2c2_value_distance``, the mean :math:`d_\pi` and, summed over the value functions,
       :math:`d_V`. With ``reduction="none"`` diagnostics are not averaged either.
@@ -88,11 +89,13 @@ class L2C2Loss(RegularizedLoss):
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from torchrl.modules import Actor, ValueOperator
+        >>> from torchrl.modules import MLP, Actor, ValueOperator
         >>> from torchrl.objectives import DDPGLoss, SoftUpdate
         >>> from torchrl_l2c2 import L2C2Loss, Neighborhood
         >>> actor = Actor(torch.nn.Linear(3, 1))
-        >>> value = ValueOperator(torch.nn.Linear(4, 1), in_keys=["observation", "action"])
+        >>> value = ValueOperator(
+        ...     MLP(in_features=4, out_features=1), in_keys=["observation", "action"]
+        ... )
         >>> loss = L2C2Loss(DDPGLoss(actor, value), Neighborhood(sigma=1.0), beta=0.1)
         >>> isinstance(loss, DDPGLoss), isinstance(loss, L2C2Loss)
         (True, True)
@@ -221,8 +224,8 @@ class L2C2Loss(RegularizedLoss):
         }
         if "distance" not in entries:
             raise KeyError(
-                f"{self.l2c2_neighbor_key!r} holds {list(entries)}, but no 'distance': write it with "
-                "NeighborTransform, or name another neighbor_key."
+                f"{self.l2c2_neighbor_key!r} holds {list(entries)}, but no 'distance': write it "
+                "with NeighborTransform, or name another neighbor_key."
             )
         distance = entries.pop("distance")
         return TensorDict(entries, batch_size=distance.shape), distance
@@ -250,9 +253,7 @@ def _value_term(network: str) -> str:
 
 
 def _match(distance: Tensor, difference: Tensor) -> Tensor:
-    """Distances ``[K, *B]`` for differences with one more dimension (agents) or one less."""
-    while distance.ndim > difference.ndim:
-        distance = distance.amax(-1)
+    """Distances ``[K, *B]`` for differences that may have more dimensions, those of agents."""
     return distance[(...,) + (None,) * (difference.ndim - distance.ndim)]
 
 

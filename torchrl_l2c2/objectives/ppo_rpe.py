@@ -8,7 +8,12 @@ from typing import Literal
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictParams,
+    dispatch,
+)
 from torch import Tensor
 from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator
@@ -34,8 +39,9 @@ class PPORPELoss(LossModule):
         y = r + \gamma (1 - \mathrm{terminated}) \bar V(s')
 
     with :math:`A = y - V(s)` detached, :math:`\bar V` the mean of the target critic's heads and
-    the threshold :math:`\epsilon = \kappa\Delta`. Both terms are weighted by the importance weights
-    of prioritized replay where the batch has them, and ``|A|`` is written as the new priority.
+    the threshold :math:`\epsilon = \kappa\Delta`. Both terms are multiplied by the importance weights
+    of prioritized replay where the batch has them, divided by the batch's largest (Schaul et al.,
+    arXiv:1511.05952), and ``|A|`` is written as the new priority.
 
     [inferred] Only the abstracts of the algorithm's papers could be read, so these are settings:
     all heads share one target; ``threshold``, ``critic_weighting`` and ``baseline`` each have the
@@ -117,6 +123,13 @@ class PPORPELoss(LossModule):
     tensor_keys: _AcceptedKeys
     default_value_estimator = ValueEstimators.TD0
 
+    # LossModule.convert_to_functional looks for these annotations.
+    actor_network: ProbabilisticTensorDictSequential
+    critic_network: TensorDictModule
+    actor_network_params: TensorDictParams
+    critic_network_params: TensorDictParams
+    target_actor_network_params: TensorDictParams
+    target_critic_network_params: TensorDictParams
     delta: Tensor
 
     def __init__(
@@ -165,6 +178,8 @@ class PPORPELoss(LossModule):
         self.reduction = reduction
         # A concrete device, so that the buffer follows the networks' without asking for one.
         self.register_buffer("delta", torch.tensor(delta_min, device=self._default_device))
+        # Now, and not at the first batch: it is a part of the state_dict.
+        self.make_value_estimator()
         self._in_keys: list[NestedKey] | None = None
         self._out_keys: list[NestedKey] | None = None
 
@@ -246,23 +261,38 @@ class PPORPELoss(LossModule):
         if self.critic_weighting == "ratio":
             loss_critic = loss_critic * relative_ratio.detach()
 
-        weights = self._maybe_get_priority_weight(tensordict)
+        weight = self._importance_weight(tensordict)
         return TensorDict(
             {
-                "loss_actor": self._reduce_loss(loss_actor, tensordict, weights=weights),
-                "loss_critic": self._reduce_loss(loss_critic, tensordict, weights=weights),
+                "loss_actor": self._reduce_loss(weight * loss_actor, tensordict),
+                "loss_critic": self._reduce_loss(weight * loss_critic, tensordict),
                 "ratio_deviation": deviation,
                 "ratio_threshold": epsilon,
             }
         )
 
+    def _importance_weight(self, tensordict: TensorDictBase) -> Tensor | float:
+        """As in prioritized replay: over the batch's largest, so that it only scales down.
+
+        TorchRL's own losses divide by the sum instead, which leaves the loss at full strength.
+        With an optimizer that has a smallest scale of gradients, as AdaTerm has, and beside terms
+        that are not weighted, the strength matters.
+        """
+        weight = self._maybe_get_priority_weight(tensordict)
+        return 1.0 if weight is None else weight / weight.max()
+
+    def _evaluate_batch(self, network: str, tensordict: TensorDictBase) -> TensorDictBase:
+        """What a network writes at the batch's own states; a regularizer reads it here as well."""
+        net = getattr(self, network)
+        run = net.get_dist_params if network == "actor_network" else net
+        with getattr(self, f"{network}_params").to_module(net):
+            return run(tensordict.select(*net.in_keys))
+
     def _values(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """The heads ``[*B, K]`` and their mean ``[*B, 1]``; one head where there is no ensemble."""
-        states = tensordict.select(*self.critic_network.in_keys)
-        with self.critic_network_params.to_module(self.critic_network):
-            states = self.critic_network(states)
-        value = states.get(self.tensor_keys.value)
-        heads = states.get(self.tensor_keys.value_heads, None)
+        written = self._evaluate_batch("critic_network", tensordict)
+        value = written.get(self.tensor_keys.value)
+        heads = written.get(self.tensor_keys.value_heads, None)
         return (value if heads is None else heads), value
 
     def _target(self, tensordict: TensorDictBase) -> Tensor:
@@ -273,9 +303,8 @@ class PPORPELoss(LossModule):
 
     def _log_ratio(self, tensordict: TensorDictBase) -> Tensor:
         action = tensordict.get(self.tensor_keys.action)
-        states = tensordict.select(*self.actor_network.in_keys)
-        with self.actor_network_params.to_module(self.actor_network):
-            log_prob = self.actor_network.get_dist(states).log_prob(action)
+        parameters = self._evaluate_batch("actor_network", tensordict)
+        log_prob = self.actor_network.build_dist_from_params(parameters).log_prob(action)
         if self.baseline == "stored":
             return log_prob - tensordict.get(self.tensor_keys.sample_log_prob)
         states = tensordict.select(*self.actor_network.in_keys)

@@ -75,7 +75,7 @@ class RegularizedLoss(LossModule):
 
     Examples:
         >>> import torch
-        >>> from torchrl.modules import Actor, ValueOperator
+        >>> from torchrl.modules import MLP, Actor, ValueOperator
         >>> from torchrl.objectives import DDPGLoss
         >>> from torchrl_l2c2 import RegularizedLoss
         >>> class StillnessLoss(RegularizedLoss):
@@ -93,7 +93,9 @@ class RegularizedLoss(LossModule):
         ...         cost = self._reduce_term(action.square().sum(-1).mean(0), tensordict)
         ...         return terms.set("loss_stillness", self.stillness_coeff * cost)
         >>> actor = Actor(torch.nn.Linear(3, 1))
-        >>> value = ValueOperator(torch.nn.Linear(4, 1), in_keys=["observation", "action"])
+        >>> value = ValueOperator(
+        ...     MLP(in_features=4, out_features=1), in_keys=["observation", "action"]
+        ... )
         >>> loss = StillnessLoss(DDPGLoss(actor, value), coeff=0.1)
         >>> type(loss).__name__, isinstance(loss, DDPGLoss), loss.out_keys[-1]
         ('StillnessLoss[DDPGLoss]', True, 'loss_stillness')
@@ -127,12 +129,13 @@ class RegularizedLoss(LossModule):
         return self
 
     def __reduce_ex__(self, protocol: int) -> tuple[Any, ...]:
-        # The class has no name that can be imported; the classes that it is made of have.
-        return (_make_empty, self._parts, *super().__reduce_ex__(protocol)[2:])
+        # A class made here has no name that can be imported; the classes that it is made of have.
+        parts = vars(type(self)).get("_parts", (type(self),))
+        return (_make_empty, parts, *super().__reduce_ex__(protocol)[2:])
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name in self._coefficients and not isinstance(value, Tensor):
-            _check_coefficient(name, value)
+            value = _check_coefficient(name, value)
             if name not in self._buffers:
                 raise ValueError(
                     f"{name} has nothing to scale: this {type(self).__name__} was made without "
@@ -156,14 +159,16 @@ class RegularizedLoss(LossModule):
         Returns:
             TensorDict: the loss's own output with the regularizer's terms and diagnostics added.
         """
-        self._evaluated.clear()
-        # The loss's own draws come first: at one seed its terms are those of the plain loss.
-        terms = super().forward(tensordict)
-        tensordict = self._prepare(tensordict)
-        terms.update(self.policy_regularizer(tensordict))
-        terms.update(self.value_regularizer(tensordict))
-        self._evaluated.clear()
-        self._clear_weakrefs(tensordict, terms, *(f"{name}_params" for name in self._wiring))
+        self._evaluated["batch"] = tensordict
+        try:
+            # The loss's own draws come first: at one seed its terms are those of the plain loss.
+            terms = super().forward(tensordict)
+            batch = self._prepare(tensordict)
+            terms.update(self.policy_regularizer(batch))
+            terms.update(self.value_regularizer(batch))
+        finally:
+            self._evaluated.clear()
+        self._clear_weakrefs(tensordict, batch, terms, *(f"{name}_params" for name in self._wiring))
         return terms
 
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -195,9 +200,8 @@ class RegularizedLoss(LossModule):
 
         Not persistent: the ``state_dict`` is to keep the keys of the plain loss's.
         """
-        _check_coefficient(name, value)
+        coefficient = torch.tensor(_check_coefficient(name, value), device=self._default_device)
         if used:
-            coefficient = torch.tensor(float(value), device=self._default_device)
             self.register_buffer(name, coefficient, persistent=False)
 
     def _regularize(self, networks: Iterable[str]) -> None:
@@ -211,15 +215,21 @@ class RegularizedLoss(LossModule):
         return self._wiring[POLICY_NETWORK].stochastic
 
     def _value_networks(self) -> list[str]:
-        """The value functions that the loss trains and whose output is one of its keys."""
+        """The value functions that the loss trains."""
         untrained = "critic_network" if getattr(self, "critic_coeff", 1.0) is None else None
-        return [
+        networks = [
             name
             for name in VALUE_NETWORKS
-            if name != untrained
-            and getattr(self, name, None) is not None
-            and self._value_key(name) is not None
+            if name != untrained and getattr(self, name, None) is not None
         ]
+        for name in networks:
+            if self._value_key(name) is None:
+                raise ValueError(
+                    f"{name} writes {list(getattr(self, name).out_keys)}, and none of it is a "
+                    f"value to this loss, whose keys are {self.tensor_keys}: name it with "
+                    "set_keys before the loss is regularized."
+                )
+        return networks
 
     # For regularizers: evaluations, made in the two methods.
 
@@ -237,7 +247,11 @@ class RegularizedLoss(LossModule):
         """
         keys = dict.fromkeys(key for name in networks for key in self._wiring[name].states)
         found = {key: tensordict.get(key, None) for key in keys}
-        floating = {k: v for k, v in found.items() if v is not None and v.is_floating_point()}
+        floating = {
+            key: value
+            for key, value in found.items()
+            if isinstance(value, Tensor) and value.is_floating_point()
+        }
         if not floating:
             dtypes = {key: getattr(value, "dtype", "missing") for key, value in found.items()}
             raise TypeError(
@@ -292,13 +306,15 @@ class RegularizedLoss(LossModule):
         return here.get(key), there.get(key)
 
     def _evaluate_batch(self, network: str, tensordict: TensorDictBase) -> TensorDictBase:
-        """Spares the second evaluation at the batch's own states.
+        """Keeps what the loss has evaluated at the batch's states until ``forward`` is done.
 
-        For losses that evaluate their networks there through a method of this name, as
-        :class:`PPORPELoss` does, and once in each forward pass.
+        Only for losses that do so through a method of this name, as :class:`PPORPELoss`: their
+        networks then need to be evaluated at the other states alone.
         """
-        self._evaluated[network] = super()._evaluate_batch(network, tensordict)
-        return self._evaluated[network]
+        out = super()._evaluate_batch(network, tensordict)
+        if "batch" in self._evaluated:
+            self._evaluated[network] = out
+        return out
 
     def _is_ensemble(self, network: str) -> bool:
         params = self._parameters_of(network)
@@ -312,8 +328,6 @@ class RegularizedLoss(LossModule):
         weights = None
         if hasattr(self.tensor_keys, "priority_weight"):
             weights = self._maybe_get_priority_weight(tensordict)
-        if weights is not None and weights.shape != value.shape:
-            weights = self._expand_loss_mask(weights, value)
         return self._reduce_loss(value, tensordict, weights=weights, reduction=self._term_reduction)
 
     def _diagnostic(self, value: Tensor, tensordict: TensorDictBase) -> Tensor:
@@ -337,7 +351,6 @@ class RegularizedLoss(LossModule):
         state = self.__dict__
         for name, value in vars(base_loss).items():
             state[name] = copy.copy(value) if name in _REGISTRIES else value
-        state["_cache"] = {}
         state.setdefault("_wiring", {})
         state["_evaluated"] = {}
         # Renaming keys here must not rename them there.
@@ -353,6 +366,8 @@ class RegularizedLoss(LossModule):
 
     def _wire(self, networks: Iterable[str]) -> None:
         self._wiring = {name: self._wiring_of(name) for name in networks}
+        if any(wiring.trunk for wiring in self._wiring.values()):
+            self._wiring[POLICY_NETWORK] = self._wiring_of(POLICY_NETWORK)
         if self.in_keys:
             states = (_next(key) for wiring in self._wiring.values() for key in wiring.states)
             self.in_keys = list(dict.fromkeys([*self.in_keys, *states]))
@@ -363,9 +378,11 @@ class RegularizedLoss(LossModule):
         stochastic, actions, made = False, self._action_keys(), set()
         if actor is not None:
             stochastic = _is_stochastic(actor)
-            if not stochastic and not set(actions) & set(actor.out_keys):
-                actions = [actor.out_keys[-1]]
-            made = set(actor.out_keys)
+            made = set(actor.out_keys) - set(actor.in_keys)
+            if stochastic:
+                actions += actor.dist_sample_keys
+            elif not made & set(actions):
+                actions = actor.out_keys[-1:]
         trunk = [key for key in net.in_keys if key in made - set(actions)]
         inputs = dict.fromkeys([*net.in_keys, *(actor.in_keys if trunk else ())])
         if network == POLICY_NETWORK:
@@ -399,7 +416,6 @@ class RegularizedLoss(LossModule):
 
     def _parameters_of(self, network: str) -> TensorDictBase | None:
         return getattr(self, f"{network}_params", None) if self.functional else None
-
 
     def _outputs_at(
         self,
@@ -439,8 +455,8 @@ class RegularizedLoss(LossModule):
             )
         rows = inputs.expand(states.batch_size[0] + with_batch, *batch)
         for key, state in moved.items():
-            here = [inputs.get(key).unsqueeze(0)] if with_batch else []
-            rows.set(key, torch.cat([*here, state]))
+            here = inputs.get(key).unsqueeze(0)
+            rows.set(key, torch.cat((here, state)) if with_batch else state)
         return rows.flatten(0, 1) if batch else rows
 
     def _evaluate(self, network: str, rows: TensorDictBase) -> TensorDictBase:
@@ -488,7 +504,9 @@ def _specialize(regularizer: type[RegularizedLoss], base: type[LossModule]) -> t
 def _check_no_clash(regularizer: type[RegularizedLoss], base: type[LossModule]) -> None:
     """Refuses to hide, by chance, a method of the loss that it needs itself."""
     ours = {name for part in regularizer.__mro__ for name in vars(part)}
-    theirs = {name for part in base.__mro__ if part not in regularizer.__mro__ for name in vars(part)}
+    theirs = {
+        name for part in base.__mro__ if part not in regularizer.__mro__ for name in vars(part)
+    }
     meant = dir(RegularizedLoss if issubclass(base, RegularizedLoss) else LossModule)
     meant = {*meant, "_evaluate_batch"}
     clash = sorted(name for name in ours & theirs - meant if not name.startswith("__"))
@@ -509,12 +527,15 @@ def _is_stochastic(actor: nn.Module) -> bool:
         for module in actor.modules()
         if isinstance(module, ProbabilisticTensorDictModule)
     }
-    if getattr(actor, "return_composite", False) and classes:
+    if classes <= {Delta, TanhDelta}:
+        return False
+    if getattr(actor, "return_composite", False) or not hasattr(actor, "get_dist_params"):
         raise TypeError(
-            "policies of several heads that sample from one another (return_composite=True) have "
-            "no distribution of their own: use one CompositeDistribution."
+            "the policy must be a ProbabilisticTensorDictSequential, such as a ProbabilisticActor, "
+            f"with one distribution, got a {type(actor).__name__} with {len(classes)}: join "
+            "several heads in one CompositeDistribution."
         )
-    return not classes <= {Delta, TanhDelta}
+    return True
 
 
 def _check_not_recurrent(net: nn.Module, name: str) -> None:
@@ -527,11 +548,12 @@ def _check_not_recurrent(net: nn.Module, name: str) -> None:
         )
 
 
-def _check_coefficient(name: str, value: Any) -> None:
+def _check_coefficient(name: str, value: Any) -> float:
     if not isinstance(value, Real) or isinstance(value, bool):
         raise TypeError(f"{name} must be a real number, got {value!r} ({type(value).__name__}).")
     if not (math.isfinite(value) and value >= 0):
         raise ValueError(f"{name} must be finite and at least 0, got {value!r}.")
+    return float(value)
 
 
 def _next(key: NestedKey) -> NestedKey:

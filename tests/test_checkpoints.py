@@ -1,0 +1,146 @@
+"""Checkpoint files: whole or refused, the newest whole one first, and no code inside."""
+
+import pickle
+import struct
+
+import pytest
+import torch
+
+from torchrl_l2c2.experiment.checkpoints import (
+    FORMAT_VERSION,
+    HEADER,
+    MAGIC,
+    CheckpointError,
+    global_rng_state,
+    list_checkpoints,
+    load_checkpoint,
+    load_newest,
+    save_checkpoint,
+    set_global_rng_state,
+)
+
+STATE = {"weights": torch.arange(100.0), "episode": 7, "names": ["a", "b"]}
+
+
+def truncated(path):
+    path.write_bytes(path.read_bytes()[:-10])
+
+
+def bit_flipped(path):
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+
+
+def emptied(path):
+    path.write_bytes(b"")
+
+
+def of_another_version(path):
+    content = bytearray(path.read_bytes())
+    struct.pack_into("<I", content, len(MAGIC), FORMAT_VERSION + 1)
+    path.write_bytes(content)
+
+
+def of_something_else(path):
+    path.write_bytes(b"\x89PNG" + bytes(HEADER.size))
+
+
+def test_what_is_saved_comes_back(tmp_path):
+    """Tensors and plain values, unchanged."""
+    loaded = load_checkpoint(save_checkpoint(tmp_path, 7, STATE, keep=2))
+    assert torch.equal(loaded["weights"], STATE["weights"])
+    assert (loaded["episode"], loaded["names"]) == (7, ["a", "b"])
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (truncated, "damaged, its checksum differs"),
+        (bit_flipped, "damaged, its checksum differs"),
+        (emptied, "cut short, 0 bytes are left"),
+        (of_another_version, f"format version {FORMAT_VERSION + 1}, .* reads {FORMAT_VERSION}"),
+        (of_something_else, "not a checkpoint of torchrl_l2c2"),
+    ],
+)
+def test_damage_is_told_and_the_one_before_is_used(tmp_path, damage, message):
+    """Never wrong numbers: the previous checkpoint, with the reason."""
+    older = save_checkpoint(tmp_path, 1, {"episode": 1}, keep=2)
+    newer = save_checkpoint(tmp_path, 2, {"episode": 2}, keep=2)
+    damage(newer)
+    with pytest.raises(CheckpointError, match=message):
+        load_checkpoint(newer)
+    path, state, damaged = load_newest(tmp_path)
+    assert path == older and state["episode"] == 1
+    assert len(damaged) == 1 and newer.name in damaged[0]
+    damage(older)
+    with pytest.raises(CheckpointError, match="no checkpoint can be read"):
+        load_newest(tmp_path)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    """The path and the system's reason."""
+    with pytest.raises(CheckpointError, match=r"gone\.pt: cannot be read \(No such file"):
+        load_checkpoint(tmp_path / "gone.pt")
+    assert load_newest(tmp_path) is None
+
+
+def test_old_ones_are_removed_by_count_newest_first(tmp_path):
+    """`keep` of them stay."""
+    for episode in (5, 40, 300):
+        save_checkpoint(tmp_path, episode, STATE, keep=2)
+    assert [path.name for path in list_checkpoints(tmp_path)] == [
+        "checkpoint_00000300.pt",
+        "checkpoint_00000040.pt",
+    ]
+
+
+def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
+    """A full disk: an error, the older checkpoint untouched, no partial file."""
+    older = save_checkpoint(tmp_path, 1, STATE, keep=1)
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        save_checkpoint(tmp_path, 2, STATE, keep=1)
+    assert [path.name for path in tmp_path.iterdir()] == [older.name]
+    assert load_checkpoint(older)["episode"] == 7
+
+
+def test_code_in_a_checkpoint_does_not_run(tmp_path):
+    """A pickled call is refused even under a right checksum."""
+    import hashlib
+    import io
+
+    class Harm:
+        def __reduce__(self):
+            return (open, (str(tmp_path / "harm"), "w"))
+
+    content = io.BytesIO()
+    torch.save({"harm": Harm()}, content, pickle_module=pickle)
+    payload = content.getvalue()
+    path = tmp_path / "checkpoint_00000001.pt"
+    header = HEADER.pack(MAGIC, FORMAT_VERSION, hashlib.sha256(payload).digest())
+    path.write_bytes(header + payload)
+    with pytest.raises(CheckpointError, match="content cannot be read"):
+        load_checkpoint(path)
+    assert not (tmp_path / "harm").exists()
+
+
+def test_global_generators_continue_where_they_were():
+    """Python's, NumPy's and PyTorch's next numbers."""
+    import random
+
+    import numpy as np
+
+    def draw():
+        return random.random(), np.random.rand(), torch.rand(()).item(), random.gauss(0, 1)
+
+    draw()
+    state = global_rng_state()
+    first = draw()
+    draw()
+    set_global_rng_state(state)
+    assert draw() == first

@@ -1,0 +1,426 @@
+"""The package's Hydra configurations, composed with those of TorchRL's trainers."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import fields
+
+import pytest
+import torch
+from hydra import compose, initialize
+from hydra.core.config_store import ConfigStore
+from hydra.errors import ConfigCompositionException, InstantiationException
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import ConfigAttributeError
+from tensordict import TensorDict
+from torch import nn
+from torchrl.data import TensorDictReplayBuffer
+from torchrl.envs import GymEnv, TransformedEnv
+from torchrl.objectives import SACLoss
+from torchrl.trainers.algorithms import SACTrainer
+
+from torchrl_l2c2 import (
+    AdaTerm,
+    CAPSLoss,
+    L2C2Loss,
+    Neighborhood,
+    NeighborTransform,
+    ObservationNoise,
+    PPORPELoss,
+    TSoftUpdate,
+    configs,
+    make_actor,
+    make_critic,
+)
+
+OURS = {
+    ("loss", "l2c2"): configs.L2C2LossConfig,
+    ("loss", "caps"): configs.CAPSLossConfig,
+    ("loss", "ppo_rpe"): configs.PPORPELossConfig,
+    ("transform", "neighbor"): configs.NeighborTransformConfig,
+    ("transform", "observation_noise"): configs.ObservationNoiseConfig,
+    ("optimizer", "adaterm"): configs.AdaTermConfig,
+    ("target_net_updater", "tsoft"): configs.TSoftUpdateConfig,
+    ("neighborhood", "l2c2"): configs.NeighborhoodConfig,
+}
+
+# Written as a user of TorchRL's trainers would write it.
+NETWORKS = {
+    "actor": {
+        "_target_": "torchrl.trainers.algorithms.configs.modules._make_tanh_normal_model",
+        "in_keys": ["observation"],
+        "out_keys": ["action"],
+        "network": {
+            "_target_": "torchrl.modules.MLP",
+            "in_features": 3,
+            "out_features": 2,
+            "num_cells": [8],
+        },
+    },
+    "qvalue": {
+        "_target_": "torchrl.trainers.algorithms.configs.modules._make_value_model",
+        "in_keys": ["observation", "action"],
+        "out_keys": ["state_action_value"],
+        "network": {
+            "_target_": "torchrl.modules.MLP",
+            "in_features": 4,
+            "out_features": 1,
+            "num_cells": [8],
+        },
+    },
+}
+SAC = ["+loss@loss.base_loss=sac", "++loss.base_loss.target_entropy=-1.0"]
+
+
+@pytest.fixture(autouse=True)
+def registered():
+    """The package's configurations are in Hydra's store."""
+    configs.register()
+
+
+def composed(*overrides: str) -> DictConfig:
+    """The configuration that these overrides make of an empty one."""
+    with initialize(version_base=None, config_path=None):
+        return compose(overrides=list(overrides))
+
+
+def with_networks(cfg: DictConfig) -> DictConfig:
+    """The configuration with a ``loss.base_loss`` given its networks."""
+    OmegaConf.set_struct(cfg, False)
+    cfg.networks = NETWORKS
+    cfg.loss.base_loss.actor_network = "${networks.actor}"
+    cfg.loss.base_loss.qvalue_network = "${networks.qvalue}"
+    return cfg
+
+
+def transitions(batch: int = 5) -> TensorDict:
+    """Made-up transitions of three observed values and one action."""
+    flags = torch.zeros(batch, 1, dtype=torch.bool)
+    return TensorDict(
+        {
+            "observation": torch.randn(batch, 3),
+            "action": torch.rand(batch, 1) - 0.5,
+            "next": {
+                "observation": torch.randn(batch, 3),
+                "reward": torch.randn(batch, 1),
+                "done": flags,
+                "terminated": flags,
+            },
+        },
+        [batch],
+    )
+
+
+def test_l2c2_over_sac_composes():
+    """``loss: l2c2`` over ``loss: sac`` is a regularized SAC loss with the settings given."""
+    cfg = with_networks(
+        composed("+loss=l2c2", *SAC, "loss.beta=0.5", "loss.neighborhood.lambda_max=0.5")
+    )
+    loss = instantiate(cfg.loss)
+    assert isinstance(loss, SACLoss)
+    assert isinstance(loss, L2C2Loss)
+    assert loss.l2c2_neighborhood == Neighborhood(lambda_max=0.5)
+    assert loss.l2c2_beta == 0.5
+    terms = {key for key in loss(transitions()).keys() if key.startswith("loss_")}
+    assert terms == {
+        "loss_actor",
+        "loss_qvalue",
+        "loss_alpha",
+        "loss_l2c2_actor",
+        "loss_l2c2_qvalue",
+    }
+
+
+def test_regularizers_nest():
+    """A regularized loss can be the base of another."""
+    cfg = composed("+loss=l2c2", "+loss@loss.base_loss=caps", "+loss@loss.base_loss.base_loss=sac")
+    OmegaConf.set_struct(cfg, False)
+    cfg.networks = NETWORKS
+    cfg.loss.base_loss.base_loss.update(
+        {
+            "actor_network": "${networks.actor}",
+            "qvalue_network": "${networks.qvalue}",
+            "target_entropy": -1.0,
+        }
+    )
+    loss = instantiate(cfg.loss)
+    assert isinstance(loss, L2C2Loss) and isinstance(loss, CAPSLoss) and isinstance(loss, SACLoss)
+
+
+def test_l2c2_reads_nested_keys_and_sample_numbers():
+    """Lists are nested keys, as everywhere in TorchRL's configurations."""
+    cfg = with_networks(
+        composed(
+            "+loss=l2c2",
+            *SAC,
+            "loss.neighbor_key=[replay,near]",
+            "loss.hellinger_samples=3",
+            "loss.num_samples=2",
+            "loss.coeff=2.0",
+        )
+    )
+    loss = instantiate(cfg.loss)
+    assert loss.l2c2_neighbor_key == ("replay", "near")
+    assert (loss.l2c2_hellinger_samples, loss.l2c2_num_samples, loss.l2c2_coeff) == (3, 2, 2.0)
+
+
+def test_caps_over_sac_composes():
+    """``loss: caps`` over ``loss: sac`` is a SAC loss regularized by CAPS."""
+    cfg = with_networks(composed("+loss=caps", *SAC, "loss.sigma=0.3", "loss.mean=action"))
+    loss = instantiate(cfg.loss)
+    assert isinstance(loss, CAPSLoss) and isinstance(loss, SACLoss)
+    assert (loss.caps_sigma, loss.caps_mean) == (0.3, "action")
+
+
+def test_ppo_rpe_instantiates():
+    """``loss: ppo_rpe`` takes its networks like TorchRL's losses and keeps its settings."""
+    cfg = composed("+loss=ppo_rpe", "loss.kappa=0.25", "loss.threshold=ema")
+    loss = instantiate(cfg.loss, actor_network=make_actor(3, 1), critic_network=make_critic(3))
+    assert isinstance(loss, PPORPELoss)
+    assert (loss.kappa, loss.threshold) == (0.25, "ema")
+
+
+def test_ppo_rpe_needs_networks():
+    """Networks have no default: a loss without them is an error that names them."""
+    with pytest.raises(InstantiationException, match="actor_network"):
+        instantiate(composed("+loss=ppo_rpe").loss)
+
+
+def test_neighbor_transform_instantiates_and_is_seeded():
+    """``transform: neighbor`` with one seed draws the same neighbors, with another others."""
+    overrides = ["+transform=neighbor", "transform.num_samples=3", "transform.out_key=[replay,near]"]
+    batch = transitions()
+
+    def drawn(seed):
+        transform = instantiate(composed(*overrides, f"transform.seed={seed}").transform)
+        assert isinstance(transform, NeighborTransform)
+        return transform(batch.clone())["replay", "near", "observation"]
+
+    assert drawn(0).shape == (5, 3, 3)
+    assert torch.equal(drawn(0), drawn(0))
+    assert not torch.equal(drawn(0), drawn(1))
+
+
+def test_neighbor_transform_reads_nested_keys():
+    """Each item of ``in_keys`` is a key, a list a nested one."""
+    cfg = composed("+transform=neighbor", "transform.in_keys=[[agents,observation],position]")
+    assert instantiate(cfg.transform).in_keys == [("agents", "observation"), "position"]
+
+
+def test_neighborhood_is_shared():
+    """One ``neighborhood`` node serves the loss and the replay buffer's transform."""
+    cfg = with_networks(
+        composed(
+            "+neighborhood@near=l2c2",
+            "near.sigma=0.5",
+            "+loss=l2c2",
+            *SAC,
+            "loss.neighborhood=${near}",
+            "+replay_buffer=tensordict",
+            "replay_buffer.batch_size=4",
+            "+storage@replay_buffer.storage=list",
+            "replay_buffer.storage.max_size=10",
+            "+transform@replay_buffer.transform=neighbor",
+            "replay_buffer.transform.neighborhood=${near}",
+        )
+    )
+    replay = instantiate(cfg.replay_buffer)
+    assert isinstance(replay, TensorDictReplayBuffer)
+    replay.extend(transitions())
+    distance = replay.sample()["neighbor", "distance"]
+    near = Neighborhood(sigma=0.5)
+    assert (distance <= near.radius + near.epsilon).all()
+    assert instantiate(cfg.loss).l2c2_neighborhood == near
+
+
+@pytest.mark.parametrize("scale", [0.5, [0.5, 0.0, 0.0]])
+def test_observation_noise_instantiates_and_is_seeded(scale):
+    """``transform: observation_noise`` takes a number or a list, and a seed."""
+    cfg = composed("+transform=observation_noise", f"transform.scale={scale}", "transform.seed=3")
+
+    def observed():
+        noise = instantiate(cfg.transform)
+        assert isinstance(noise, ObservationNoise)
+        env = TransformedEnv(GymEnv("Pendulum-v1"), noise)
+        env.set_seed(0)
+        return env.reset()["observation"]
+
+    env = GymEnv("Pendulum-v1")
+    env.set_seed(0)
+    drawn = torch.randn(3, generator=torch.Generator().manual_seed(3))
+    expected = env.reset()["observation"] + drawn * torch.tensor(scale)
+    torch.testing.assert_close(observed(), expected)
+
+
+def test_adaterm_is_partial():
+    """``optimizer: adaterm`` waits for the parameters, as TorchRL's trainers give them."""
+    cfg = composed("+optimizer=adaterm", "optimizer.lr=0.02")
+    optimizer = instantiate(cfg.optimizer)(params=nn.Linear(2, 1).parameters())
+    assert isinstance(optimizer, AdaTerm)
+    assert optimizer.param_groups[0]["lr"] == 0.02
+
+
+def test_tsoft_is_partial():
+    """``target_net_updater: tsoft`` waits for the loss, as TorchRL's trainers give it."""
+    cfg = composed("+target_net_updater=tsoft", "target_net_updater.nu=.inf")
+    updater = instantiate(cfg.target_net_updater)(PPORPELoss(make_actor(3, 1), make_critic(3)))
+    assert isinstance(updater, TSoftUpdate)
+    assert (updater.tau, updater.nu) == (0.1, float("inf"))
+
+
+def test_trainer_composes():
+    """A whole SAC trainer of TorchRL's, regularized by configuration alone, trains."""
+    cfg = with_networks(
+        composed(
+            "+env@training_env=gym",
+            "training_env.env_name=Pendulum-v1",
+            "+collector=sync",
+            "collector.create_env_fn=${training_env}",
+            "collector.policy=${networks.actor}",
+            "collector.frames_per_batch=16",
+            "collector.total_frames=32",
+            "+replay_buffer=tensordict",
+            "replay_buffer.batch_size=8",
+            "+storage@replay_buffer.storage=lazy_tensor",
+            "replay_buffer.storage.max_size=100",
+            "+sampler@replay_buffer.sampler=prioritized",
+            "replay_buffer.sampler.max_capacity=100",
+            "replay_buffer.sampler.alpha=1.0",
+            "replay_buffer.sampler.beta=0.5",
+            "+transform@replay_buffer.transform=neighbor",
+            "replay_buffer.transform.seed=0",
+            "+loss=l2c2",
+            *SAC,
+            "+optimizer=adaterm",
+            "+target_net_updater=tsoft",
+            "+trainer=sac",
+            "trainer.collector=${collector}",
+            "trainer.replay_buffer=${replay_buffer}",
+            "trainer.loss_module=${loss}",
+            "trainer.optimizer=${optimizer}",
+            "trainer.target_net_updater=${target_net_updater}",
+            "trainer.logger=null",
+            "trainer.save_trainer_file=null",
+            "trainer.total_frames=32",
+            "trainer.optim_steps_per_batch=2",
+            "trainer.progress_bar=false",
+            "trainer.enable_logging=false",
+        )
+    )
+    trainer = instantiate(cfg.trainer)
+    assert isinstance(trainer, SACTrainer)
+    assert isinstance(trainer.loss_module, L2C2Loss)
+    assert isinstance(trainer.optimizer, AdaTerm)
+    assert isinstance(trainer.target_net_updater, TSoftUpdate)
+    trainer.train()
+    assert len(trainer._log_dict["loss_l2c2_qvalue"]) == 2
+
+
+@pytest.mark.parametrize(
+    "overrides,message",
+    [
+        (["+loss=l2c2", *SAC, "loss.beta=-1.0"], "l2c2_beta must be finite and at least 0"),
+        (["+loss=l2c2", *SAC, "loss.neighborhood.sigma=0.0"], "sigma must be finite and greater"),
+        (["+loss=l2c2", *SAC, "loss.num_samples=0"], "num_samples must be at least 1"),
+        (["+loss=caps", *SAC, "loss.sigma=-0.2"], "sigma must be finite and greater"),
+        (["+loss=caps", *SAC, "loss.mean=median"], "mean must be 'loc' or 'action'"),
+    ],
+)
+def test_wrong_loss_settings_give_the_loss_errors(overrides, message):
+    """What a loss refuses from Python, it refuses from a configuration, in the same words."""
+    with pytest.raises(InstantiationException, match=message):
+        instantiate(with_networks(composed(*overrides)).loss)
+
+
+@pytest.mark.parametrize(
+    "overrides,message",
+    [
+        (["+node=neighbor", "node.num_samples=0"], "num_samples must be an integer"),
+        (["+node=observation_noise", "node.scale=-0.1"], "scale must be finite and at least 0"),
+    ],
+)
+def test_wrong_transform_settings_give_the_transform_errors(overrides, message):
+    """Likewise for transforms."""
+    overrides = [overrides[0].replace("+node", "+transform@node"), overrides[1]]
+    with pytest.raises(InstantiationException, match=message):
+        instantiate(composed(*overrides).node)
+
+
+def test_wrong_optimizer_and_updater_settings_give_their_errors():
+    """Likewise for what waits for its parameters: when it gets them."""
+    optimizer = instantiate(composed("+optimizer=adaterm", "optimizer.beta=1.5").optimizer)
+    with pytest.raises(ValueError, match="beta"):
+        optimizer(params=nn.Linear(2, 1).parameters())
+    updater = instantiate(
+        composed("+target_net_updater=tsoft", "target_net_updater.tau=0.0").target_net_updater
+    )
+    with pytest.raises(ValueError, match="tau must be in"):
+        updater(PPORPELoss(make_actor(3, 1), make_critic(3)))
+
+
+@pytest.mark.parametrize("node", OURS)
+def test_unknown_settings_are_refused(node):
+    """A misspelled setting is an error of the composition, which names it."""
+    group, name = node
+    with pytest.raises(ConfigCompositionException, match="bett") as caught:
+        composed(f"+{group}@node={name}", "node.bett=1")
+    assert isinstance(caught.value.__cause__, ConfigAttributeError)
+
+
+@pytest.mark.parametrize("node", OURS)
+def test_values_of_another_type_are_refused(node):
+    """Numbers are checked where they are composed, before anything is built."""
+    group, name = node
+    numbers = [f.name for f in fields(OURS[node]) if f.type in ("float", "int", "int | None")]
+    for number in numbers:
+        with pytest.raises(ConfigCompositionException, match="many"):
+            composed(f"+{group}@node={name}", f"node.{number}=many")
+    assert numbers or node == ("transform", "observation_noise")
+
+
+def test_a_base_loss_is_required():
+    """``loss: l2c2`` alone has nothing to regularize and says what is missing."""
+    with pytest.raises(InstantiationException, match="base_loss"):
+        instantiate(composed("+loss=l2c2").loss)
+
+
+def test_registering_twice_changes_nothing():
+    """All our names, and TorchRL's own, are there once, the second call as the first."""
+
+    def stored():
+        repo = ConfigStore.instance().repo
+        groups = {group for group, _ in OURS}
+        return {(group, name): node.node for group in groups for name, node in repo[group].items()}
+
+    before = stored()
+    configs.register()
+    assert stored() == before
+    assert {(group, f"{name}.yaml") for group, name in OURS} <= set(before)
+    assert ("loss", "sac.yaml") in before
+
+
+def test_targets_are_the_package_own():
+    """No node of ours names anything but this package's classes and builders to be called."""
+    for group, name in OURS:
+        node = OmegaConf.to_container(composed(f"+{group}@node={name}").node)
+        targets = [node["_target_"]]
+        targets += [v["_target_"] for v in node.values() if isinstance(v, dict)]
+        assert all(target.startswith("torchrl_l2c2.") for target in targets)
+
+
+def test_hydra_is_optional_and_registration_explicit():
+    """The components do not import Hydra; importing the configurations stores none of them."""
+    program = """
+import sys
+import torchrl_l2c2
+assert not {"hydra", "omegaconf"} & set(sys.modules), "the components import Hydra"
+import torchrl_l2c2.configs
+from hydra.core.config_store import ConfigStore
+repo = ConfigStore.instance().repo
+assert "sac.yaml" in repo["loss"] and "l2c2.yaml" not in repo["loss"]
+torchrl_l2c2.configs.register()
+assert "l2c2.yaml" in repo["loss"]
+"""
+    subprocess.run([sys.executable, "-c", program], check=True)

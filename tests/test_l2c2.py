@@ -1,0 +1,438 @@
+"""The two terms of L2C2 against hand-computed numbers and a slow loop over transitions."""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import pytest
+import torch
+from losses import (
+    BOUNDS,
+    action_values,
+    critic,
+    deterministic_actor,
+    gaussian_actor,
+    heads_critic,
+    make_distributional_dqn,
+    mlp,
+    on_policy,
+    one_hot_batch,
+    qvalue,
+    transitions,
+)
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.modules import Actor, IndependentNormal, ProbabilisticActor, ValueOperator
+from torchrl.objectives import DDPGLoss, DiscreteSACLoss, DQNLoss, PPOLoss, SACLoss, TD3Loss
+
+from torchrl_l2c2 import L2C2Loss, Neighborhood, NeighborTransform, PPORPELoss
+
+# epsilon = 1/4, lambda_pi = 1/4: the gain is 1 at distance 1/4 and 1/5 at distance 5/4.
+NEAR = Neighborhood(sigma=1.0, lambda_min=0.2, lambda_max=1.0)
+
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::UserWarning:torchrl", "ignore:.*leaves out the policy term"
+)
+
+
+class LinearGaussian(nn.Module):
+    """Mean w.s and standard deviation 1/2 of a policy over one action."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.tensor([1.0, -2.0]))
+
+    def forward(self, observation):
+        loc = (observation * self.weight).sum(-1, keepdim=True)
+        return loc, torch.full_like(loc, 0.5)
+
+
+class LinearValue(nn.Module):
+    """V(s) = v.s."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.tensor([3.0, 1.0]))
+
+    def forward(self, observation):
+        return (observation * self.weight).sum(-1, keepdim=True)
+
+
+def linear_loss(**kwargs) -> L2C2Loss:
+    actor = ProbabilisticActor(
+        TensorDictModule(LinearGaussian(), ["observation"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=IndependentNormal,
+        return_log_prob=True,
+    )
+    value = ValueOperator(LinearValue(), in_keys=["observation"])
+    return L2C2Loss(PPOLoss(actor, value), NEAR, **kwargs)
+
+
+def linear_batch() -> TensorDict:
+    """Two states at 0 and (1, 1); u = (1/2, 1/4) and (0, -1): distances 3/4 and 5/4.
+
+    The mean moves by 1/2 - 2/4 = 0 and by 2, the value by 3/2 + 1/4 = 7/4 and by -1.
+    """
+    neighbor = {
+        "observation": torch.tensor([[[0.5, 0.25]], [[1.0, 0.0]]]),
+        "distance": torch.tensor([[0.75], [1.25]]),
+    }
+    return TensorDict(
+        {
+            "observation": torch.tensor([[0.0, 0.0], [1.0, 1.0]]),
+            "neighbor": TensorDict(neighbor, batch_size=[2]),
+        },
+        batch_size=[2],
+    )
+
+
+# H^2 of two normals of equal scale s whose means lie m apart is 1 - exp(-m^2 / (8 s^2)).
+HELLINGER = 1.0 - math.exp(-(2.0**2) / (8 * 0.5**2))
+
+
+class TestHandComputedNumbers:
+    def test_the_policy_term(self):
+        """lambda_pi times the mean of the Hellinger distance over the distance of the states."""
+        terms = linear_loss().policy_regularizer(linear_batch())
+        expected = (0.25 / 0.75 * 0.0 + 0.25 / 1.25 * HELLINGER) / 2
+        assert terms["loss_l2c2_actor"].item() == pytest.approx(expected, rel=1e-6)
+        assert terms["l2c2_hellinger"].item() == pytest.approx(HELLINGER / 2, rel=1e-6)
+
+    def test_the_value_term(self):
+        """beta lambda_pi times the mean of half the squared difference over the distance."""
+        terms = linear_loss(beta=0.4).value_regularizer(linear_batch())
+        differences = 0.5 * 1.75**2, 0.5 * 1.0**2
+        expected = 0.4 * (0.25 / 0.75 * differences[0] + 0.25 / 1.25 * differences[1]) / 2
+        assert terms["loss_l2c2_critic"].item() == pytest.approx(expected, rel=1e-6)
+        assert terms["l2c2_value_distance"].item() == pytest.approx(sum(differences) / 2, rel=1e-6)
+
+    def test_the_diagnostics_of_the_neighborhood(self):
+        """The mean distance 1 and the mean gain (1/3 + 1/5) / 2."""
+        terms = linear_loss().policy_regularizer(linear_batch())
+        assert terms["l2c2_distance"].item() == pytest.approx(1.0)
+        assert terms["l2c2_gain"].item() == pytest.approx((1 / 3 + 1 / 5) / 2)
+
+    def test_gradients_flow_through_both_states(self):
+        """d/dv of (v.x)^2 is 2 (v.x) x with x the difference of the states, not one of them."""
+        loss = linear_loss(beta=1.0)
+        term = loss.value_regularizer(linear_batch())["loss_l2c2_critic"]
+        (found,) = torch.autograd.grad(term, loss.critic_network.module.weight)
+        moves = torch.tensor([[0.5, 0.25], [0.0, -1.0]])
+        gains = torch.tensor([[0.25 / 0.75], [0.25 / 1.25]])
+        expected = (gains * torch.tensor([[1.75], [-1.0]]) * moves).mean(0)
+        torch.testing.assert_close(found, expected)
+
+    def test_several_neighbors_are_averaged(self):
+        """The mean over K = 2 neighbors is that of two batches with one each."""
+        loss, batch = linear_loss(), linear_batch()
+        other = linear_batch()
+        other["neighbor", "observation"] = -other["neighbor", "observation"]
+        other["neighbor", "distance"] = other["neighbor", "distance"] + 0.1
+        both = batch.clone()
+        both["neighbor"] = TensorDict(
+            {
+                key: torch.cat((batch["neighbor", key], other["neighbor", key]), 1)
+                for key in ("observation", "distance")
+            },
+            batch_size=[2],
+        )
+        for method in (loss.policy_regularizer, loss.value_regularizer):
+            singles, found = (method(batch), method(other)), method(both)
+            for key, value in found.items():
+                torch.testing.assert_close(value, 0.5 * (singles[0][key] + singles[1][key]))
+
+    @pytest.mark.parametrize(("u", "gain"), [(0.0, 1.0), (1.0, 0.2)])
+    def test_the_gain_is_lambda_max_at_the_state_and_lambda_min_at_the_edge(self, u, gain):
+        """At u = 0 and |u| = radius, where the distance is epsilon and radius + epsilon."""
+        batch = linear_batch()
+        batch["neighbor", "distance"] = torch.full((2, 1), u + NEAR.epsilon)
+        terms = linear_loss().policy_regularizer(batch)
+        assert terms["l2c2_gain"].item() == pytest.approx(gain)
+        assert terms["loss_l2c2_actor"].item() == pytest.approx(gain * HELLINGER / 2, rel=1e-6)
+
+    def test_priority_weights_make_a_weighted_mean(self):
+        """With weights 1 and 3 the second transition counts three quarters."""
+        batch = transitions(2)
+        batch.update(linear_batch())
+        batch["action"] = torch.zeros(2, 1)
+        batch["priority_weight"] = torch.tensor([1.0, 3.0])
+        weight = torch.tensor([[1.0, -2.0]])
+        actor = Actor(nn.Linear(2, 1, bias=False))
+        value = ValueOperator(LinearValue(), in_keys=["observation"])
+        value.out_keys = ["state_action_value"]
+        actor.module.weight.data = weight
+        loss = L2C2Loss(DDPGLoss(actor, value), NEAR)
+        found = loss.policy_regularizer(batch)["loss_l2c2_actor"]
+        # Actions move by 0 and 2: half the squared distance is 0 and 2.
+        assert found.item() == pytest.approx(0.75 * 0.25 / 1.25 * 2.0)
+
+    def test_papers_values_are_the_defaults(self):
+        """sigma = 1, gains .01 and 1, beta = .1: lambda_pi = .010101."""
+        loss = L2C2Loss(DDPGLoss(deterministic_actor(), qvalue()))
+        assert loss.l2c2_neighborhood == Neighborhood(1.0, 0.01, 1.0)
+        assert loss.l2c2_neighborhood.scale == pytest.approx(0.010101, rel=1e-4)
+        assert loss.l2c2_beta.item() == pytest.approx(0.1)
+        assert loss.l2c2_coeff.item() == 1.0
+
+
+class TestAgainstALoop:
+    """Terms computed transition by transition, with the networks' own parameters."""
+
+    @pytest.fixture(autouse=True)
+    def seed(self):
+        torch.manual_seed(0)
+
+    def neighbors(self, batch: TensorDict, num_samples: int = 2) -> TensorDict:
+        return NeighborTransform(NEAR, num_samples=num_samples)(batch)
+
+    def mean_over_pairs(self, batch: TensorDict, difference) -> float:
+        """Mean of difference(transition, neighbor) / distance over transitions and neighbors."""
+        total, count = 0.0, 0
+        for row in batch.unbind(0):
+            for k in range(row["neighbor", "distance"].shape[0]):
+                moved = row.clone()
+                moved["observation"] = row["neighbor", "observation"][k]
+                gain = NEAR.scale / row["neighbor", "distance"][k].item()
+                total, count = total + gain * difference(row, moved), count + 1
+        return total / count
+
+    def call(self, loss, network: str, row: TensorDict, key: str, member: int | None = None):
+        params = getattr(loss, f"{network}_params")
+        params = params if member is None else params[member]
+        with torch.no_grad(), params.to_module(getattr(loss, network)):
+            return getattr(loss, network)(row.exclude("next", "neighbor"))[key]
+
+    def test_members_of_a_q_ensemble_are_one_vector(self):
+        """The squared errors of all members are summed, at the batch's action."""
+        loss = L2C2Loss(
+            TD3Loss(deterministic_actor(), qvalue(), action_spec=BOUNDS, num_qvalue_nets=3), NEAR
+        )
+        batch = self.neighbors(transitions(4))
+
+        def difference(row, moved):
+            values = [
+                [
+                    self.call(loss, "qvalue_network", state, "state_action_value", member).item()
+                    for member in range(3)
+                ]
+                for state in (row, moved)
+            ]
+            return 0.5 * sum((a - b) ** 2 for a, b in zip(*values, strict=True))
+
+        found = loss.value_regularizer(batch)["loss_l2c2_qvalue"].item()
+        assert found == pytest.approx(0.1 * self.mean_over_pairs(batch, difference), rel=1e-4)
+
+    def test_heads_of_an_ensemble_are_one_vector(self):
+        """PPORPELoss's critic is compared over its heads, not over their mean."""
+        loss = L2C2Loss(PPORPELoss(gaussian_actor(), heads_critic()), NEAR)
+        batch = self.neighbors(on_policy(4))
+
+        def difference(row, moved):
+            here, there = (
+                self.call(loss, "critic_network", state, "state_value_heads")
+                for state in (row, moved)
+            )
+            assert here.shape == (3,)
+            return 0.5 * (here - there).square().sum().item()
+
+        found = loss.value_regularizer(batch)["loss_l2c2_critic"].item()
+        assert found == pytest.approx(0.1 * self.mean_over_pairs(batch, difference), rel=1e-4)
+
+    @pytest.mark.parametrize("ensemble", [False, True])
+    def test_values_of_all_discrete_actions_are_one_vector(self, ensemble):
+        """Whatever action the batch holds."""
+        if ensemble:
+            base = DiscreteSACLoss(
+                ProbabilisticActor(
+                    TensorDictModule(nn.Linear(3, 4), ["observation"], ["logits"]),
+                    in_keys=["logits"],
+                    distribution_class=torch.distributions.OneHotCategorical,
+                    return_log_prob=True,
+                ),
+                action_values(),
+                action_space="one-hot",
+                num_actions=4,
+            )
+            network, members = "qvalue_network", (0, 1)
+        else:
+            base = DQNLoss(action_values(), action_space="one-hot")
+            network, members = "value_network", (None,)
+        loss = L2C2Loss(base, NEAR)
+        batch = self.neighbors(one_hot_batch(4))
+
+        def difference(row, moved):
+            return sum(
+                0.5
+                * sum(
+                    (a - b) ** 2
+                    for a, b in zip(
+                        self.call(loss, network, row, "action_value", member).tolist(),
+                        self.call(loss, network, moved, "action_value", member).tolist(),
+                        strict=True,
+                    )
+                )
+                for member in members
+            )
+
+        found = loss.value_regularizer(batch)
+        found = found["loss_l2c2_" + network.removesuffix("_network")].item()
+        assert found == pytest.approx(0.1 * self.mean_over_pairs(batch, difference), rel=1e-4)
+
+    def test_value_distributions_are_compared_by_hellinger(self):
+        """Half the squared difference of the roots of the atoms' probabilities, all actions."""
+        loss = L2C2Loss(make_distributional_dqn(), NEAR)
+        batch = self.neighbors(one_hot_batch(4))
+
+        def difference(row, moved):
+            here, there = (
+                self.call(loss, "value_network", state.unsqueeze(0), "action_value")[0].exp()
+                for state in (row, moved)
+            )
+            torch.testing.assert_close(here.sum(0), torch.ones(4))
+            return 0.5 * (here.sqrt() - there.sqrt()).square().sum().item()
+
+        found = loss.value_regularizer(batch)["loss_l2c2_value"].item()
+        assert found == pytest.approx(0.1 * self.mean_over_pairs(batch, difference), rel=1e-4)
+
+    def test_policies_are_compared_by_hellinger(self):
+        """A squashed policy has the distance of the normal distributions it squashes."""
+        loss = L2C2Loss(SACLoss(gaussian_actor(), qvalue(), action_spec=BOUNDS), NEAR)
+        batch = self.neighbors(transitions(4))
+
+        def difference(row, moved):
+            (m, s), (n, t) = (
+                [self.call(loss, "actor_network", state, key).tolist() for key in ("loc", "scale")]
+                for state in (row, moved)
+            )
+            affinity = 1.0
+            for i in range(2):
+                variance = s[i] ** 2 + t[i] ** 2
+                affinity *= math.sqrt(2 * s[i] * t[i] / variance)
+                affinity *= math.exp(-((m[i] - n[i]) ** 2) / (4 * variance))
+            return 1.0 - affinity
+
+        found = loss.policy_regularizer(batch)["loss_l2c2_actor"].item()
+        assert found == pytest.approx(self.mean_over_pairs(batch, difference), rel=1e-3)
+
+    def test_deterministic_policies_are_compared_by_their_actions(self):
+        """Half the squared distance of the actions, not of their coordinates' mean."""
+        loss = L2C2Loss(DDPGLoss(deterministic_actor(), qvalue()), NEAR)
+        batch = self.neighbors(transitions(4))
+
+        def difference(row, moved):
+            here, there = (
+                self.call(loss, "actor_network", state.exclude("action"), "action").tolist()
+                for state in (row, moved)
+            )
+            return 0.5 * sum((a - b) ** 2 for a, b in zip(here, there, strict=True))
+
+        terms = loss.policy_regularizer(batch)
+        expected = self.mean_over_pairs(batch, difference)
+        assert terms["loss_l2c2_actor"].item() == pytest.approx(expected, rel=1e-4)
+
+
+class TestNeighbors:
+    def test_the_distance_of_several_observations_is_the_largest(self):
+        """Drawn in the loss, all parts of a state move and the farthest counts."""
+        keys = ["position", "velocity"]
+        actor = Actor(mlp(3, 2), in_keys=keys)
+        value = ValueOperator(mlp(5, 1), in_keys=[*keys, "action"])
+        loss = L2C2Loss(DDPGLoss(actor, value), NEAR)
+        batch = TensorDict(
+            {
+                "position": torch.zeros(500, 1),
+                "velocity": torch.zeros(500, 2),
+                "action": torch.zeros(500, 2),
+                "next": {"position": torch.ones(500, 1), "velocity": torch.ones(500, 2)},
+            },
+            batch_size=[500],
+        )
+        torch.manual_seed(0)
+        # The largest of three independent draws has the mean 3/4, of one 1/2, of two 2/3.
+        for terms in (loss.policy_regularizer(batch), loss.value_regularizer(batch)):
+            mean = terms["l2c2_distance"].item() - NEAR.epsilon
+            assert mean == pytest.approx(0.75, abs=0.03)
+
+    def test_neighbors_are_drawn_as_often_as_asked(self):
+        """More samples leave the mean as it is and make it less noisy."""
+        torch.manual_seed(0)
+        batch = transitions(4)
+        actor = deterministic_actor()
+        spread = {}
+        for count in (1, 64):
+            loss = L2C2Loss(DDPGLoss(actor, qvalue()), NEAR, num_samples=count)
+            draws = torch.stack(
+                [loss.policy_regularizer(batch)["loss_l2c2_actor"].detach() for _ in range(50)]
+            )
+            spread[count] = draws.std()
+        assert spread[64] < spread[1] / 4
+
+    def test_both_terms_of_a_forward_pass_share_their_neighbors(self, monkeypatch):
+        """One draw serves the policy and the value function; alone, each draws its own."""
+        draws = []
+
+        def sample(self, *args, original=Neighborhood.sample, **kwargs):
+            draws.append(args)
+            return original(self, *args, **kwargs)
+
+        monkeypatch.setattr(Neighborhood, "sample", sample)
+        loss = L2C2Loss(DDPGLoss(deterministic_actor(), qvalue()))
+        loss(transitions(4))
+        assert len(draws) == 1
+        loss.policy_regularizer(transitions(4))
+        loss.value_regularizer(transitions(4))
+        assert len(draws) == 3
+
+    def test_another_entry_can_be_read(self):
+        """neighbor_key names the entry that the transform wrote."""
+        loss = linear_loss(neighbor_key="near")
+        batch = linear_batch().rename_key_("neighbor", "near")
+        assert loss.policy_regularizer(batch)["l2c2_distance"].item() == pytest.approx(1.0)
+
+
+class TestMonteCarlo:
+    def test_sampled_actions_estimate_the_closed_form(self):
+        """The paper's estimator has the closed form as its mean."""
+        torch.manual_seed(0)
+        expected = linear_loss().policy_regularizer(linear_batch())["l2c2_hellinger"]
+        loss = linear_loss(hellinger_samples=4000)
+        found = loss.policy_regularizer(linear_batch())["l2c2_hellinger"]
+        assert found != expected
+        assert found.item() == pytest.approx(expected.item(), rel=0.03)
+
+
+class TestConstruction:
+    @pytest.mark.parametrize(
+        ("settings", "error", "message"),
+        [
+            ({"neighborhood": 1.0}, TypeError, "neighborhood must be a Neighborhood, got a float"),
+            ({"num_samples": 0}, ValueError, "num_samples must be at least 1"),
+            ({"num_samples": 1.5}, TypeError, "num_samples must be an integer"),
+            ({"hellinger_samples": 0}, ValueError, "hellinger_samples must be at least 1"),
+            ({"hellinger_samples": "8"}, TypeError, "hellinger_samples must be an integer"),
+            ({"beta": -0.1}, ValueError, "l2c2_beta must be finite and at least 0, got -0.1"),
+            ({"beta": "0.1"}, TypeError, "l2c2_beta must be a real number"),
+        ],
+    )
+    def test_wrong_settings_are_refused(self, settings, error, message):
+        """At construction, with what was given and what is allowed."""
+        with pytest.raises(error, match=message):
+            L2C2Loss(DDPGLoss(deterministic_actor(), qvalue()), **settings)
+
+    def test_a_loss_without_a_trained_value_function_is_pointed_out(self):
+        """The dropped term is named, unless beta=0 says that it is not wanted."""
+        for base in (
+            PPOLoss(gaussian_actor()),
+            PPOLoss(gaussian_actor(), critic(), critic_coeff=0),
+        ):
+            with pytest.warns(UserWarning, match="PPOLoss trains no value function.*Pass beta=0"):
+                loss = L2C2Loss(base)
+            assert "loss_l2c2_critic" not in loss.out_keys
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")
+                L2C2Loss(base, beta=0)
+        terms = loss.value_regularizer(on_policy(4))
+        assert terms.is_empty()

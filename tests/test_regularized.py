@@ -1,0 +1,522 @@
+"""How a loss is wrapped: the class that is made for it, what is refused, odd networks."""
+
+from __future__ import annotations
+
+import copy
+import gc
+import pickle
+
+import pytest
+import torch
+from losses import (
+    ACTION,
+    ACTIONS,
+    OBSERVATION,
+    action_values,
+    batch_norm_qvalue,
+    composite_actor,
+    critic,
+    deterministic_actor,
+    gaussian_actor,
+    mlp,
+    on_policy,
+    one_hot_batch,
+    qvalue,
+    transitions,
+)
+from tensordict import TensorDict
+from tensordict.nn import (
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictSequential,
+)
+from torch import nn
+from torchrl.data import Bounded
+from torchrl.modules import (
+    Actor,
+    LSTMModule,
+    MaskedCategorical,
+    NormalParamExtractor,
+    ProbabilisticActor,
+    QValueModule,
+    TanhNormal,
+    ValueOperator,
+)
+from torchrl.objectives import (
+    A2CLoss,
+    BCLoss,
+    ClipPPOLoss,
+    CrossQLoss,
+    DDPGLoss,
+    DQNLoss,
+    DTLoss,
+    IQLLoss,
+    LossModule,
+    OnlineDTLoss,
+    PPOLoss,
+    ReinforceLoss,
+    SACLoss,
+)
+
+from torchrl_l2c2 import CAPSLoss, L2C2Loss, Neighborhood, NeighborTransform, RegularizedLoss
+
+NEAR = Neighborhood(sigma=1.0, lambda_min=0.1, lambda_max=1.0)
+
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:torchrl")
+
+
+def ddpg(**kwargs) -> DDPGLoss:
+    return DDPGLoss(deterministic_actor(), qvalue(), **kwargs)
+
+
+def with_neighbors(batch: TensorDict, **kwargs) -> TensorDict:
+    return NeighborTransform(NEAR, **kwargs)(batch)
+
+
+class Stillness(RegularizedLoss):
+    """The shortest regularizer: mean squared actions."""
+
+    _schedulable_buffers = frozenset({"stillness_coeff"})
+
+    def __init__(self, base_loss: LossModule, coeff: float = 1.0) -> None:
+        self._register_coefficient("stillness_coeff", coeff)
+        self._regularize(["actor_network"])
+        self.out_keys = [*self.out_keys, "loss_stillness"]
+
+    def policy_regularizer(self, tensordict):
+        terms = super().policy_regularizer(tensordict)
+        _, action = self._policies_at(tensordict, tensordict.select("observation")[None])
+        cost = self._reduce_term(action[0].square().sum(-1), tensordict)
+        return terms.set("loss_stillness", self.stillness_coeff * cost)
+
+
+class TestTheClass:
+    def test_it_is_made_once_for_each_pair(self):
+        """Two losses of one class have one regularized class, and it can be named."""
+        first, second = L2C2Loss(ddpg()), L2C2Loss(ddpg())
+        assert type(first) is type(second) is L2C2Loss[DDPGLoss]
+        assert type(L2C2Loss[DDPGLoss](ddpg())) is L2C2Loss[DDPGLoss]
+        assert issubclass(L2C2Loss[DDPGLoss], L2C2Loss)
+        assert issubclass(L2C2Loss[DDPGLoss], DDPGLoss)
+
+    def test_a_new_regularizer_is_one_short_class(self):
+        """A subclass with __init__ and one method works as those of the package do."""
+        torch.manual_seed(0)
+        base, batch = ddpg(), transitions(4)
+        loss = Stillness(base, coeff=0.5)
+        assert loss.out_keys == [*base.out_keys, "loss_stillness"]
+        action = base.actor_network(batch.copy())["action"]
+        expected = 0.5 * action.square().sum(-1).mean()
+        torch.testing.assert_close(loss(batch.copy())["loss_stillness"], expected)
+        loss.stillness_coeff = 0.0
+        assert copy.deepcopy(L2C2Loss(loss))(batch)["loss_stillness"] == 0
+
+    def test_chains_pickle(self):
+        """Also a class made of a class that was made is found again."""
+        chain = CAPSLoss(Stillness(L2C2Loss(ddpg())))
+        twin = pickle.loads(pickle.dumps(chain))
+        assert type(twin) is type(chain)
+        assert type(twin).__name__ == "CAPSLoss[Stillness[L2C2Loss[DDPGLoss]]]"
+
+    def test_it_can_be_subclassed(self):
+        """A named subclass of a made class keeps its type when copied."""
+
+        class SmoothDDPG(L2C2Loss[DDPGLoss]):
+            pass
+
+        loss = SmoothDDPG(ddpg())
+        assert type(loss) is type(copy.deepcopy(loss)) is SmoothDDPG
+
+    def test_what_it_is_made_for_is_checked(self):
+        """Classes and objects that cannot be combined are refused with their names."""
+        with pytest.raises(TypeError, match="LossModule, got a Linear"):
+            L2C2Loss(nn.Linear(1, 1))
+        with pytest.raises(TypeError, match="takes a class of losses"):
+            L2C2Loss[nn.Linear]
+        with pytest.raises(TypeError, match=r"L2C2Loss\[SACLoss\] cannot wrap a DDPGLoss"):
+            L2C2Loss[SACLoss](ddpg())
+        with pytest.raises(TypeError, match="made for one class of losses already"):
+            L2C2Loss[SACLoss][DDPGLoss]
+
+    def test_the_same_regularizer_is_not_applied_twice(self):
+        """Neither directly nor with another one in between."""
+        with pytest.raises(TypeError, match="already regularized by L2C2Loss"):
+            L2C2Loss(L2C2Loss(ddpg()))
+        with pytest.raises(TypeError, match="already regularized by L2C2Loss"):
+            L2C2Loss(CAPSLoss(L2C2Loss(ddpg())))
+
+    def test_methods_are_not_hidden_by_chance(self):
+        """A loss whose own method has the name of one of ours would break: it is refused."""
+
+        class Clashing(DDPGLoss):
+            def _policies_at(self):
+                return None
+
+        with pytest.raises(TypeError, match=r"both define \['_policies_at'\]"):
+            L2C2Loss(Clashing(deterministic_actor(), qvalue()))
+
+
+class TestAttributes:
+    def test_the_losss_own_settings_can_be_assigned(self):
+        """Writes reach the one object: scheduled buffers, plain attributes, train and eval."""
+        loss = L2C2Loss(ClipPPOLoss(gaussian_actor(), critic(), clip_epsilon=0.2))
+        buffer = loss.clip_epsilon
+        loss.clip_epsilon = 0.1
+        assert buffer == pytest.approx(0.1)
+        loss.reduction = "sum"
+        batch = with_neighbors(on_policy(4))
+        summed = loss(batch.copy())["loss_l2c2_actor"]
+        loss.reduction = "mean"
+        torch.testing.assert_close(summed, 4 * loss(batch.copy())["loss_l2c2_actor"])
+        loss.eval()
+        assert not loss.training
+        assert not any(module.training for module in loss.children())
+
+    @pytest.mark.parametrize("value", [-0.1, float("nan"), float("inf")])
+    def test_gains_are_checked_whenever_they_are_set(self, value):
+        """At construction and when assigned to later."""
+        for name in ("coeff", "beta"):
+            with pytest.raises(ValueError, match=f"l2c2_{name} must be finite and at least 0"):
+                L2C2Loss(ddpg(), **{name: value})
+        loss = L2C2Loss(ddpg())
+        with pytest.raises(ValueError, match="l2c2_beta must be finite and at least 0"):
+            loss.l2c2_beta = value
+
+    @pytest.mark.parametrize("value", ["0.1", None, True])
+    def test_gains_are_numbers(self, value):
+        """Anything else is a TypeError, at construction and later."""
+        with pytest.raises(TypeError, match="l2c2_coeff must be a real number"):
+            L2C2Loss(ddpg(), coeff=value)
+        loss = L2C2Loss(ddpg())
+        with pytest.raises(TypeError, match="l2c2_coeff must be a real number"):
+            loss.l2c2_coeff = value
+
+    def test_load_hooks_outlive_the_wrapped_loss(self):
+        """Hooks of the plain loss that name their module work when only the new one is left."""
+        loss = L2C2Loss(IQLLoss(gaussian_actor(), qvalue(), critic(), num_qvalue_nets=1))
+        gc.collect()
+        loss.load_state_dict(loss.state_dict())
+
+
+class TestWhatIsRefused:
+    def test_losses_without_transitions(self):
+        """Imitation and sequence models have no next state: the message says so."""
+        actor = TensorDictModule(
+            mlp(OBSERVATION + ACTION + 1, ACTION),
+            ["observation", "action", "return_to_go"],
+            ["action"],
+        )
+        for loss in (
+            BCLoss(gaussian_actor()),
+            DTLoss(actor),
+            OnlineDTLoss(gaussian_actor(), alpha_init=1.0, target_entropy=-1.0),
+        ):
+            for regularizer in (L2C2Loss, CAPSLoss):
+                with pytest.raises(TypeError, match="is not trained on transitions"):
+                    regularizer(loss)
+
+    def test_recurrent_policies(self):
+        """A policy with a hidden state has no value at a neighbor alone."""
+        lstm = LSTMModule(input_size=OBSERVATION, hidden_size=4, in_key="observation", out_key="h")
+        head = TensorDictModule(
+            nn.Sequential(mlp(4, 2 * ACTION), NormalParamExtractor()), ["h"], ["loc", "scale"]
+        )
+        actor = ProbabilisticActor(
+            TensorDictSequential(lstm, head),
+            in_keys=["loc", "scale"],
+            distribution_class=TanhNormal,
+            return_log_prob=True,
+        )
+        with pytest.raises(TypeError, match="actor_network is recurrent"):
+            L2C2Loss(PPOLoss(actor, critic()))
+
+    def test_observations_that_are_integers(self):
+        """There is nothing between two labels: the key and its type are named."""
+        loss = L2C2Loss(ddpg())
+        batch = transitions(4)
+        batch["observation"] = batch["observation"].long()
+        with pytest.raises(TypeError, match=r"floating-point observation.*'observation'.*int64"):
+            loss.policy_regularizer(batch)
+
+    def test_neighbors_of_other_entries(self):
+        """A network none of whose inputs was moved is named with what was."""
+        loss = L2C2Loss(ddpg())
+        batch = transitions(4)
+        batch["other"] = batch["next", "other"] = torch.randn(4, 2)
+        with_neighbors(batch, in_keys=["other"])
+        with pytest.raises(KeyError, match=r"inputs of actor_network.*'other'.*in_keys"):
+            loss(batch)
+
+    def test_neighbors_without_distances(self):
+        """An entry that NeighborTransform did not write."""
+        batch = transitions(4)
+        batch["neighbor"] = TensorDict({"observation": torch.zeros(4, 1, 3)}, batch_size=[4])
+        with pytest.raises(KeyError, match="no 'distance'"):
+            L2C2Loss(ddpg())(batch)
+
+    def test_policies_that_sample_from_their_own_samples(self):
+        """Several distributions in a row have no distance; one composite distribution has."""
+        heads = [
+            ProbabilisticTensorDictModule(
+                in_keys=["loc", "scale"],
+                out_keys=[name],
+                distribution_class=TanhNormal,
+                return_log_prob=True,
+            )
+            for name in ("first", "action")
+        ]
+        both = ProbabilisticTensorDictSequential(gaussian_actor().module[0], *heads)
+        loss = PPOLoss(both, critic())
+        with pytest.raises(TypeError, match="join several heads in one CompositeDistribution"):
+            L2C2Loss(loss)
+        assert L2C2Loss(PPOLoss(composite_actor(), critic()))
+
+
+class TestNetworks:
+    @pytest.mark.parametrize("loss_class", [PPOLoss, A2CLoss, ReinforceLoss])
+    def test_losses_on_the_users_own_modules_give_the_same_terms(self, loss_class):
+        """functional=False: the modules themselves are evaluated, and trained."""
+        torch.manual_seed(0)
+        actor, value = gaussian_actor(), critic()
+        batch = with_neighbors(on_policy(6))
+        terms = []
+        for functional in (True, False):
+            loss = L2C2Loss(loss_class(actor, value, functional=functional), NEAR)
+            out = loss.policy_regularizer(batch).update(loss.value_regularizer(batch))
+            terms.append(out)
+            (out["loss_l2c2_actor"] + out["loss_l2c2_critic"]).backward()
+        for key in ("loss_l2c2_actor", "loss_l2c2_critic"):
+            torch.testing.assert_close(terms[0][key], terms[1][key])
+        assert all(p.grad is not None for p in (*actor.parameters(), *value.parameters()))
+
+    def test_a_regularizer_of_values_alone_evaluates_a_shared_trunk(self):
+        """It need not regularize the policy whose hidden output the critic reads."""
+
+        class SmallValues(RegularizedLoss):
+            def __init__(self, base_loss):
+                self._regularize(self._value_networks())
+
+            def value_regularizer(self, tensordict):
+                states = tensordict.select("observation")[None]
+                value, _ = self._values_at("critic_network", tensordict, states)
+                return TensorDict(loss_small=value.square().mean())
+
+        trunk = TensorDictModule(mlp(OBSERVATION, 2 * ACTION), ["observation"], ["hidden"])
+        extract = TensorDictModule(NormalParamExtractor(), ["hidden"], ["loc", "scale"])
+        actor = ProbabilisticActor(
+            TensorDictSequential(trunk, extract),
+            in_keys=["loc", "scale"],
+            distribution_class=TanhNormal,
+            return_log_prob=True,
+        )
+        value = ValueOperator(mlp(2 * ACTION, 1), in_keys=["hidden"])
+        loss, batch = SmallValues(PPOLoss(actor, value)), on_policy(4)
+        expected = value.module(trunk.module(batch["observation"])).square().mean()
+        torch.testing.assert_close(loss.value_regularizer(batch)["loss_small"], expected)
+
+    @pytest.mark.parametrize("separate", [False, True])
+    def test_a_critic_cut_off_a_shared_trunk_reads_the_policys_hidden_output(self, separate):
+        """The value term trains the trunk as the plain loss does: not with separate_losses."""
+        torch.manual_seed(0)
+        trunk = TensorDictModule(mlp(OBSERVATION, 8), ["observation"], ["hidden"])
+        head = TensorDictModule(
+            nn.Sequential(mlp(8, 2 * ACTION), NormalParamExtractor()), ["hidden"], ["loc", "scale"]
+        )
+        actor = ProbabilisticActor(
+            TensorDictSequential(trunk, head),
+            in_keys=["loc", "scale"],
+            distribution_class=TanhNormal,
+            return_log_prob=True,
+        )
+        value = ValueOperator(mlp(8, 1), in_keys=["hidden"])
+        loss = L2C2Loss(PPOLoss(actor, value, separate_losses=separate), NEAR)
+        batch = with_neighbors(on_policy(6))
+        terms = loss.value_regularizer(batch)
+        here, there = batch["observation"], batch["neighbor", "observation"].squeeze(1)
+        values = [value.module(trunk.module(states)) for states in (here, there)]
+        gain = NEAR.gain(batch["neighbor", "distance"])
+        expected = 0.1 * (gain * 0.5 * (values[0] - values[1]).square()).mean()
+        torch.testing.assert_close(terms["loss_l2c2_critic"], expected)
+        weight = loss.actor_network_params["module", "0", "module", "0", "module", "0", "weight"]
+        found = torch.autograd.grad(terms["loss_l2c2_critic"], weight, allow_unused=True)[0]
+        assert (found is None) == separate
+        assert ("next", "observation") in loss.in_keys and ("next", "hidden") not in loss.in_keys
+
+    def test_running_statistics_are_the_losss_own(self):
+        """Evaluating neighbors does not count as another batch in normalization layers."""
+        torch.manual_seed(0)
+        loss = L2C2Loss(
+            CrossQLoss(gaussian_actor(), batch_norm_qvalue(), action_spec=Bounded(-1, 1, (ACTION,)))
+        )
+        before = {name: value.clone() for name, value in loss.state_dict().items()}
+        loss.value_regularizer(transitions(6))
+        assert all(torch.equal(value, before[name]) for name, value in loss.state_dict().items())
+        loss(transitions(6))
+        assert not all(
+            torch.equal(value, before[name]) for name, value in loss.state_dict().items()
+        )
+
+    def test_inputs_that_are_not_states_stay(self):
+        """A goal without a successor and a mask are read as they are at every neighbor."""
+        torch.manual_seed(0)
+        actor = Actor(mlp(OBSERVATION + 2, ACTION), in_keys=["observation", "goal"])
+        loss = L2C2Loss(DDPGLoss(actor, qvalue()), NEAR)
+        batch = transitions(6)
+        batch["goal"] = torch.randn(6, 2)
+        with_neighbors(batch)
+        found = loss.policy_regularizer(batch)["l2c2_action_distance"]
+        there = batch["neighbor", "observation"].squeeze(1)
+        here = actor.module(batch["observation"], batch["goal"])
+        there = actor.module(there, batch["goal"])
+        torch.testing.assert_close(found, 0.5 * (here - there).square().sum(-1).mean().detach())
+        torch.manual_seed(1)
+        drawn = loss.policy_regularizer(batch.exclude("neighbor"))
+        assert drawn["loss_l2c2_actor"] > 0
+
+    def test_inputs_that_the_policy_overwrites_are_states(self):
+        """A policy may write its normalized observation where it was."""
+        torch.manual_seed(0)
+        normalize = TensorDictModule(torch.tanh, ["observation"], ["observation"])
+        actor = TensorDictSequential(normalize, deterministic_actor())
+        loss = L2C2Loss(DDPGLoss(actor, qvalue()), NEAR)
+        batch = with_neighbors(transitions(6))
+        found = loss.policy_regularizer(batch)["l2c2_action_distance"]
+        here, there = batch["observation"], batch["neighbor", "observation"].squeeze(1)
+        actions = [actor[1].module(states.tanh()) for states in (here, there)]
+        expected = 0.5 * (actions[0] - actions[1]).square().sum(-1).mean()
+        torch.testing.assert_close(found, expected.detach())
+
+    def test_action_values_are_taken_at_the_batchs_action(self):
+        """Also where the loss has no key of its own for the action."""
+        torch.manual_seed(0)
+        value = qvalue()
+        loss = L2C2Loss(DDPGLoss(gaussian_actor(), value), NEAR)
+        batch = with_neighbors(transitions(6))
+        here, there = batch["observation"], batch["neighbor", "observation"].squeeze(1)
+        values = [value.module(states, batch["action"]) for states in (here, there)]
+        expected = 0.5 * (values[0] - values[1]).square().mean()
+        found = loss.value_regularizer(batch)["l2c2_value_distance"]
+        torch.testing.assert_close(found, expected.detach())
+
+    def test_a_critic_with_a_state_of_its_own(self):
+        """A centralized critic's state has neighbors too, and its successor is an input."""
+        loss = L2C2Loss(PPOLoss(gaussian_actor(), ValueOperator(mlp(4, 1), in_keys=["state"])))
+        assert ("next", "state") in loss.in_keys
+        loss.set_keys(reward="other_reward")
+        assert ("next", "state") in loss.in_keys
+        batch = on_policy(6)
+        batch["state"], batch["next", "state"] = torch.randn(6, 4), torch.randn(6, 4)
+        assert loss.value_regularizer(batch)["loss_l2c2_critic"] > 0
+
+    def test_the_value_can_be_renamed(self):
+        """set_keys tells which of a critic's outputs is its value, before wrapping and after."""
+        torch.manual_seed(0)
+        heads = TensorDictModule(
+            lambda observation: (observation[..., :1], 2 * observation[..., :1]),
+            ["observation"],
+            ["state_value", "other_value"],
+        )
+        loss = L2C2Loss(PPOLoss(gaussian_actor(), heads), NEAR)
+        batch = with_neighbors(on_policy(6))
+        before = loss.value_regularizer(batch)["loss_l2c2_critic"]
+        loss.set_keys(value="other_value")
+        torch.testing.assert_close(loss.value_regularizer(batch)["loss_l2c2_critic"], 4 * before)
+        heads = TensorDictModule(mlp(OBSERVATION, 1), ["observation"], ["v"])
+        with pytest.raises(ValueError, match=r"critic_network writes \['v'\].*set_keys before"):
+            L2C2Loss(PPOLoss(gaussian_actor(), heads))
+
+    def test_masked_actions(self):
+        """A mask of allowed actions is an input of the policy like any other."""
+        module = TensorDictModule(mlp(OBSERVATION, ACTIONS), ["observation"], ["logits"])
+        actor = ProbabilisticActor(
+            module,
+            in_keys={"logits": "logits", "mask": "mask"},
+            distribution_class=MaskedCategorical,
+            return_log_prob=True,
+        )
+        batch = transitions(6, action=torch.zeros(6, dtype=torch.long))
+        batch["mask"] = torch.tensor([True, True, False, True]).expand(6, 4)
+        terms = L2C2Loss(PPOLoss(actor, critic()), NEAR).policy_regularizer(batch)
+        assert terms["loss_l2c2_actor"].isfinite() and terms["loss_l2c2_actor"] > 0
+
+    def test_action_masks_of_value_based_losses(self):
+        """Boolean inputs of a Q-network are not taken for states."""
+        select = QValueModule(action_space="one-hot", action_mask_key="mask")
+        actor = TensorDictSequential(action_values(), select)
+        with pytest.warns(UserWarning, match="leaves out the policy term"):
+            loss = L2C2Loss(DQNLoss(actor, action_space="one-hot"), NEAR)
+        batch = one_hot_batch(4)
+        batch["mask"] = batch["next", "mask"] = torch.tensor([True, True, False, True]).expand(4, 4)
+        term = loss(batch)["loss_l2c2_value"]
+        assert term.isfinite() and term > 0
+
+    def test_batches_with_named_dimensions(self):
+        """Collectors name the time dimension; the terms do not mind."""
+        loss = L2C2Loss(ddpg(), NEAR)
+        batch = transitions(2, 3)
+        torch.manual_seed(0)
+        expected = loss.policy_regularizer(batch)
+        batch.names = [None, "time"]
+        torch.manual_seed(0)
+        found = loss.policy_regularizer(batch)
+        torch.testing.assert_close(found["loss_l2c2_actor"], expected["loss_l2c2_actor"])
+
+    def test_single_transitions(self):
+        """A batch without batch dimensions."""
+        torch.manual_seed(0)
+        loss, batch = L2C2Loss(ddpg(), NEAR), with_neighbors(transitions())
+        expected = loss.policy_regularizer(batch.unsqueeze(0))["loss_l2c2_actor"]
+        torch.testing.assert_close(loss.policy_regularizer(batch)["loss_l2c2_actor"], expected)
+
+
+class Cooperating(DDPGLoss):
+    """Evaluates its value network through the method that regularizers listen to."""
+
+    rows = 0
+
+    def _evaluate_batch(self, network, tensordict):
+        with self.value_network_params.to_module(self.value_network):
+            return self.value_network(tensordict.select(*self.value_network.in_keys))
+
+    def loss_value(self, tensordict):
+        value = self._evaluate_batch("value_network", tensordict)["state_action_value"]
+        return value.square().mean(), {}
+
+
+class TestEvaluationsThatAreSpared:
+    @pytest.fixture
+    def losses(self):
+        torch.manual_seed(0)
+        networks = deterministic_actor(), qvalue()
+        return L2C2Loss(Cooperating(*networks), NEAR), L2C2Loss(DDPGLoss(*networks), NEAR)
+
+    def test_states_that_the_loss_has_evaluated_are_not_evaluated_again(self, losses):
+        """The terms are the same, from the neighbors' rows alone."""
+        batch = with_neighbors(transitions(6))
+        terms, gradients = [], []
+        for loss in losses:
+            rows = []
+            handle = loss.value_network.register_forward_pre_hook(
+                lambda _, inputs, rows=rows: rows.append(inputs[0].shape[0])
+            )
+            terms.append(loss(batch.copy()))
+            handle.remove()
+            assert rows[-1] == (6 if isinstance(loss, Cooperating) else 12)
+            terms[-1]["loss_l2c2_value"].backward()
+            weight = next(loss.value_network_params.parameters())
+            gradients.append(weight.grad.clone())
+            weight.grad = None
+        torch.testing.assert_close(terms[0]["loss_l2c2_value"], terms[1]["loss_l2c2_value"])
+        torch.testing.assert_close(*gradients)
+
+    def test_nothing_is_kept_beyond_the_forward_pass(self, losses):
+        """After forward, or after an error in it, another batch is evaluated anew."""
+        loss, plain = losses
+        batch, other = with_neighbors(transitions(6)), with_neighbors(transitions(6))
+        expected = plain.value_regularizer(other)["loss_l2c2_value"]
+        loss(batch.copy())
+        torch.testing.assert_close(loss.value_regularizer(other)["loss_l2c2_value"], expected)
+        with pytest.raises(KeyError):
+            loss(batch.exclude("neighbor", ("next", "observation")))
+        torch.testing.assert_close(loss.value_regularizer(other)["loss_l2c2_value"], expected)

@@ -1,0 +1,209 @@
+"""N episodes equal k episodes, a kill and N - k episodes: bit for bit."""
+
+import csv
+import hashlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from torchrl_l2c2.experiment import (
+    AdamConfig,
+    CAPSConfig,
+    Experiment,
+    ExperimentConfig,
+    L2C2Config,
+    PPORPEConfig,
+    TaskConfig,
+    UniformReplayConfig,
+)
+from torchrl_l2c2.experiment.checkpoints import list_checkpoints, load_checkpoint
+from torchrl_l2c2.experiment.evaluate import load_policy
+
+ROOT = Path(__file__).parent.parent
+SWINGUP = TaskConfig(episodes=6, max_steps=60)
+HOPPER = TaskConfig("hopper", "pybullet_envs_gymnasium:HopperBulletEnv-v0", 0.001, 6, 100)
+
+
+def small(**settings):
+    return ExperimentConfig(
+        **{"task": SWINGUP, "compile": False, "test_episodes": 1, "checkpoint_interval": 0.0}
+        | settings
+    )
+
+
+def parameter_hash(experiment):
+    digest = hashlib.sha256()
+    for name, tensor in sorted(experiment.agent.loss.state_dict().items()):
+        if hasattr(tensor, "numpy"):
+            digest.update(name.encode() + tensor.numpy().tobytes())
+    return digest.hexdigest()
+
+
+def lines(folder):
+    """The metrics, without the one that is a matter of the clock."""
+    with open(folder / "metrics.csv", newline="") as file:
+        return [
+            {key: value for key, value in row.items() if key != "frames_per_second"}
+            for row in csv.DictReader(file)
+        ]
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"regularizer": L2C2Config()},
+        {"regularizer": CAPSConfig(), "task": HOPPER},
+        {"replay": UniformReplayConfig(), "optimizer": AdamConfig()},
+        {"algorithm": PPORPEConfig(schedule="step"), "task": replace(SWINGUP, max_steps=30)},
+    ],
+    ids=("l2c2", "caps-hopper", "uniform-adam", "step"),
+)
+def test_a_continued_run_is_the_uninterrupted_one(tmp_path, settings):
+    """Parameters, targets, thresholds, metrics and test episodes, to the last bit."""
+    config = small(**settings)
+    whole = Experiment(config, tmp_path / "whole")
+    whole.train()
+    first = Experiment(
+        replace(config, task=replace(config.task, episodes=3)), tmp_path / "continued"
+    )
+    first.train()
+    second = Experiment(config, tmp_path / "continued")
+    assert len(second.metrics) == 3
+    second.train()
+    assert parameter_hash(second) == parameter_hash(whole)
+    assert lines(tmp_path / "continued") == lines(tmp_path / "whole")
+    assert second.test() == whole.test()
+
+
+def test_a_run_can_be_continued_in_another_folder(tmp_path):
+    """resume= reads there and writes here."""
+    Experiment(small(), tmp_path / "a").train()
+    longer = Experiment(
+        small(task=replace(SWINGUP, episodes=8)), tmp_path / "b", resume=tmp_path / "a"
+    )
+    longer.train()
+    assert len(lines(tmp_path / "a")) == 6
+    assert [row["episode"] for row in lines(tmp_path / "b")] == [str(i) for i in range(1, 9)]
+
+
+def test_changed_settings_are_refused_and_nothing_is_overwritten(tmp_path):
+    """The error names the setting with both values."""
+    Experiment(small(), tmp_path).train()
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(ValueError, match=r"regularizer.sigma=1.0, not 2.0.*outputs=FOLDER"):
+        Experiment(small(regularizer=L2C2Config(sigma=2.0)), tmp_path)
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_damaged_newest_checkpoint_gives_the_run_from_the_one_before(tmp_path):
+    """With a warning; and the run ends with the same numbers all the same."""
+    whole = Experiment(small(), tmp_path)
+    whole.train()
+    expected, rows = parameter_hash(whole), lines(tmp_path)
+    newest, older = list_checkpoints(tmp_path)
+    newest.write_bytes(newest.read_bytes()[:-1])
+    with pytest.warns(UserWarning, match="checksum differs.*one before it is used"):
+        again = Experiment(small(), tmp_path)
+    assert len(again.metrics) == int(older.stem.split("_")[1])
+    again.train()
+    assert parameter_hash(again) == expected and lines(tmp_path) == rows
+
+
+def test_a_policy_needs_its_folder_alone(tmp_path):
+    """From a checkpoint before the run is finished."""
+    experiment = Experiment(small(), tmp_path)
+    experiment.train()
+    policy, env, max_steps = load_policy(tmp_path)
+    assert max_steps == 60
+    td = env.reset()
+    loc = experiment.agent.policy(td.clone())["loc"]
+    assert policy(td)["loc"].equal(loc)
+
+
+def start(folder, episodes, *extra):
+    command = [
+        sys.executable, str(ROOT / "train.py"), "compile=false", f"task.episodes={episodes}",
+        "task.max_steps=50", "algorithm.updates=5", "test_episodes=1", "checkpoint_interval=0",
+        f"hydra.run.dir={folder}", *extra,
+    ]  # fmt: skip
+    return subprocess.Popen(
+        command,
+        cwd=folder.parent,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+
+
+def final(folder):
+    state = load_checkpoint(list_checkpoints(folder)[0])
+    digest = hashlib.sha256()
+    for name, tensor in sorted(state["loss"].items()):
+        if hasattr(tensor, "numpy"):
+            digest.update(name.encode() + tensor.numpy().tobytes())
+    return digest.hexdigest()
+
+
+def wait_for(condition, process, pause=0.01):
+    ends = time.monotonic() + 120
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < ends, "nothing happened"
+        if pause:
+            time.sleep(pause)
+
+
+@pytest.mark.parametrize(
+    "kills",
+    [3, pytest.param(20, marks=pytest.mark.slow)],
+)
+def test_killed_processes_end_with_the_numbers_of_the_one_that_was_not(tmp_path, kills):
+    """SIGKILL between and within episodes, and while a checkpoint is being written."""
+    episodes = 30 * (kills + 1)
+    undisturbed = start(tmp_path / "undisturbed", episodes)
+    assert undisturbed.wait(600) == 0, undisturbed.communicate()
+    folder = tmp_path / "killed"
+    for kill in range(kills):
+        process = start(folder, episodes)
+        known = len(lines(folder)) if (folder / "metrics.csv").exists() else 0
+        wait_for(
+            lambda known=known: (
+                (folder / "metrics.csv").exists() and len(lines(folder)) >= known + 2
+            ),
+            process,
+        )
+        if kill == 1:
+            # A write takes a millisecond or two: no pause, or it is missed.
+            wait_for(lambda: any(folder.glob(".checkpoint_*.partial")), process, pause=0)
+        else:
+            time.sleep(0.03 * kill)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        assert all(None not in row.values() for row in lines(folder)), "half a line"
+    last = start(folder, episodes)
+    assert last.wait(600) == 0, last.communicate()
+    assert final(folder) == final(tmp_path / "undisturbed")
+    assert lines(folder) == lines(tmp_path / "undisturbed")
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_signals_save_and_the_same_command_continues(tmp_path, number):
+    """The process ends by itself, with a checkpoint and a word on how to go on."""
+    folder = tmp_path / "run"
+    process = start(folder, 2000, "checkpoint_interval=3600")
+    wait_for(lambda: (folder / "metrics.csv").exists() and len(lines(folder)) >= 2, process)
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 128 + number
+    assert f"{number.name} ended the training" in errors and "Traceback" not in errors
+    episodes = len(lines(folder))
+    again = start(folder, episodes + 1)
+    assert again.wait(120) == 0, again.communicate()
+    assert len(lines(folder)) == episodes + 1
