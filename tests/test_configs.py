@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from dataclasses import fields
+from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize
+from hydra import compose, initialize, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from hydra.errors import ConfigCompositionException, InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import ConfigAttributeError
+from omegaconf.errors import ConfigAttributeError, MissingMandatoryValue
 from tensordict import TensorDict
 from torch import nn
 from torchrl.data import TensorDictReplayBuffer
@@ -71,6 +73,7 @@ NETWORKS = {
         },
     },
 }
+NEAR = ["+neighborhood@loss.neighborhood=l2c2"]
 SAC = ["+loss@loss.base_loss=sac", "++loss.base_loss.target_entropy=-1.0"]
 
 
@@ -116,7 +119,13 @@ def transitions(batch: int = 5) -> TensorDict:
 def test_l2c2_over_sac_composes():
     """``loss: l2c2`` over ``loss: sac`` is a regularized SAC loss with the settings given."""
     cfg = with_networks(
-        composed("+loss=l2c2", *SAC, "loss.beta=0.5", "loss.neighborhood.lambda_max=0.5")
+        composed(
+            "+loss=l2c2",
+            *SAC,
+            "loss.beta=0.5",
+            *NEAR,
+            "loss.neighborhood.lambda_max=0.5",
+        )
     )
     loss = instantiate(cfg.loss)
     assert isinstance(loss, SACLoss)
@@ -184,13 +193,17 @@ def test_ppo_rpe_instantiates():
 
 def test_ppo_rpe_needs_networks():
     """Networks have no default: a loss without them is an error that names them."""
-    with pytest.raises(InstantiationException, match="actor_network"):
+    with pytest.raises(MissingMandatoryValue, match="actor_network"):
         instantiate(composed("+loss=ppo_rpe").loss)
 
 
 def test_neighbor_transform_instantiates_and_is_seeded():
     """``transform: neighbor`` with one seed draws the same neighbors, with another others."""
-    overrides = ["+transform=neighbor", "transform.num_samples=3", "transform.out_key=[replay,near]"]
+    overrides = [
+        "+transform=neighbor",
+        "transform.num_samples=3",
+        "transform.out_key=[replay,near]",
+    ]
     batch = transitions()
 
     def drawn(seed):
@@ -264,7 +277,7 @@ def test_adaterm_is_partial():
 
 def test_tsoft_is_partial():
     """``target_net_updater: tsoft`` waits for the loss, as TorchRL's trainers give it."""
-    cfg = composed("+target_net_updater=tsoft", "target_net_updater.nu=.inf")
+    cfg = composed("+target_net_updater=tsoft", "target_net_updater.nu=inf")
     updater = instantiate(cfg.target_net_updater)(PPORPELoss(make_actor(3, 1), make_critic(3)))
     assert isinstance(updater, TSoftUpdate)
     assert (updater.tau, updater.nu) == (0.1, float("inf"))
@@ -289,6 +302,8 @@ def test_trainer_composes():
             "replay_buffer.sampler.max_capacity=100",
             "replay_buffer.sampler.alpha=1.0",
             "replay_buffer.sampler.beta=0.5",
+            "replay_buffer.sampler.eps=1e-8",
+            "replay_buffer.sampler.reduction=max",
             "+transform@replay_buffer.transform=neighbor",
             "replay_buffer.transform.seed=0",
             "+loss=l2c2",
@@ -318,11 +333,25 @@ def test_trainer_composes():
     assert len(trainer._log_dict["loss_l2c2_qvalue"]) == 2
 
 
+def test_documentation_composes(tmp_path):
+    """The page's YAML is a regularized SAC loss and a buffer with the same neighborhood."""
+    page = (Path(__file__).parents[1] / "docs" / "trainers.md").read_text()
+    (block,) = re.findall(r"```yaml\n(.*?)```", page, flags=re.DOTALL)
+    (tmp_path / "config.yaml").write_text(block)
+    with initialize_config_dir(str(tmp_path), version_base=None):
+        cfg = compose("config", overrides=["near.lambda_max=0.5", "+networks={}"])
+    OmegaConf.set_struct(cfg, False)
+    cfg.networks = NETWORKS
+    loss, transform = instantiate(cfg.loss), instantiate(cfg.replay_buffer.transform)
+    assert isinstance(loss, SACLoss) and isinstance(loss, L2C2Loss)
+    assert loss.l2c2_neighborhood == transform.neighborhood == Neighborhood(lambda_max=0.5)
+
+
 @pytest.mark.parametrize(
     "overrides,message",
     [
         (["+loss=l2c2", *SAC, "loss.beta=-1.0"], "l2c2_beta must be finite and at least 0"),
-        (["+loss=l2c2", *SAC, "loss.neighborhood.sigma=0.0"], "sigma must be finite and greater"),
+        (["+loss=l2c2", *SAC, *NEAR, "loss.neighborhood.sigma=0.0"], "sigma must be finite"),
         (["+loss=l2c2", *SAC, "loss.num_samples=0"], "num_samples must be at least 1"),
         (["+loss=caps", *SAC, "loss.sigma=-0.2"], "sigma must be finite and greater"),
         (["+loss=caps", *SAC, "loss.mean=median"], "mean must be 'loc' or 'action'"),
@@ -382,7 +411,7 @@ def test_values_of_another_type_are_refused(node):
 
 def test_a_base_loss_is_required():
     """``loss: l2c2`` alone has nothing to regularize and says what is missing."""
-    with pytest.raises(InstantiationException, match="base_loss"):
+    with pytest.raises(MissingMandatoryValue, match="base_loss"):
         instantiate(composed("+loss=l2c2").loss)
 
 

@@ -35,9 +35,7 @@ def test_stored_without_outputs(notebook: nbformat.NotebookNode) -> None:
     assert all(cell.execution_count is None for cell in notebook.cells if cell.cell_type == "code")
 
 
-def test_runs_and_draws(
-    notebook: nbformat.NotebookNode, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_runs_and_draws(notebook: nbformat.NotebookNode, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every cell runs in a fresh kernel without an error, and a picture comes out."""
     # A backend chosen outside would keep the pictures out of the notebook.
     monkeypatch.delenv("MPLBACKEND", raising=False)

@@ -7,7 +7,7 @@ module.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -46,11 +46,12 @@ class NeighborhoodConfig(ConfigBase):
 class L2C2LossConfig(LossConfig):
     """Hydra configuration of :class:`~torchrl_l2c2.L2C2Loss`, ``loss: l2c2``.
 
-    ``base_loss`` is the configuration of another loss, such as TorchRL's ``loss: sac``.
+    ``base_loss`` is the configuration of another loss, such as TorchRL's ``loss: sac``;
+    ``neighborhood``, where it is not the paper's, one of the group of that name.
     """
 
     base_loss: Any = MISSING
-    neighborhood: Any = field(default_factory=NeighborhoodConfig)
+    neighborhood: Any = None
     beta: float = 0.1
     coeff: float = 1.0
     num_samples: int = 1
@@ -96,10 +97,10 @@ class PPORPELossConfig(LossConfig):
 class NeighborTransformConfig(TransformConfig):
     """Hydra configuration of :class:`~torchrl_l2c2.NeighborTransform`, ``transform: neighbor``.
 
-    A ``seed`` gives the transform a generator of its own.
+    ``neighborhood`` is as in the loss. A ``seed`` gives the transform a generator of its own.
     """
 
-    neighborhood: Any = field(default_factory=NeighborhoodConfig)
+    neighborhood: Any = None
     in_keys: list[Any] | None = None
     out_key: Any = "neighbor"
     num_samples: int = 1
@@ -172,6 +173,7 @@ def register() -> None:
         ...         overrides=[
         ...             "+loss=l2c2",
         ...             "+loss@loss.base_loss=sac",
+        ...             "+neighborhood@loss.neighborhood=l2c2",
         ...             "loss.neighborhood.lambda_max=0.5",
         ...         ]
         ...     )
@@ -194,14 +196,14 @@ def _make_l2c2_loss(base_loss: LossModule, neighbor_key: Any, **settings: Any) -
 
 
 def _make_neighbor_transform(
-    neighborhood: Neighborhood,
+    neighborhood: Neighborhood | None,
     in_keys: Sequence[Any] | None,
     out_key: Any,
     seed: int | None,
     **settings: Any,
 ) -> NeighborTransform:
     return NeighborTransform(
-        neighborhood,
+        Neighborhood() if neighborhood is None else neighborhood,
         in_keys=_normalize_hydra_keys(in_keys),
         out_key=_normalize_hydra_key(out_key),
         generator=_generator(seed),

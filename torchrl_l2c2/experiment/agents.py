@@ -115,7 +115,12 @@ def make_update(
     def differentiate(
         batch: TensorDictBase, with_policy: bool
     ) -> tuple[Tensor, tuple[Tensor | None, ...]]:
-        terms = agent.loss(batch)
+        # Some losses write what still has a gradient; only the priority is to come out.
+        entries = batch.copy()
+        terms = agent.loss(entries)
+        priority = entries.get("td_error", None)
+        if priority is not None:
+            batch.set("td_error", priority.detach())
         total = sum(terms[key] for key in keys if is_loss(key) and (with_policy or on_values(key)))
         gradients = torch.autograd.grad(total, parameters, allow_unused=True)
         return torch.stack([terms[key].detach().float().mean() for key in keys]), gradients
@@ -135,6 +140,7 @@ def make_update(
         return values
 
     # torch's own optimizers and TorchRL's updaters break the graph.
+    compile = compile and agent.compilable
     whole = isinstance(agent.optimizer, AdaTerm) and isinstance(agent.target_updater, TSoftUpdate)
     if compile and whole and not skip_nonfinite:
         return compiled(update)

@@ -54,6 +54,7 @@ class Parts:
         target_updater: moves the target networks after every update; ``None`` without any.
         exploration: the part of ``policy`` that only explores; ``None`` where it samples.
         advantage: estimates advantages of an episode, for on-policy learning.
+        compilable: whether the loss compiles into one graph.
     """
 
     loss: LossModule
@@ -61,6 +62,7 @@ class Parts:
     target_updater: TargetNetUpdater | None = None
     exploration: nn.Module | None = None
     advantage: GAE | None = None
+    compilable: bool = True
 
 
 def make_algorithm(config: AlgorithmConfig, env: EnvBase, regularize: Regularize) -> Parts:
@@ -211,7 +213,9 @@ def _ppo(config: PPOConfig, env: EnvBase, regularize: Regularize) -> Parts:
         lmbda=config.gae_lambda,
         value_network=sharing(critic, loss.critic_network_params),
     )
-    return Parts(loss, sharing(actor, loss.actor_network_params), advantage=advantage)
+    policy = sharing(actor, loss.actor_network_params)
+    # TorchRL's PPO losses dispatch on distributions in ways that Dynamo does not trace.
+    return Parts(loss, policy, advantage=advantage, compilable=False)
 
 
 def _stochastic_actor(

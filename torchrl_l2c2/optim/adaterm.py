@@ -38,8 +38,11 @@ class AdaTerm(Optimizer):
         \frac{m / (1 - \beta^t)}{\sqrt{v / (1 - \beta^t)}}
 
     starting from :math:`m = 0`, :math:`v = \epsilon^2` and :math:`\nu = \nu_{\min} + \epsilon`.
-    The state holds :math:`\nu - \nu_{\min}` (``"nu_excess"``), which float32 resolves; it takes
-    some thousand steps to grow.
+
+    .. note:: **Precision.** :math:`\nu` has the parameters' precision, as in the optimizer that its
+        authors released. Near its start it changes by less than float32 resolves: with the default
+        settings it then stays there, the most robust of optimizers. In float64 it grows with
+        gradients that hold no outliers, over some thousand steps.
 
     Args:
         params (iterable): parameters, named parameters or parameter groups, in float32 or float64.
@@ -128,7 +131,9 @@ class AdaTerm(Optimizer):
                 "step": torch.zeros((), dtype=torch.float32, device=p.device),
                 "exp_avg": torch.zeros_like(p, memory_format=torch.preserve_format),
                 "exp_avg_var": torch.full_like(p, group["eps"] ** 2),
-                "nu_excess": torch.full((), group["eps"], dtype=p.dtype, device=p.device),
+                "nu": torch.full(
+                    (), group["nu_min"] + group["eps"], dtype=p.dtype, device=p.device
+                ),
             }
 
     @torch.no_grad()
@@ -156,7 +161,7 @@ class AdaTerm(Optimizer):
                     [p.grad for p in params],
                     [state["exp_avg"] for state in states],
                     [state["exp_avg_var"] for state in states],
-                    [state["nu_excess"] for state in states],
+                    [state["nu"] for state in states],
                     [state["step"] for state in states],
                     lr=group["lr"],
                     beta=group["beta"],
@@ -171,7 +176,7 @@ def adaterm(
     grads: list[Tensor],
     exp_avgs: list[Tensor],
     exp_avg_vars: list[Tensor],
-    nu_excesses: list[Tensor],
+    nus: list[Tensor],
     state_steps: list[Tensor],
     *,
     lr: float | Tensor,
@@ -189,8 +194,7 @@ def adaterm(
         grads (list of Tensor): their gradients.
         exp_avgs (list of Tensor): locations :math:`m`.
         exp_avg_vars (list of Tensor): squared scales :math:`v`.
-        nu_excesses (list of Tensor): degrees of freedom above ``nu_min``,
-            :math:`\nu - \nu_{\min}`, each of shape ``[]``.
+        nus (list of Tensor): degrees of freedom, each of shape ``[]``.
         state_steps (list of Tensor): how many steps were taken, each of shape ``[]``.
 
     Keyword Args:
@@ -203,8 +207,7 @@ def adaterm(
     squares = torch._foreach_mul(deviations, deviations)
     # Sums one by one: _foreach_norm(..., 1) is slower, by far when compiled for the CPU.
     sums = [quotient.sum() for quotient in torch._foreach_div(squares, exp_avg_vars)]
-    excess = torch.stack(nu_excesses)
-    nu = nu_min + excess
+    nu = torch.stack(nus)
     mean_distance = torch.stack(sums) / nu.new_tensor([p.numel() for p in params])
     tau = (1.0 - beta) * nu / (nu + mean_distance)
 
@@ -217,8 +220,7 @@ def adaterm(
 
     torch._foreach_addcmul_(exp_avgs, deviations, tau.unbind())
     torch._foreach_addcmul_(exp_avg_vars, changes, tau.unbind())
-    excess = _next_excess(excess, nu, mean_distance, beta, eps)
-    torch._foreach_copy_(nu_excesses, excess.unbind())
+    torch._foreach_copy_(nus, _next_nu(nu, mean_distance, beta, eps, nu_min).unbind())
     step = torch.stack(state_steps) + 1.0
     torch._foreach_copy_(state_steps, step.unbind())
 
@@ -229,20 +231,14 @@ def adaterm(
     torch._foreach_addcmul_(params, directions, (-step_size).unbind())
 
 
-def _next_excess(
-    excess: Tensor, nu: Tensor, mean_distance: Tensor, beta: float, eps: float
-) -> Tensor:
-    """Degrees of freedom above ``nu_min`` after this gradient; all of shape ``[N]``.
-
-    Above ``nu_min``, because near it :math:`\\nu` changes by less than float32 resolves: stored as
-    such it would never leave its start.
-    """
+def _next_nu(nu: Tensor, mean_distance: Tensor, beta: float, eps: float, nu_min: float) -> Tensor:
+    """Degrees of freedom after a gradient at this mean distance; all of shape ``[N]``."""
     w = (nu + 1.0) / (nu + mean_distance)
     w_max = (nu + 1.0) / nu
     w_log = w - w.clamp_min(TINY).log()
     w_log_max = (w_max - w_max.log()).clamp_min(-math.log(TINY))
-    target = ((nu + 2.0) / (nu + 1.0) + nu) / w_log * (excess / nu) + eps
-    return torch.lerp(excess, target, (1.0 - beta) * w_log / w_log_max)
+    target = ((nu + 2.0) / (nu + 1.0) + nu) / w_log * (1.0 - nu_min / nu) + (nu_min + eps)
+    return torch.lerp(nu, target, (1.0 - beta) * w_log / w_log_max)
 
 
 def _alike(params: list[Tensor]) -> Iterable[list[Tensor]]:

@@ -1,0 +1,1 @@
+"""Measurements of this package; run them as ``python -m benchmarks.speed``."""

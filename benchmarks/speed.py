@@ -1,0 +1,509 @@
+"""How fast the experiment is, as ratios: ``python -m benchmarks.speed``.
+
+Every row compares things that are measured alternately in one process (where the row is about
+processes, by one process that starts them), and is made of medians. ``docs/speed.md`` explains
+the rows.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import logging
+import os
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from statistics import median
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import gymnasium
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
+from tqdm import tqdm
+
+from benchmarks.timing import Row, alternate, machine, to_markdown, to_text
+from torchrl_l2c2.experiment import (
+    Experiment,
+    ExperimentConfig,
+    L2C2Config,
+    NoRegularizerConfig,
+    PPORPEConfig,
+    PrioritizedReplayConfig,
+    TaskConfig,
+    UniformReplayConfig,
+    make_env,
+)
+from torchrl_l2c2.experiment.agents import make_agent, make_update
+from torchrl_l2c2.experiment.collection import EpisodeCollector
+from torchrl_l2c2.experiment.config import BULLET, SACConfig
+from torchrl_l2c2.modules import make_actor
+from torchrl_l2c2.optim import AdaTerm
+from torchrl_l2c2.updaters import TSoftUpdate
+
+TASKS = {
+    "swingup": TaskConfig(),
+    "reacher": TaskConfig("reacher", f"{BULLET}:ReacherBulletEnv-v0", max_steps=150),
+    "hopper": TaskConfig("hopper", f"{BULLET}:HopperBulletEnv-v0", noise_scale=0.001),
+    "ant": TaskConfig("ant", f"{BULLET}:AntBulletEnv-v0", noise_scale=0.001),
+}
+REGULARIZERS = {"vanilla": NoRegularizerConfig(), "l2c2": L2C2Config()}
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How long to measure, and whether anything is compiled."""
+
+    rounds: int = 15
+    steps: int = 1000
+    compile: bool = True
+
+
+# Shows that everything runs; its numbers say nothing.
+QUICK = Effort(rounds=1, steps=60, compile=False)
+
+
+def update_rows(effort: Effort) -> Iterable[Row]:
+    """The update of the paper's agent at its batch size, against three others."""
+    small = partial(updates, effort, 32)
+    l2c2 = small("l2c2", effort.compile)
+    times = alternate(
+        {
+            "l2c2": l2c2,
+            "vanilla": small("vanilla", effort.compile),
+            "eager": small("l2c2", False),
+            "products": matrix_products(small("l2c2", False)),
+        },
+        repeats=effort.rounds,
+        calls=20,
+        warm_up=5,
+    )
+    us = {name: 1e6 * seconds for name, seconds in times.items()}
+    yield Row(
+        "update",
+        "eager update / compiled update, batch 32",
+        us["eager"] / us["l2c2"],
+        at_least=4.0,
+        parts={"eager us": us["eager"], "compiled us": us["l2c2"]},
+    )
+    yield _smoothing_row("update", 32, us, 1.25)
+    yield Row(
+        "update",
+        "compiled update / its matrix products alone, batch 32",
+        us["l2c2"] / us["products"],
+        at_most=5.0,
+        parts={"compiled us": us["l2c2"], "products us": us["products"]},
+    )
+
+
+def large_update_rows(effort: Effort) -> Iterable[Row]:
+    """The price of the regularization where arithmetic, and no call's overhead, is what counts."""
+    actions = {name: updates(effort, 4096, name, effort.compile) for name in REGULARIZERS}
+    times = alternate(actions, repeats=effort.rounds, calls=2)
+    us = {name: 1e6 * seconds for name, seconds in times.items()}
+    yield _smoothing_row("update_4096", 4096, us, 1.8)
+
+
+def _smoothing_row(group: str, size: int, us: dict[str, float], at_most: float) -> Row:
+    return Row(
+        group,
+        f"L2C2 update / vanilla update, batch {size}",
+        us["l2c2"] / us["vanilla"],
+        at_most=at_most,
+        parts={"l2c2 us": us["l2c2"], "vanilla us": us["vanilla"]},
+    )
+
+
+def collection_rows(effort: Effort) -> Iterable[Row]:
+    """Frames with noise, stored as batches, against the simulator's with the same policy."""
+    for name, task in TASKS.items():
+        task = dataclasses.replace(task, max_steps=min(task.max_steps, effort.steps))
+        env = make_env(task, seed=0)
+        actor = make_actor(env.observation_spec["observation"].shape[-1], env.action_spec)
+        collector = EpisodeCollector(
+            env,
+            actor,
+            frames_per_batch=min(250, effort.steps),
+            stop_at_done=False,
+            compile_policy=effort.compile,
+        )
+        times = alternate(
+            {
+                "collector": lambda collector=collector: collector.rollout().numel(),
+                "simulator": _simulation(task, collector),
+            },
+            repeats=2 * effort.rounds,
+        )
+        fps = {what: 1.0 / seconds for what, seconds in times.items()}
+        collector.shutdown()
+        yield Row(
+            "collection",
+            f"collected frames / simulated frames, {name}",
+            fps["collector"] / fps["simulator"],
+            at_least=0.6,
+            parts={"collected frames/s": fps["collector"], "simulated frames/s": fps["simulator"]},
+        )
+
+
+def _simulation(task: TaskConfig, collector: EpisodeCollector) -> Callable[[], int]:
+    """As many frames as the collector's batch has, by the collector's own compiled policy."""
+    env = make_env(task, seed=1)
+    simulator = (env.base_env if isinstance(env, TransformedEnv) else env)._env
+    policy, action = collector._act, collector._policy_keys.index("action")
+    observation, _ = simulator.reset()
+
+    @torch.no_grad()
+    def simulate() -> int:
+        nonlocal observation
+        with set_exploration_type(ExplorationType.RANDOM):
+            for _ in range(collector.frames_per_batch):
+                acted = policy(torch.as_tensor(observation, dtype=torch.float32))[action]
+                observation, _, terminated, truncated, _ = simulator.step(acted.numpy())
+                if terminated or truncated:
+                    observation, _ = simulator.reset()
+        return collector.frames_per_batch
+
+    return simulate
+
+
+def run_rows(effort: Effort) -> Iterable[Row]:
+    """A whole run of the paper's experiment, in frames, against what it is made of."""
+    with tempfile.TemporaryDirectory() as folder:
+        config = paper_config(effort)
+        run, parts = Experiment(config, folder), Experiment(config, Path(folder) / "parts")
+        parts_episode = play_episode(parts)
+        parts_episode()
+        batch, row = parts.replay.sample(), parts.metrics[-1]
+        frames = config.task.max_steps
+        times = alternate(
+            {
+                "run": play_episode(run),
+                "collect": lambda: parts.collector.rollout().numel(),
+                **{
+                    name: partial(_repeat, action, frames)
+                    for name, action in {
+                        "sample": parts.replay.sample,
+                        "update": lambda: parts.update(batch, True),
+                        "prioritize": lambda: parts.replay.update_tensordict_priority(batch),
+                    }.items()
+                },
+                "log": lambda: parts._log.write(row) or frames,
+                "checkpoint": lambda: parts.save() and frames,
+            },
+            repeats=max(1, effort.rounds // 3),
+        )
+    us = {f"{name} us": 1e6 * seconds for name, seconds in times.items()}
+    yield Row(
+        "run",
+        "whole Swingup run / sum of its parts, per frame",
+        us["run us"] / sum(value for name, value in us.items() if name != "run us"),
+        at_most=1.15,
+        parts=us,
+    )
+
+
+def baseline_rows(effort: Effort) -> Iterable[Row]:
+    """A whole run, and SAC's, against Stable-Baselines3's SAC on the same networks and batches."""
+    names = {
+        "paper": "whole run (L2C2) / Stable-Baselines3 SAC, frames/s",
+        "sac": "whole run (SAC) / Stable-Baselines3 SAC, frames/s",
+    }
+    try:
+        from stable_baselines3 import SAC
+    except ModuleNotFoundError:
+        note = "not measured: pip install 'torchrl-l2c2[benchmark]'"
+        for kind, name in names.items():
+            yield Row("sb3", name, at_least=4.0 if kind == "paper" else None, note=note)
+        return
+    config = dataclasses.replace(paper_config(effort), checkpoint_interval=1e9)
+    sac = dataclasses.replace(
+        config,
+        algorithm=SACConfig(hidden=config.algorithm.hidden, random_frames=0),
+        regularizer=NoRegularizerConfig(),
+        replay=UniformReplayConfig(capacity=config.replay.capacity, batch_size=32),
+        optimizer=None,
+    )
+    steps = config.task.max_steps
+    baseline = SAC(
+        "MlpPolicy",
+        gymnasium.make(config.task.env_id, max_episode_steps=steps),
+        policy_kwargs={"net_arch": list(config.algorithm.hidden)},
+        buffer_size=config.replay.capacity,
+        batch_size=config.replay.batch_size,
+        learning_starts=config.replay.batch_size,
+        train_freq=1,
+        gradient_steps=1,
+        device="cpu",
+    )
+
+    def learn() -> int:
+        baseline.learn(steps, reset_num_timesteps=False, log_interval=None)
+        return steps
+
+    actions = {"paper": play_episode(Experiment(config)), "sac": play_episode(Experiment(sac))}
+    times = alternate({**actions, "sb3": learn}, repeats=max(1, effort.rounds // 3))
+    fps = {name: 1.0 / seconds for name, seconds in times.items()}
+    for kind, name in names.items():
+        yield Row(
+            "sb3",
+            name,
+            fps[kind] / fps["sb3"],
+            at_least=4.0 if kind == "paper" else None,
+            parts={"ours frames/s": fps[kind], "Stable-Baselines3 frames/s": fps["sb3"]},
+        )
+
+
+def process_rows(effort: Effort) -> Iterable[Row]:
+    """What the second core gives to a second run."""
+    command = [sys.executable, "-m", "benchmarks.speed", "--worker"]
+    command += [] if effort.compile else ["--quick"]
+    pipe = subprocess.PIPE
+    # One after the other: the second finds what the first has compiled.
+    workers = []
+    for _ in range(2):
+        worker = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True)
+        worker.stdout.readline()
+        workers.append(worker)
+
+    def play(*chosen: subprocess.Popen) -> int:
+        for worker in chosen:
+            print("go", file=worker.stdin, flush=True)
+        return sum(int(worker.stdout.readline()) for worker in chosen)
+
+    times = alternate(
+        {
+            "one": lambda: play(workers[0]) + play(workers[1]),
+            "two": lambda: play(*workers),
+        },
+        repeats=max(1, effort.rounds // 3),
+    )
+    for worker in workers:
+        worker.communicate()
+    yield Row(
+        "processes",
+        "two runs side by side / one, frames/s",
+        times["one"] / times["two"],
+        at_least=1.8,
+        parts={"one frames/s": 1.0 / times["one"], "two frames/s": 1.0 / times["two"]},
+    )
+
+
+def _work(effort: Effort) -> None:
+    """What a process of ``process_rows`` does: an episode for every line that it is sent."""
+    play = play_episode(Experiment(paper_config(effort)))
+    play()
+    print("ready", flush=True)
+    for _ in sys.stdin:
+        print(play(), flush=True)
+
+
+def import_rows(effort: Effort) -> Iterable[Row]:
+    """What importing this package adds to importing TorchRL."""
+    code = (
+        "import time, torchrl.envs, torchrl.modules, torchrl.objectives, torchrl.data\n"
+        "start = time.perf_counter(); import torchrl_l2c2; print(time.perf_counter() - start)"
+    )
+    bare = code.replace(", torchrl.envs, torchrl.modules, torchrl.objectives, torchrl.data", ", torchrl")
+    rounds = range(max(1, effort.rounds // 3))
+    seconds = {
+        name: median(float(_python(script)) for _ in rounds)
+        for name, script in (("submodules", code), ("bare", bare))
+    }
+    yield Row(
+        "import",
+        "import torchrl_l2c2 beyond import torchrl",
+        seconds["bare"],
+        unit="s",
+        at_most=0.2,
+        parts={"beyond torchrl's submodules s": seconds["submodules"]},
+    )
+
+
+def _python(script: str) -> str:
+    return subprocess.run(
+        [sys.executable, "-c", script], check=True, capture_output=True, text=True
+    ).stdout
+
+
+def cuda_rows(effort: Effort) -> Iterable[Row]:
+    """The update on a CUDA device: eager, and compiled into CUDA graphs."""
+    for size in (32, 1024, 16384):
+        name = f"eager update / compiled update with CUDA graphs, batch {size}"
+        if not torch.cuda.is_available():
+            yield Row("cuda", name, note="not measured: no CUDA device")
+            continue
+        actions = {
+            "eager": updates(effort, size, "l2c2", False, "cuda"),
+            "graphs": updates(effort, size, "l2c2", effort.compile, "cuda"),
+        }
+        waiting = {what: partial(_synchronized, action) for what, action in actions.items()}
+        times = alternate(waiting, repeats=effort.rounds, warm_up=5)
+        us = {f"{what} us": 1e6 * seconds / 20 for what, seconds in times.items()}
+        yield Row("cuda", name, us["eager us"] / us["graphs us"], parts=us)
+
+
+def _synchronized(action: Callable[[], object]) -> None:
+    for _ in range(20):
+        action()
+    torch.cuda.synchronize()
+
+
+ROWS: dict[str, Callable[[Effort], Iterable[Row]]] = {
+    "import": import_rows,
+    "update": update_rows,
+    "update_4096": large_update_rows,
+    "collection": collection_rows,
+    "run": run_rows,
+    "sb3": baseline_rows,
+    "processes": process_rows,
+    "cuda": cuda_rows,
+}
+
+
+def paper_config(effort: Effort) -> ExperimentConfig:
+    """The paper's L2C2 on Swingup with one update a frame, for as long as one asks."""
+    return ExperimentConfig(
+        task=TaskConfig(max_steps=effort.steps, episodes=1),
+        algorithm=PPORPEConfig(updates=effort.steps),
+        compile=effort.compile,
+    )
+
+
+def play_episode(experiment: Experiment) -> Callable[[], int]:
+    """Training of one more episode, as a function; returns its frames."""
+
+    def play() -> int:
+        config, before = experiment.config, experiment.frames
+        task = dataclasses.replace(config.task, episodes=len(experiment.metrics) + 1)
+        experiment.config = dataclasses.replace(config, task=task)
+        experiment.train()
+        return experiment.frames - before
+
+    return play
+
+
+def updates(
+    effort: Effort, size: int, regularizer: str, compile: bool, device: str = "cpu"
+) -> Callable[[], Tensor]:
+    """Updates of a new agent with one batch."""
+    config = dataclasses.replace(
+        paper_config(effort),
+        regularizer=REGULARIZERS[regularizer],
+        replay=PrioritizedReplayConfig(capacity=max(10_000, size), batch_size=size),
+        compile=False,
+    )
+    experiment = Experiment(config)
+    batch = _batch(experiment)
+    if device == "cpu":
+        update = make_update(experiment.agent, compile=compile)
+        return lambda: update(batch, True)
+    agent = make_agent(config, experiment.env)
+    agent.loss.to(device)
+    agent.optimizer = AdaTerm(agent.loss.parameters())
+    agent.target_updater = TSoftUpdate(agent.loss)
+    update = make_update(agent, compile=False)
+    if compile:
+        torch._dynamo.config.trace_autograd_ops = True
+        update = torch.compile(update, fullgraph=True, mode="reduce-overhead")
+    batch = batch.to(device)
+    return lambda: update(batch, True)
+
+
+def _batch(experiment: Experiment) -> TensorDictBase:
+    experiment.replay.extend(experiment._remembered(experiment.collector.rollout()))
+    batch = experiment.replay.sample()
+    # The update writes it; there from the start, one compilation is enough.
+    return batch.set("td_error", torch.zeros(batch.batch_size))
+
+
+def matrix_products(update: Callable[[], object]) -> Callable[[], None]:
+    """The matrix products that an eager update makes, forward and backward, and nothing else."""
+    with _Recorder() as recorder:
+        update()
+    products = [
+        (left, right, torch.empty(*left.shape[:-1], right.shape[-1]))
+        for left, right in recorder.factors
+    ]
+
+    def multiply() -> None:
+        for left, right, out in products:
+            torch.matmul(left, right, out=out)
+
+    return multiply
+
+
+class _Recorder(TorchDispatchMode):
+    """Keeps the factors of every matrix product, with the strides that they had."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.factors: list[tuple[Tensor, Tensor]] = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        aten = torch.ops.aten
+        if func.overloadpacket in (aten.mm, aten.bmm, aten.addmm, aten.baddbmm):
+            self.factors.append(tuple(factor.detach().clone() for factor in args[-2:]))
+        return func(*args, **(kwargs or {}))
+
+
+def _repeat(action: Callable[[], object], times: int) -> int:
+    for _ in range(times):
+        action()
+    return times
+
+
+def _parse(arguments: list[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.speed", description=__doc__)
+    parser.add_argument("--rows", nargs="+", choices=ROWS, default=list(ROWS), help="default: all")
+    parser.add_argument("--json", type=Path, help="file to write the rows to")
+    parser.add_argument("--markdown", type=Path, help="file to write the table to")
+    parser.add_argument(
+        "--quick", action="store_true", help="one short uncompiled round: shows that it runs"
+    )
+    parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
+    return parser.parse_args(arguments)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Measures, prints and writes the rows."""
+    options = _parse(arguments)
+    for chatty in ("torchrl", "torch"):
+        logging.getLogger(chatty).setLevel(logging.ERROR)
+    warnings.simplefilter("ignore")
+    torch.set_num_threads(1)
+    effort = QUICK if options.quick else Effort()
+    if options.worker:
+        _work(effort)
+        return
+    where, rows, started = machine(), [], time.monotonic()
+    for group in tqdm(options.rows, disable=None):
+        # Functions of one source share what was compiled for them: begin anew.
+        torch.compiler.reset()
+        for row in ROWS[group](effort):
+            tqdm.write(to_text(row))
+            rows.append(row)
+    result = {
+        "machine": where,
+        "quick": options.quick,
+        "minutes": (time.monotonic() - started) / 60,
+        "rows": [row.to_dict() for row in rows],
+    }
+    if options.json:
+        options.json.write_text(json.dumps(result, indent=2) + "\n")
+    if options.markdown:
+        options.markdown.write_text(to_markdown(rows, where))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,110 @@
+"""The pages of docs/ are true: their code runs, their names and numbers are the package's."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from scipy.integrate import quad
+
+import torchrl_l2c2
+
+FOLDER = Path(__file__).parents[1] / "docs"
+PAGES = sorted(path.name for path in FOLDER.glob("*.md"))
+COMPONENTS = FOLDER / "components.md"
+# An HTML comment right before a block keeps it from being run.
+BLOCK = re.compile(r"(?P<skip><!-- no-test -->\s*)?^```python\n(?P<code>.*?)^```", re.M | re.S)
+
+
+def run_blocks(page: Path) -> dict[str, Any]:
+    """Runs a page's Python blocks in order, in one namespace; errors show the page's lines."""
+    text = page.read_text()
+    namespace: dict[str, Any] = {"__name__": page.name}
+    for block in BLOCK.finditer(text):
+        if block["skip"] is None:
+            line = text.count("\n", 0, block.start("code"))
+            exec(compile("\n" * line + block["code"], str(page), "exec"), namespace)
+    return namespace
+
+
+@pytest.fixture(scope="module")
+def components() -> dict[str, Any]:
+    """What the page of the components has defined when all of it has run."""
+    torch.manual_seed(0)
+    return run_blocks(COMPONENTS)
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page != COMPONENTS.name])
+def test_blocks_run(page: str) -> None:
+    """The code of every page runs from top to bottom."""
+    run_blocks(FOLDER / page)
+
+
+def test_a_marked_block_is_left_out_and_the_others_share_a_namespace(tmp_path: Path) -> None:
+    """An error in a block shows, one after the mark does not."""
+    page = tmp_path / "page.md"
+    page.write_text(
+        "```python\na = 1\n```\n<!-- no-test -->\n```python\nraise ValueError\n```\n"
+        "```bash\nfalse\n```\n```python\nb = a + 1\n```\n"
+    )
+    assert run_blocks(page)["b"] == 2
+    page.write_text("text\n\n```python\nraise ValueError\n```\n")
+    with pytest.raises(ValueError) as raised:
+        run_blocks(page)
+    assert raised.traceback[-1].lineno == 3  # counted from 0: the page's fourth line
+
+
+def test_every_public_name_has_a_section_that_uses_it(components: dict[str, Any]) -> None:
+    """Nothing public is left out, and each section runs what it is about."""
+    sections = re.split(r"^## ", COMPONENTS.read_text(), flags=re.M)[1:]
+    for name in torchrl_l2c2.__all__:
+        described = [s for s in sections if f"`{name}`" in s.splitlines()[0]]
+        assert len(described) == 1, name
+        code = "".join(block["code"] for block in BLOCK.finditer(described[0]))
+        assert re.search(rf"\b{name}\b", code), name
+        assert components[name] is getattr(torchrl_l2c2, name)
+
+
+def test_the_table_of_contents_leads_to_sections() -> None:
+    """Every link into the page has its heading, as GitHub names it."""
+    text = COMPONENTS.read_text()
+    headings = re.findall(r"^## (.*)$", text, re.M)
+    anchors = {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+    links = set(re.findall(r"\]\(#([^)]*)\)", text))
+    assert links and links <= anchors
+
+
+def test_the_mean_gains_are_right(components: dict[str, Any]) -> None:
+    """The page's table and its formula, against quadrature over the largest of n draws."""
+    text = COMPONENTS.read_text()
+    rows = {
+        name: [float(cell) for cell in cells.split("|")[:-1]]
+        for name, cells in re.findall(r"^\| (mean [^|]*?) \|(.*)$", text, re.M)
+    }
+    near = torchrl_l2c2.Neighborhood(1.0, 0.01, 1.0)
+    for column, n in enumerate((1, 2, 5, 9, 15, 28)):
+
+        def mean(function: Any, n: int = n) -> float:
+            # The density of the largest of n draws from [0, r] is n x^(n-1) / r^n; here r = 1.
+            return quad(lambda x: n * x ** (n - 1) * function(x), 0.0, near.radius)[0]
+
+        gain = mean(lambda x: near.scale / (x + near.epsilon))
+        assert components["mean_gain"](near, n) == pytest.approx(gain, rel=1e-8)
+        assert rows["mean gain"][column] == pytest.approx(gain, abs=0.5001e-4)
+        distance = rows["mean distance, less epsilon"][column]
+        assert distance == pytest.approx(mean(lambda x: x), abs=0.5001e-3)
+
+
+def test_the_gain_of_the_page_is_that_of_the_loss(components: dict[str, Any]) -> None:
+    """The diagnostics of a long batch are the means that the page predicts."""
+    torch.manual_seed(0)
+    near, loss = components["near"], components["loss"]
+    rollout = components["rollout"][:64].repeat(500)
+    with torch.no_grad():
+        terms = loss(rollout)
+    # The standard deviation of the gain in three dimensions is 0.011, of the distance 0.19.
+    assert terms["l2c2_gain"].item() == pytest.approx(components["mean_gain"](near, 3), abs=3e-4)
+    assert terms["l2c2_distance"].item() == pytest.approx(0.75 + near.epsilon, abs=6e-3)
