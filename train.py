@@ -10,10 +10,10 @@ from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig
-from torchrl_l2c2.experiment.checkpoints import CheckpointError
 from torchrl_l2c2.experiment.reports import compare_with_paper
 from torchrl_l2c2.experiment.training import Interrupted, finished_run
 
@@ -35,8 +35,11 @@ def main(settings: DictConfig) -> None:
     except Interrupted as interruption:
         print(interruption, file=sys.stderr)
         sys.exit(interruption.exit_status)
-    except (ValueError, OSError, CheckpointError, FloatingPointError) as error:
-        sys.exit(f"error: {error}")
+    except (ValueError, OSError, RuntimeError, FloatingPointError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        if HydraConfig.get().mode == RunMode.MULTIRUN:
+            raise  # Hydra counts it, goes on with the other jobs, and shows it again at the end.
+        sys.exit(1)
     print(compare_with_paper(run))
     print(f"picture: {folder / 'learning_curves.png'}")
 

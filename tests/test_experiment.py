@@ -15,17 +15,22 @@ from torchrl_l2c2 import make_actor
 from torchrl_l2c2.experiment import (
     AdamConfig,
     CAPSConfig,
+    DQNConfig,
     Experiment,
     ExperimentConfig,
     L2C2Config,
     NoRegularizerConfig,
+    PPOConfig,
     PPORPEConfig,
+    RolloutReplayConfig,
+    SACConfig,
     TaskConfig,
+    TD3Config,
     UniformReplayConfig,
     make_env,
 )
 from torchrl_l2c2.experiment.reports import read_runs, table
-from torchrl_l2c2.experiment.training import check_finite
+from torchrl_l2c2.experiment.training import SimulatorError, check_finite
 
 ROOT = Path(__file__).parent.parent
 TASKS = {
@@ -80,7 +85,7 @@ def test_the_same_seed_gives_the_same_numbers_and_another_seed_others():
 @pytest.mark.parametrize(
     "settings",
     [
-        {"replay": UniformReplayConfig()},
+        {"replay": UniformReplayConfig(batch_size=32)},
         {"optimizer": AdamConfig()},
         {"algorithm": PPORPEConfig(schedule="step", updates=2)},
         {"algorithm": PPORPEConfig(acting_policy="online", baseline="target")},
@@ -135,6 +140,113 @@ def test_nan_from_the_environment_stops_the_run_with_key_and_frame():
     batch["next", "reward"][4] = float("nan")
     with pytest.raises(FloatingPointError, match=r"'next', 'reward'.*frame 104"):
         check_finite(batch.detach(), first_frame=100)
+
+
+def broken_after(experiment, frames, outcome):
+    """Lets the simulator give (or raise) something else once so many frames were played."""
+    original, left = experiment.collector._gymnasium.step, [frames]
+
+    def step(action):
+        left[0] -= 1
+        if left[0] > 0:
+            return original(action)
+        if isinstance(outcome, Exception):
+            raise outcome
+        observation, _, *ends = original(action)
+        return observation, outcome, *ends
+
+    experiment.collector._gymnasium.step = step
+
+
+@pytest.mark.parametrize(
+    ("outcome", "error", "message"),
+    [
+        (float("nan"), FloatingPointError, r"'reward'\) is not finite at frame 59: \[nan\]"),
+        (RuntimeError("physics gone"), SimulatorError, "failed after frame 40: .* physics gone"),
+    ],
+)
+def test_a_broken_simulator_stops_the_run_and_leaves_a_checkpoint(
+    tmp_path, outcome, error, message
+):
+    """The error says where it began, and the checkpoint of the episode before is usable."""
+    config = small(checkpoint_interval=0.0)
+    experiment = Experiment(config, tmp_path)
+    broken_after(experiment, 60, outcome)
+    with pytest.raises(error, match=message) as raised:
+        experiment.train()
+    assert "Last good checkpoint: " in str(raised.value) and "00000001.pt" in str(raised.value)
+    again = Experiment(config, tmp_path)
+    assert len(again.metrics) == 1 and len(again.train()) == 2
+
+
+@pytest.mark.parametrize("entry", [("next", "reward"), "observation"])
+def test_a_batch_that_is_not_finite_can_be_skipped(entry):
+    """Nothing changes but the count; a finite batch then learns as ever."""
+    experiment = Experiment(small(on_nonfinite="skip"))
+    experiment.train()
+    before = [p.clone() for p in experiment.agent.loss.parameters()]
+    batch = experiment.replay.sample()
+    batch[entry][3] = float("nan")
+    assert experiment.update(batch, True) is None
+    after = experiment.agent.loss.parameters()
+    assert all(torch.equal(a, b) for a, b in zip(before, after, strict=True))
+    assert experiment.update(experiment.replay.sample(), True).isfinite().all()
+    assert experiment.metrics[-1]["skipped_updates"] == 0
+
+
+def test_a_loss_that_is_not_finite_stops_the_run_with_its_name(monkeypatch):
+    """The term, the update and the frame."""
+    experiment = Experiment(small())
+    original = experiment.update
+
+    def update(batch, with_policy):
+        values = original(batch, with_policy)
+        values[1] = float("inf")
+        return values
+
+    experiment.update = update
+    with pytest.raises(FloatingPointError, match=r"loss_critic is inf at update 1 \(frame 40\)"):
+        experiment.train()
+
+
+ALGORITHMS = {
+    "sac": SACConfig(random_frames=20),
+    "td3": TD3Config(random_frames=20),
+    "ppo": PPOConfig(frames=60, epochs=2),
+    "dqn": DQNConfig(random_frames=20),
+}
+
+
+@pytest.mark.parametrize("regularizer", [NoRegularizerConfig(), L2C2Config()])
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_every_algorithm_learns_from_its_batches(name, regularizer):
+    """Updates happen, every parameter group moves, and the regularizer's terms are there."""
+    discrete = name == "dqn"
+    task = replace(
+        PENDULUM, env_id="CartPole-v1" if discrete else "Pendulum-v1", episodes=8 if discrete else 2
+    )
+    batches = (
+        RolloutReplayConfig(batch_size=32) if name == "ppo" else UniformReplayConfig(batch_size=32)
+    )
+    config = small(task=task, algorithm=ALGORITHMS[name], replay=batches, regularizer=regularizer)
+    experiment = Experiment(config)
+    before = [p.clone() for p in experiment.agent.loss.parameters()]
+    metrics = experiment.train()
+    after = list(experiment.agent.loss.parameters())
+    assert experiment.updates > 0
+    assert all(p.isfinite().all() for p in after)
+    assert all(not torch.equal(a, b) for a, b in zip(before, after, strict=True))
+    added = {key for key in metrics[-1] if key.startswith("loss_l2c2")}
+    values = {"sac": "qvalue", "td3": "qvalue", "ppo": "critic", "dqn": "value"}[name]
+    expected = {f"loss_l2c2_{values}"} | (set() if discrete else {"loss_l2c2_actor"})
+    assert added == (expected if regularizer.name == "l2c2" else set())
+    assert len(experiment.test().returns) == 2
+
+
+def test_a_discrete_task_is_refused_by_algorithms_for_continuous_ones():
+    """And the other way round; the error says which kind is needed."""
+    with pytest.raises(ValueError, match="dqn needs discrete actions"):
+        Experiment(small(algorithm=DQNConfig()))
 
 
 def run_train(*overrides, folder, check=True):

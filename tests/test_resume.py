@@ -59,7 +59,7 @@ def lines(folder):
     [
         {"regularizer": L2C2Config()},
         {"regularizer": CAPSConfig(), "task": HOPPER},
-        {"replay": UniformReplayConfig(), "optimizer": AdamConfig()},
+        {"replay": UniformReplayConfig(batch_size=32), "optimizer": AdamConfig()},
         {"algorithm": PPORPEConfig(schedule="step"), "task": replace(SWINGUP, max_steps=30)},
     ],
     ids=("l2c2", "caps-hopper", "uniform-adam", "step"),

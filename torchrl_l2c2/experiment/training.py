@@ -136,11 +136,14 @@ class Experiment:
         Raises:
             FloatingPointError: NaN or infinity in what the environment gave, in a loss or in a
                 gradient; names the key and the step, and the last good checkpoint.
+            SimulatorError: the environment failed; names the frame and the last good checkpoint.
             Interrupted: a signal ended the training.
         """
         started, first_frame = time.monotonic(), self.frames
         total, done = self.config.task.episodes, len(self.metrics)
         bar = tqdm(total=total, initial=done, unit="episode", disable=not progress)
+        if self._compile:
+            bar.set_postfix_str("compiling at the first updates, up to two minutes")
         saved = time.monotonic()
         with bar, stop_on_signals() as signals:
             while len(self.metrics) < total:
@@ -233,8 +236,7 @@ class Experiment:
         parts: list[TensorDictBase] = []
         terms: list[torch.Tensor] = []
         while not parts or not parts[-1]["next", "done"][-1]:
-            batch = self.collector.rollout()
-            self._check_finite(batch)
+            batch = self._collect()
             parts.append(batch)
             self.frames += batch.numel()
             if isinstance(self.agent.exploration, EGreedyModule):
@@ -314,6 +316,19 @@ class Experiment:
             random_frames=self._random_frames,
         )
 
+    def _collect(self) -> TensorDictBase:
+        try:
+            batch = self.collector.rollout()
+            check_finite(batch, self.frames)
+        except FloatingPointError as error:
+            raise FloatingPointError(f"{error} {self._last_checkpoint()}") from None
+        except Exception as error:
+            raise SimulatorError(
+                f"{self.config.task.env_id} failed after frame {self.frames}: "
+                f"{type(error).__name__}: {error} {self._last_checkpoint()}"
+            ) from error
+        return batch
+
     @property
     def _random_frames(self) -> int:
         return getattr(self.config.algorithm, "random_frames", 0)
@@ -374,12 +389,6 @@ class Experiment:
         }
         return {**means, **shares}
 
-    def _check_finite(self, batch: TensorDictBase) -> None:
-        try:
-            check_finite(batch, self.frames)
-        except FloatingPointError as error:
-            raise FloatingPointError(f"{error} {self._last_checkpoint()}") from None
-
     def _check_terms(self, values: torch.Tensor) -> None:
         bad = ~values.isfinite()
         if bad.any():
@@ -406,6 +415,10 @@ class Experiment:
 
 def _state_of(part: Any) -> dict[str, Any] | None:
     return None if part is None else part.state_dict()
+
+
+class SimulatorError(RuntimeError):
+    """The environment or the policy in it raised an error; the cause is chained."""
 
 
 class Interrupted(Exception):

@@ -39,9 +39,9 @@ class PPORPELoss(LossModule):
         y = r + \gamma (1 - \mathrm{terminated}) \bar V(s')
 
     with :math:`A = y - V(s)` detached, :math:`\bar V` the mean of the target critic's heads and
-    the threshold :math:`\epsilon = \kappa\Delta`. Both terms are multiplied by the importance weights
-    of prioritized replay where the batch has them, divided by the batch's largest (Schaul et al.,
-    arXiv:1511.05952), and ``|A|`` is written as the new priority.
+    the threshold :math:`\epsilon = \kappa\Delta`. Both terms are multiplied by the importance
+    weights of prioritized replay where the batch has them, divided by the batch's largest (Schaul
+    et al., arXiv:1511.05952), and ``|A|`` is written as the new priority.
 
     [inferred] Only the abstracts of the algorithm's papers could be read, so these are settings:
     all heads share one target; ``threshold``, ``critic_weighting`` and ``baseline`` each have the

@@ -1,0 +1,39 @@
+"""The package as a whole: its style, what importing it needs, and what it says of itself."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import torchrl_l2c2
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.mark.parametrize("arguments", [["check"], ["format", "--check"]])
+def test_ruff_is_content(arguments):
+    """Lint and format, with the rules of pyproject.toml."""
+    command = [sys.executable, "-m", "ruff", *arguments, "."]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_importing_the_components_needs_nothing_of_the_experiment():
+    """No Hydra, Gymnasium, PyBullet or drawing library beyond what torchrl itself imports."""
+    code = (
+        "import sys, torchrl, torchrl.modules, torchrl.objectives, torchrl.envs\n"
+        "before = set(sys.modules)\n"
+        "import torchrl_l2c2\n"
+        "new = {name.split('.')[0] for name in set(sys.modules) - before}\n"
+        "print(sorted(new & {'hydra', 'gymnasium', 'pybullet', 'matplotlib', 'tqdm'}))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_every_public_name_is_documented_with_an_example():
+    """A docstring, and for classes and functions a runnable example in it."""
+    for name in set(torchrl_l2c2.__all__) - {"__version__"}:
+        public = getattr(torchrl_l2c2, name)
+        assert "Examples:" in public.__doc__ and ">>>" in public.__doc__, name
