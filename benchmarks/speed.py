@@ -47,11 +47,14 @@ from torchrl_l2c2.experiment import (
 )
 from torchrl_l2c2.experiment.agents import make_agent, make_update
 from torchrl_l2c2.experiment.collection import EpisodeCollector
-from torchrl_l2c2.experiment.config import BULLET, SACConfig
+from torchrl_l2c2.experiment.config import SACConfig
+from torchrl_l2c2.experiment.environments import quiet_stdout
 from torchrl_l2c2.modules import make_actor
 from torchrl_l2c2.optim import AdaTerm
 from torchrl_l2c2.updaters import TSoftUpdate
 
+BULLET = "pybullet_envs_gymnasium"
+ROOT = Path(__file__).parent.parent
 TASKS = {
     "swingup": TaskConfig(),
     "reacher": TaskConfig("reacher", f"{BULLET}:ReacherBulletEnv-v0", max_steps=150),
@@ -158,9 +161,10 @@ def collection_rows(effort: Effort) -> Iterable[Row]:
 
 def _simulation(task: TaskConfig, collector: EpisodeCollector) -> Callable[[], int]:
     """As many frames as the collector's batch has, by the collector's own compiled policy."""
-    simulator = gymnasium.make(task.env_id, max_episode_steps=task.max_steps)
     policy, action = collector._act, collector._policy_keys.index("action")
-    observation, _ = simulator.reset()
+    with quiet_stdout():
+        simulator = gymnasium.make(task.env_id, max_episode_steps=task.max_steps)
+        observation, _ = simulator.reset()
 
     @torch.no_grad()
     def simulate() -> int:
@@ -271,7 +275,7 @@ def process_rows(effort: Effort) -> Iterable[Row]:
     # One after the other: the second finds what the first has compiled.
     workers = []
     for _ in range(2):
-        worker = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True)
+        worker = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, cwd=ROOT)
         worker.stdout.readline()
         workers.append(worker)
 
@@ -428,7 +432,7 @@ def _batch(experiment: Experiment) -> TensorDictBase:
     return batch.set("td_error", torch.zeros(batch.batch_size))
 
 
-def matrix_products(update: Callable[[], object]) -> Callable[[], None]:
+def matrix_products(update: Callable[[], object]) -> partial[None]:
     """The matrix products that an eager update makes, forward and backward, and nothing else."""
     with _Recorder() as recorder:
         update()
@@ -436,12 +440,13 @@ def matrix_products(update: Callable[[], object]) -> Callable[[], None]:
         (left, right, torch.empty(*left.shape[:-1], right.shape[-1]))
         for left, right in recorder.factors
     ]
+    return partial(_multiply, products)
 
-    def multiply() -> None:
-        for left, right, out in products:
-            torch.matmul(left, right, out=out)
 
-    return multiply
+@torch.no_grad()
+def _multiply(products: list[tuple[Tensor, Tensor, Tensor]]) -> None:
+    for left, right, out in products:
+        torch.matmul(left, right, out=out)
 
 
 class _Recorder(TorchDispatchMode):

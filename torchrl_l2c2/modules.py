@@ -133,9 +133,11 @@ def make_actor(
     """
     if squash not in ("tanh", "none"):
         raise ValueError(f"make_actor: squash must be 'tanh' or 'none', got {squash!r}.")
-    spec = action if isinstance(action, TensorSpec) else None
-    size = action if spec is None else _action_size(spec)
-    _check_whole("make_actor: the number of actions", size)
+    spec = action
+    if not isinstance(spec, TensorSpec):
+        _check_whole("make_actor: the number of actions", action)
+        spec = Bounded(low=-1.0, high=1.0, shape=(action,))
+    size = _action_size(spec)
     network = NormalNetwork(
         _body(observation_size, hidden, 2 * size, squish_b), NormalParamExtractor(scale_mapping)
     )
@@ -144,7 +146,7 @@ def make_actor(
         in_keys=["loc", "scale"],
         spec=spec,
         distribution_class=TanhNormal if squash == "tanh" else IndependentNormal,
-        distribution_kwargs=_bounds(spec) if squash == "tanh" and spec is not None else {},
+        distribution_kwargs=_bounds(spec) if squash == "tanh" else {},
         return_log_prob=True,
         log_prob_key="action_log_prob",
         default_interaction_type=ExplorationType.RANDOM,

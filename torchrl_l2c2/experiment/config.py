@@ -12,21 +12,27 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-BULLET = "pybullet_envs_gymnasium"
+SWINGUP = "pybullet_envs_gymnasium:InvertedPendulumSwingupBulletEnv-v0"
 
 
 @dataclass(frozen=True)
 class TaskConfig:
-    """What is learned: a Gymnasium task with noisy observations. Comments: ``conf/task/``."""
+    """What is learned: a Gymnasium task with noisy observations. Comments: ``conf/task/``.
+
+    Left at ``None``, ``noise_scale`` is the paper's for Swingup, and none for any other task.
+    """
 
     name: str = "swingup"
-    env_id: str = f"{BULLET}:InvertedPendulumSwingupBulletEnv-v0"
-    noise_scale: float = 0.01
+    env_id: str = SWINGUP
+    noise_scale: float | None = None
     episodes: int = 200
     max_steps: int = 1000
-    solved_at: float | None = 800.0
+    solved_at: float | None = None
 
     def __post_init__(self) -> None:
+        if self.noise_scale is None:
+            # Frozen: this is how a default that depends on another field is set.
+            object.__setattr__(self, "noise_scale", 0.01 if self.env_id == SWINGUP else 0.0)
         _nonnegative(self, "noise_scale")
         _whole(self, "episodes", "max_steps")
 
@@ -289,7 +295,7 @@ class ExperimentConfig:
         (5, 'caps', 32)
     """
 
-    task: TaskConfig = field(default_factory=TaskConfig)
+    task: TaskConfig = field(default_factory=lambda: TaskConfig(solved_at=800.0))
     algorithm: AlgorithmConfig = field(default_factory=PPORPEConfig)
     regularizer: RegularizerConfig = field(default_factory=L2C2Config)
     replay: ReplayConfig | None = None
@@ -305,7 +311,6 @@ class ExperimentConfig:
 
     def __post_init__(self) -> None:
         replay, optimizer = _usual(self.algorithm)
-        # Frozen: this is how a default that depends on another field is set.
         object.__setattr__(self, "replay", self.replay or replay)
         object.__setattr__(self, "optimizer", self.optimizer or optimizer)
         on_policy = isinstance(self.algorithm, PPOConfig)

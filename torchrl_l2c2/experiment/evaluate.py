@@ -16,7 +16,7 @@ from pathlib import Path
 import torch
 from tensordict.nn import TensorDictModule
 from torchrl.envs import EnvBase, ExplorationType
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 from torchrl_l2c2.experiment.collection import EpisodeCollector
 from torchrl_l2c2.metrics import action_variation

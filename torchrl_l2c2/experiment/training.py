@@ -28,7 +28,7 @@ from torchrl.data import (
 )
 from torchrl.envs import ExplorationType, RewardScaling, set_exploration_type
 from torchrl.modules import EGreedyModule
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 from torchrl_l2c2.experiment.agents import is_loss, make_agent, make_update
 from torchrl_l2c2.experiment.checkpoints import (
@@ -245,6 +245,8 @@ class Experiment:
                 self.replay.extend(self._remembered(batch))
                 self._replay_updates(self.config.algorithm.updates or 1, terms)
         episode = torch.cat(parts)
+        # Of the policy that played it, where the updates come after the episode.
+        variation = self._action_variation(episode)
         if self.config.algorithm.schedule != "step":
             self.replay.extend(self._remembered(episode))
             self._updates_after_episode(terms)
@@ -254,7 +256,7 @@ class Experiment:
             "updates": self.updates,
             "skipped_updates": self.skipped_updates,
             "return": episode["next", "reward"].sum().item(),
-            "action_variation": self._action_variation(episode),
+            "action_variation": variation,
             "length": episode.numel(),
             **self._mean_terms(terms),
         }

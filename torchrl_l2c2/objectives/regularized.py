@@ -323,7 +323,9 @@ class RegularizedLoss(LossModule):
     def _reduce_term(self, value: Tensor, tensordict: TensorDictBase) -> Tensor:
         """Reduces as the loss does its own terms: its reduction, masks and priority weights.
 
-        Losses that ignore priority weights, ignore them here too.
+        Losses that ignore priority weights, ignore them here too. Weights make it TorchRL's
+        weighted mean, whose strength does not depend on them; :class:`PPORPELoss` scales its own
+        terms down by them, so that beside those a regularizer is at its full gain.
         """
         weights = None
         if hasattr(self.tensor_keys, "priority_weight"):

@@ -1,0 +1,82 @@
+"""The benchmark command runs and writes what it says."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from benchmarks.speed import matrix_products
+from benchmarks.timing import Row, alternate, to_markdown
+
+REPOSITORY = Path(__file__).parent.parent
+
+
+def test_the_command_writes_rows_as_json_and_as_a_table(tmp_path):
+    """A quick run of two groups: valid JSON, one table line per row, ratios of the parts."""
+    result, table = tmp_path / "speed.json", tmp_path / "speed.md"
+    command = [sys.executable, "-m", "benchmarks.speed", "--quick", "--rows", "update", "cuda"]
+    subprocess.run(
+        [*command, "--json", str(result), "--markdown", str(table)],
+        check=True,
+        cwd=REPOSITORY,
+        env={**os.environ, "CUDA_VISIBLE_DEVICES": ""},
+        capture_output=True,
+    )
+    written = json.loads(result.read_text())
+    rows = written["rows"]
+    assert [row["group"] for row in rows] == ["update"] * 3 + ["cuda"] * 3
+    parts = rows[0]["parts"]
+    assert rows[0]["value"] == pytest.approx(parts["eager us"] / parts["compiled us"])
+    assert rows[0]["met"] == (rows[0]["value"] >= rows[0]["at_least"])
+    assert rows[3]["value"] is None and "no CUDA device" in rows[3]["note"]
+    assert written["quick"] and written["machine"]["name"] and written["machine"]["cpu"]
+    assert written["machine"]["versions"]["torch"] == torch.__version__
+    assert all(f"| {row['name']} |" in table.read_text() for row in rows)
+
+
+def test_alternate_takes_turns_and_gives_the_median_per_unit():
+    """Of rounds of 1, 2 and 9 times 10 ms for two units, the median is 10 ms a unit."""
+    turns, factors = [], iter([0, 1, 2, 9])
+
+    def slow():
+        turns.append("slow")
+        time.sleep(0.01 * next(factors))
+        return 2
+
+    times = alternate({"slow": slow, "fast": lambda: turns.append("fast")}, repeats=3)
+    assert turns == ["slow", "fast"] * 4
+    assert 0.010 <= times["slow"] < 0.020
+    assert times["fast"] < times["slow"]
+
+
+def test_matrix_products_are_those_of_forward_and_backward():
+    """A linear layer on 3 rows with a gradient to its input makes three: x W^T, g^T x and g W."""
+    x = torch.randn(3, 4, requires_grad=True)
+    layer = torch.nn.Linear(4, 5)
+    multiply = matrix_products(lambda: layer(x).sum().backward())
+    shapes = sorted(tuple(out.shape) for _, _, out in multiply.args[0])
+    assert shapes == [(3, 4), (3, 5), (5, 4)]
+    multiply()
+    outs = [out for left, right, out in multiply.args[0] if out.shape == (3, 5)]
+    torch.testing.assert_close(outs[0], x @ layer.weight.T)
+
+
+@pytest.mark.parametrize(
+    ("row", "met"),
+    [
+        (Row("g", "r", 4.0, at_least=4.0), True),
+        (Row("g", "r", 1.3, at_most=1.25), False),
+        (Row("g", "r", at_most=1.25, note="not measured"), None),
+        (Row("g", "r", 2.0), None),
+    ],
+)
+def test_a_row_meets_its_limit_or_not(row, met):
+    """Limits count as met; nothing is met without a value or a limit."""
+    assert row.met is met
+    where = {"cpu": "c", "cores": 2, "load": 0.0, "threads": 1, "versions": {}, "python": "3"}
+    assert {True: "| yes |", False: "| no |", None: "| - |"}[met] in to_markdown([row], where)
