@@ -14,6 +14,7 @@ import torch
 from torchrl_l2c2 import make_actor
 from torchrl_l2c2.experiment import (
     AdamConfig,
+    AdaTermConfig,
     CAPSConfig,
     DQNConfig,
     Experiment,
@@ -252,7 +253,7 @@ def test_a_discrete_task_is_refused_by_algorithms_for_continuous_ones():
 def run_train(*overrides, folder, check=True):
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     return subprocess.run(
-        [sys.executable, ROOT / "train.py", f"outputs={folder}", "compile=false", *overrides],
+        [sys.executable, ROOT / "train.py", *overrides, f"outputs={folder}", "compile=false"],
         cwd=folder,
         env=environment,
         check=check,
@@ -291,8 +292,8 @@ def test_a_run_from_the_command_line_leaves_everything_behind(tmp_path):
 
 def test_a_sweep_gives_one_table(tmp_path):
     """Methods and seeds in their order; figures over seeds with every seed's own behind them."""
-    overrides = ("-m", "regularizer=none,l2c2", "seed=0,1", "hydra/launcher=basic")
-    run_train(*PENDULUM_OVERRIDES, *overrides, folder=tmp_path)
+    overrides = ("regularizer=none,l2c2", "seed=0,1", "hydra/launcher=basic")
+    run_train("-m", *PENDULUM_OVERRIDES, *overrides, folder=tmp_path)
     runs = read_runs(tmp_path)
     assert [(run.regularizer, run.seed) for run in runs] == [
         ("none", 0),
@@ -304,15 +305,23 @@ def test_a_sweep_gives_one_table(tmp_path):
     assert len(rows) == 4 and "| vanilla | 0, 1 |" in rows[2] and "| L2C2 | 0, 1 |" in rows[3]
 
 
+def test_in_a_sweep_a_failed_job_is_told_and_the_others_go_on(tmp_path):
+    """And the same command again does not repeat what is finished."""
+    overrides = ("-m", *PENDULUM_OVERRIDES, "regularizer.sigma=-1,1", "hydra/launcher=basic")
+    failed = run_train(*overrides, folder=tmp_path, check=False)
+    assert failed.returncode == 1
+    assert "sigma must be finite and greater than 0" in failed.stderr
+    (run,) = read_runs(tmp_path)
+    written = (run.folder / "evaluation.json").stat().st_mtime_ns
+    run_train(*overrides, folder=tmp_path, check=False)
+    assert (run.folder / "evaluation.json").stat().st_mtime_ns == written
+
+
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
         (["task=gymnasium", "task.env_id=Nowhere-v0"], "Nowhere-v0' is not a task that Gymnasium"),
         (["regularizer.sigma=-1"], "sigma must be finite and greater than 0"),
-        (["regularizer.lambda_min=2"], "lambda_max must be greater than"),
-        (["regularizer.beta=-0.1"], "beta"),
-        (["algorithm.kappa=9"], "kappa must be in"),
-        (["task=gymnasium", "task.env_id=CartPole-v1"], "needs continuous actions"),
     ],
 )
 def test_a_wrong_setting_ends_with_one_clear_line(tmp_path, overrides, message):
@@ -323,6 +332,26 @@ def test_a_wrong_setting_ends_with_one_clear_line(tmp_path, overrides, message):
     assert failed.stderr.strip().splitlines()[-1].startswith("error: ")
     assert message in failed.stderr
     assert not list(tmp_path.rglob("metrics.csv"))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"regularizer": L2C2Config(lambda_min=2.0)}, "lambda_max must be greater than"),
+        ({"regularizer": L2C2Config(beta=-0.1)}, "beta must be finite and at least 0, got -0.1"),
+        ({"algorithm": PPORPEConfig(kappa=9.0)}, "kappa must be in"),
+        ({"regularizer": CAPSConfig(mean="median")}, "mean must be 'loc' or 'action'"),
+        ({"optimizer": AdaTermConfig(lr=-1.0)}, "lr must be finite and at least 0, got -1.0"),
+        (
+            {"task": TaskConfig("cartpole", "CartPole-v1")},
+            "ppo_rpe needs continuous actions, this task's are OneHot",
+        ),
+    ],
+)
+def test_settings_that_a_component_refuses_are_refused_when_the_run_is_made(settings, message):
+    """With the component's own words."""
+    with pytest.raises(ValueError, match=message):
+        Experiment(small(**settings))
 
 
 def test_an_unwritable_folder_is_named(tmp_path):

@@ -75,7 +75,8 @@ def make_algorithm(config: AlgorithmConfig, env: EnvBase, regularize: Regularize
     if continuous == isinstance(config, DQNConfig):
         kind = "discrete" if isinstance(config, DQNConfig) else "continuous"
         raise ValueError(
-            f"algorithm={config.name} needs {kind} actions, this task's are {env.action_spec}."
+            f"algorithm={config.name} needs {kind} actions, this task's are "
+            f"{type(env.action_spec).__name__} of shape {tuple(env.action_spec.shape)}."
         )
     return BUILDERS[type(config)](config, env, regularize)
 
