@@ -269,7 +269,7 @@ class Experiment:
             progress (bool): whether to show a progress bar.
 
         Returns:
-            Evaluation: also written to ``evaluation.json``, beside the picture of the run.
+            Evaluation: give it to :meth:`finish` to have it written.
         """
         env = make_env(self.config.task, self.config.seed + TEST_SEED)
         result = evaluate_policy(
@@ -284,7 +284,17 @@ class Experiment:
         return result
 
     def finish(self, result: Evaluation) -> FinishedRun:
-        """Writes what a finished run's folder holds: policy, test episodes and picture."""
+        """Writes what a finished run's folder holds: policy, test episodes and picture.
+
+        Args:
+            result (Evaluation): of :meth:`test`.
+
+        Returns:
+            FinishedRun: the folder, read back.
+
+        Raises:
+            ValueError: the experiment was made without a folder.
+        """
         if self.folder is None:
             raise ValueError("this experiment has no folder to write to; give it one when made.")
         save_policy(self.agent.policy, self.folder / "policy.pt")
