@@ -170,7 +170,8 @@ def draw_learning_curves(runs: Sequence[FinishedRun], path: str | Path) -> None:
                 label=None if name in named else name,
             )
             named.add(name)
-        axis.set_xlabel("frames")
+        axis.set_xlabel("thousand frames")
+        axis.xaxis.set_major_formatter(lambda frames, _: f"{frames / 1000:g}")
         axis.set_ylabel(label)
         axis.grid(alpha=0.25)
     if runs[0].solved_at is not None:
