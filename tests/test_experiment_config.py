@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
 from torchrl_l2c2.experiment import ExperimentConfig, TaskConfig
@@ -13,8 +14,15 @@ CONF = Path(__file__).parent.parent / "conf"
 
 
 def composed(*overrides):
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
+    """What `python train.py` composes; other tests store TorchRL's nodes under the same names."""
+    store = ConfigStore.instance()
+    stored = store.repo
+    store.repo = {name: nodes for name, nodes in stored.items() if name not in GROUPS}
+    try:
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            return OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
+    finally:
+        store.repo = stored
 
 
 def test_the_defaults_of_the_files_are_those_of_the_classes():
