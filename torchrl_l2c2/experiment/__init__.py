@@ -1,6 +1,11 @@
 """The paper's experiment, built from the components: needs the ``experiment`` extra."""
 
-from torchrl_l2c2.experiment.config import (
+import warnings
+
+# `python -m` of a module that the package has imported itself is meant, and harmless here.
+warnings.filterwarnings("ignore", ".*found in sys.modules after import of package", RuntimeWarning)
+
+from torchrl_l2c2.experiment.config import (  # noqa: E402
     AdamConfig,
     AdaTermConfig,
     CAPSConfig,
@@ -18,9 +23,9 @@ from torchrl_l2c2.experiment.config import (
     TD3Config,
     UniformReplayConfig,
 )
-from torchrl_l2c2.experiment.environments import make_env
-from torchrl_l2c2.experiment.evaluate import Evaluation, evaluate_policy
-from torchrl_l2c2.experiment.training import Experiment
+from torchrl_l2c2.experiment.environments import make_env  # noqa: E402
+from torchrl_l2c2.experiment.evaluate import Evaluation, evaluate_policy  # noqa: E402
+from torchrl_l2c2.experiment.training import Experiment  # noqa: E402
 
 __all__ = [
     "AdaTermConfig",

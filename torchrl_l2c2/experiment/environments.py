@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import sys
 from collections.abc import Iterator
@@ -34,7 +35,7 @@ def make_env(task: TaskConfig, seed: int) -> EnvBase:
             tensor of floats.
     """
     try:
-        with quiet_stdout():
+        with quiet_output():
             env = GymEnv(task.env_id, max_episode_steps=task.max_steps)
             env.reset()
     except (gymnasium.error.Error, ModuleNotFoundError) as error:
@@ -61,15 +62,20 @@ def _check_spaces(env: GymEnv, task: TaskConfig) -> None:
 
 
 @contextlib.contextmanager
-def quiet_stdout() -> Iterator[None]:
-    """Keeps what a C library prints to standard output, as Bullet does at start, off the screen."""
-    sys.stdout.flush()
-    saved = os.dup(1)
+def quiet_output() -> Iterator[None]:
+    """Keeps what a C library prints, as Bullet does at start, off the screen."""
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
+    saved = [os.dup(number) for number in (1, 2)]
     silent = os.open(os.devnull, os.O_WRONLY)
     try:
-        os.dup2(silent, 1)
+        for number in (1, 2):
+            os.dup2(silent, number)
         yield
     finally:
-        os.dup2(saved, 1)
-        os.close(saved)
+        # What the library has printed waits in C's own buffer where the output is no terminal.
+        ctypes.CDLL(None).fflush(None)
+        for number, original in zip((1, 2), saved, strict=True):
+            os.dup2(original, number)
+            os.close(original)
         os.close(silent)
