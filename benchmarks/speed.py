@@ -48,7 +48,7 @@ from torchrl_l2c2.experiment import (
 from torchrl_l2c2.experiment.agents import make_agent, make_update
 from torchrl_l2c2.experiment.collection import EpisodeCollector
 from torchrl_l2c2.experiment.config import SACConfig
-from torchrl_l2c2.experiment.environments import quiet_stdout
+from torchrl_l2c2.experiment.environments import quiet_output
 from torchrl_l2c2.modules import make_actor
 from torchrl_l2c2.optim import AdaTerm
 from torchrl_l2c2.updaters import TSoftUpdate
@@ -162,7 +162,7 @@ def collection_rows(effort: Effort) -> Iterable[Row]:
 def _simulation(task: TaskConfig, collector: EpisodeCollector) -> Callable[[], int]:
     """As many frames as the collector's batch has, by the collector's own compiled policy."""
     policy, action = collector._act, collector._policy_keys.index("action")
-    with quiet_stdout():
+    with quiet_output():
         simulator = gymnasium.make(task.env_id, max_episode_steps=task.max_steps)
         observation, _ = simulator.reset()
 

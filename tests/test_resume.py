@@ -132,14 +132,19 @@ def start(folder, episodes, *extra):
         "task.max_steps=50", "algorithm.updates=5", "test_episodes=1", "checkpoint_interval=0",
         f"hydra.run.dir={folder}", *extra,
     ]  # fmt: skip
-    return subprocess.Popen(
-        command,
-        cwd=folder.parent,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )
+    # Into a file: a pipe that nobody reads is full after some hundred lines of progress.
+    with open(messages(folder), "w") as output:
+        return subprocess.Popen(
+            command,
+            cwd=folder.parent,
+            stdout=output,
+            stderr=output,
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+        )
+
+
+def messages(folder):
+    return folder.with_suffix(".log")
 
 
 def final(folder):
@@ -154,7 +159,7 @@ def final(folder):
 def wait_for(condition, process, pause=0.01):
     ends = time.monotonic() + 120
     while not condition():
-        assert process.poll() is None, process.communicate()
+        assert process.poll() is None, f"the process ended with {process.returncode}"
         assert time.monotonic() < ends, "nothing happened"
         if pause:
             time.sleep(pause)
@@ -168,7 +173,7 @@ def test_killed_processes_end_with_the_numbers_of_the_one_that_was_not(tmp_path,
     """SIGKILL between and within episodes, and while a checkpoint is being written."""
     episodes = 30 * (kills + 1)
     undisturbed = start(tmp_path / "undisturbed", episodes)
-    assert undisturbed.wait(600) == 0, undisturbed.communicate()
+    assert undisturbed.wait(600) == 0, messages(tmp_path / "undisturbed").read_text()
     folder = tmp_path / "killed"
     for kill in range(kills):
         process = start(folder, episodes)
@@ -188,7 +193,7 @@ def test_killed_processes_end_with_the_numbers_of_the_one_that_was_not(tmp_path,
         process.wait()
         assert all(None not in row.values() for row in lines(folder)), "half a line"
     last = start(folder, episodes)
-    assert last.wait(600) == 0, last.communicate()
+    assert last.wait(600) == 0, messages(folder).read_text()
     assert final(folder) == final(tmp_path / "undisturbed")
     assert lines(folder) == lines(tmp_path / "undisturbed")
 
@@ -200,10 +205,10 @@ def test_signals_save_and_the_same_command_continues(tmp_path, number):
     process = start(folder, 2000, "checkpoint_interval=3600")
     wait_for(lambda: (folder / "metrics.csv").exists() and len(lines(folder)) >= 2, process)
     process.send_signal(number)
-    _, errors = process.communicate(timeout=30)
-    assert process.returncode == 128 + number
+    assert process.wait(30) == 128 + number
+    errors = messages(folder).read_text()
     assert f"{number.name} ended the training" in errors and "Traceback" not in errors
     episodes = len(lines(folder))
     again = start(folder, episodes + 1)
-    assert again.wait(120) == 0, again.communicate()
+    assert again.wait(120) == 0, messages(folder).read_text()
     assert len(lines(folder)) == episodes + 1
