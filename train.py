@@ -35,6 +35,9 @@ def main(settings: DictConfig) -> None:
     except Interrupted as interruption:
         print(interruption, file=sys.stderr)
         sys.exit(interruption.exit_status)
+    except KeyboardInterrupt:  # While testing, which begins anew, or a second one while training.
+        print(f"interrupted; the same command continues from {folder}.", file=sys.stderr)
+        sys.exit(130)
     except (ValueError, OSError, RuntimeError, FloatingPointError) as error:
         print(f"error: {error}", file=sys.stderr)
         if HydraConfig.get().mode == RunMode.MULTIRUN:

@@ -16,7 +16,11 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """
     # Without it the graph ends at the gradient, and the step is several small ones.
     torch._dynamo.config.trace_autograd_ops = True
-    return torch.compile(function, fullgraph=True, options={"fallback_random": True})
+    # Every run of a sweep compiles the same code for objects of its own: counted together, they
+    # would soon meet the limit of recompilations.
+    return torch.compile(
+        function, fullgraph=True, isolate_recompiles=True, options={"fallback_random": True}
+    )
 
 
 def compiler_available() -> bool:
