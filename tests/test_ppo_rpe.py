@@ -133,18 +133,19 @@ def test_the_ema_reading_averages_the_mean_deviation():
     assert terms["ratio_threshold"].item() == pytest.approx(0.5 * (0.5 * 0.1 + 0.5 * 0.25))
 
 
-def test_priority_weights_only_scale_down():
-    """Weights (2, 1) halve the second transition's losses and leave the first's."""
+@pytest.mark.parametrize(("importance", "weights"), [("max", (1.0, 0.5)), ("mean", (4 / 3, 2 / 3))])
+def test_priority_weights_are_divided_by_their_largest_or_their_mean(importance, weights):
+    """Weights (2, 1): the first only scales down, the second is a weighted mean."""
     settings = {"ratios": [1.5, 0.7], "rewards": [0.3, -2.0]}
     plain = make_loss(reduction="none")
     each = plain(make_batch(plain, **settings))
-    weighted = make_loss()
+    weighted = make_loss(importance=importance)
     weighted.load_state_dict({**plain.state_dict(), "delta": torch.tensor(0.1)})
     batch = make_batch(weighted, **settings)
     batch["priority_weight"] = torch.tensor([2.0, 1.0])
     terms = weighted(batch)
     for key in ("loss_actor", "loss_critic"):
-        expected = (each[key][0] + 0.5 * each[key][1]) / 2
+        expected = (weights[0] * each[key][0] + weights[1] * each[key][1]) / 2
         torch.testing.assert_close(terms[key], expected)
 
 
@@ -256,6 +257,7 @@ def test_renamed_keys_are_read():
         ("threshold", "median"),
         ("critic_weighting", "advantage"),
         ("baseline", "old"),
+        ("importance", "sum"),
         ("reduction", "max"),
     ],
 )

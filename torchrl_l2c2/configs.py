@@ -89,6 +89,7 @@ class PPORPELossConfig(LossConfig):
     threshold: str = "max"
     critic_weighting: str = "ratio"
     baseline: str = "stored"
+    importance: str = "max"
     reduction: str = "mean"
     _target_: str = "torchrl_l2c2.PPORPELoss"
 

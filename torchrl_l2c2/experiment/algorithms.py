@@ -116,6 +116,7 @@ def _ppo_rpe(config: PPORPEConfig, env: EnvBase, regularize: Regularize) -> Part
             threshold=config.threshold,
             critic_weighting=config.critic_weighting,
             baseline=config.baseline,
+            importance=config.importance,
         )
     )
     updater = TSoftUpdate(loss, tau=config.tau, nu=config.nu)

@@ -50,6 +50,7 @@ class PPORPEConfig:
     threshold: str = "max"
     critic_weighting: str = "ratio"
     baseline: str = "stored"
+    importance: str = "max"
     acting_policy: str = "target"
     reward_scale: float | None = None
     squash: str = "tanh"

@@ -44,8 +44,8 @@ class PPORPELoss(LossModule):
     et al., arXiv:1511.05952), and ``|A|`` is written as the new priority.
 
     [inferred] Only the abstracts of the algorithm's papers could be read, so these are settings:
-    all heads share one target; ``threshold``, ``critic_weighting`` and ``baseline`` each have the
-    reading that was seen to work as their default.
+    all heads share one target; ``threshold``, ``critic_weighting``, ``baseline`` and
+    ``importance`` each have the reading that was seen to work as their default.
 
     Args:
         actor_network (ProbabilisticTensorDictSequential): the policy. A target copy is kept.
@@ -69,6 +69,10 @@ class PPORPELoss(LossModule):
             :math:`\rho_R`; ``"none"`` does not. [inferred] Default ``"ratio"``.
         baseline (str): ``"stored"``: :math:`b` is the likelihood stored when the action was taken;
             ``"target"``: the target policy's likelihood now. [inferred] Default ``"stored"``.
+        importance (str): what the importance weights of prioritized replay are divided by:
+            ``"max"``, the batch's largest, so that they only scale the loss down; ``"mean"``, their
+            mean, as TorchRL's own losses do, which leaves the loss at full strength beside a
+            regularizer. [inferred] Default ``"max"``.
         reduction (str): ``"mean"``, ``"sum"`` or ``"none"``. Default ``"mean"``.
 
     Raises:
@@ -145,6 +149,7 @@ class PPORPELoss(LossModule):
         threshold: Literal["max", "ema"] = "max",
         critic_weighting: Literal["ratio", "none"] = "ratio",
         baseline: Literal["stored", "target"] = "stored",
+        importance: Literal["max", "mean"] = "max",
         reduction: str = "mean",
     ) -> None:
         super().__init__()
@@ -163,6 +168,7 @@ class PPORPELoss(LossModule):
         _check_choice("threshold", threshold, ("max", "ema"))
         _check_choice("critic_weighting", critic_weighting, ("ratio", "none"))
         _check_choice("baseline", baseline, ("stored", "target"))
+        _check_choice("importance", importance, ("max", "mean"))
         _check_choice("reduction", reduction, ("mean", "sum", "none"))
 
         self.convert_to_functional(actor_network, "actor_network", create_target_params=True)
@@ -175,6 +181,7 @@ class PPORPELoss(LossModule):
         self.threshold = threshold
         self.critic_weighting = critic_weighting
         self.baseline = baseline
+        self.importance = importance
         self.reduction = reduction
         # A concrete device, so that the buffer follows the networks' without asking for one.
         self.register_buffer("delta", torch.tensor(delta_min, device=self._default_device))
@@ -272,14 +279,10 @@ class PPORPELoss(LossModule):
         )
 
     def _importance_weight(self, tensordict: TensorDictBase) -> Tensor | float:
-        """As in prioritized replay: over the batch's largest, so that it only scales down.
-
-        TorchRL's own losses divide by the sum instead, which leaves the loss at full strength.
-        With an optimizer that has a smallest scale of gradients, as AdaTerm has, and beside terms
-        that are not weighted, the strength matters.
-        """
         weight = self._maybe_get_priority_weight(tensordict)
-        return 1.0 if weight is None else weight / weight.max()
+        if weight is None:
+            return 1.0
+        return weight / (weight.max() if self.importance == "max" else weight.mean())
 
     def _evaluate_batch(self, network: str, tensordict: TensorDictBase) -> TensorDictBase:
         """What a network writes at the batch's own states; a regularizer reads it here as well."""
