@@ -141,12 +141,7 @@ def _sac(config: SACConfig, env: EnvBase, regularize: Regularize) -> Parts:
 
 def _td3(config: TD3Config, env: EnvBase, regularize: Regularize) -> Parts:
     spec = env.action_spec
-    network = MLP(
-        in_features=_observation_size(env),
-        out_features=spec.shape[-1],
-        num_cells=list(config.hidden),
-        activation_class=nn.ReLU,
-    )
+    network = _network(config.hidden, _observation_size(env), spec.shape[-1], nn.ReLU)
     squash = TanhModule(in_keys=["action"], out_keys=["action"], spec=spec)
     actor = TensorDictSequential(Actor(network, out_keys=["action"]), squash)
     half_range = ((spec.space.high - spec.space.low) / 2).max().item()
@@ -169,12 +164,7 @@ def _td3(config: TD3Config, env: EnvBase, regularize: Regularize) -> Parts:
 
 def _dqn(config: DQNConfig, env: EnvBase, regularize: Regularize) -> Parts:
     spec = env.action_spec
-    network = MLP(
-        in_features=_observation_size(env),
-        out_features=spec.shape[-1],
-        num_cells=list(config.hidden),
-        activation_class=nn.ReLU,
-    )
+    network = _network(config.hidden, _observation_size(env), spec.shape[-1], nn.ReLU)
     values = QValueActor(network, spec=spec)
     loss = DQNLoss(values, action_space=spec, loss_function="l2", delay_value=True, double_dqn=True)
     loss.make_value_estimator(gamma=config.gamma)
@@ -191,14 +181,7 @@ def _dqn(config: DQNConfig, env: EnvBase, regularize: Regularize) -> Parts:
 
 def _ppo(config: PPOConfig, env: EnvBase, regularize: Regularize) -> Parts:
     actor = _stochastic_actor(config.hidden, env, nn.Tanh)
-    critic = ValueOperator(
-        MLP(
-            in_features=_observation_size(env),
-            out_features=1,
-            num_cells=list(config.hidden),
-            activation_class=nn.Tanh,
-        )
-    )
+    critic = ValueOperator(_network(config.hidden, _observation_size(env), 1, nn.Tanh))
     loss = ClipPPOLoss(
         actor,
         critic,
@@ -220,18 +203,24 @@ def _ppo(config: PPOConfig, env: EnvBase, regularize: Regularize) -> Parts:
     return Parts(loss, policy, advantage=advantage, compilable=False)
 
 
+def _network(
+    hidden: tuple[int, ...], in_features: int, out_features: int, activation: type[nn.Module]
+) -> MLP:
+    return MLP(
+        in_features=in_features,
+        out_features=out_features,
+        num_cells=list(hidden),
+        activation_class=activation,
+    )
+
+
 def _stochastic_actor(
     hidden: tuple[int, ...], env: EnvBase, activation: type[nn.Module]
 ) -> TensorDictModule:
     """A tanh-squashed diagonal normal."""
     spec = env.action_spec
     network = nn.Sequential(
-        MLP(
-            in_features=_observation_size(env),
-            out_features=2 * spec.shape[-1],
-            num_cells=list(hidden),
-            activation_class=activation,
-        ),
+        _network(hidden, _observation_size(env), 2 * spec.shape[-1], activation),
         NormalParamExtractor(),
     )
     return ProbabilisticActor(
@@ -248,9 +237,7 @@ def _stochastic_actor(
 
 def _action_value(hidden: tuple[int, ...], env: EnvBase) -> ValueOperator:
     size = _observation_size(env) + env.action_spec.shape[-1]
-    network = MLP(
-        in_features=size, out_features=1, num_cells=list(hidden), activation_class=nn.ReLU
-    )
+    network = _network(hidden, size, 1, nn.ReLU)
     return ValueOperator(network, in_keys=["observation", "action"])
 
 
