@@ -27,7 +27,6 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import gymnasium
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torchrl.envs import ExplorationType, set_exploration_type
@@ -49,6 +48,7 @@ from torchrl_l2c2.experiment.agents import make_agent, make_update
 from torchrl_l2c2.experiment.collection import EpisodeCollector
 from torchrl_l2c2.experiment.config import SACConfig
 from torchrl_l2c2.experiment.environments import quiet_output
+from torchrl_l2c2.experiment.replay import ReplayUpdate
 from torchrl_l2c2.modules import make_actor
 from torchrl_l2c2.optim import AdaTerm
 from torchrl_l2c2.updaters import TSoftUpdate
@@ -187,7 +187,9 @@ def run_rows(effort: Effort) -> Iterable[Row]:
         run, parts = Experiment(config, folder), Experiment(config, Path(folder) / "parts")
         parts_episode = play_episode(parts)
         parts_episode()
-        batch, row = parts.replay.sample(), parts.metrics[-1]
+        learner, row = parts.update, parts.metrics[-1]
+        draw = learner.draw()
+        priority = torch.rand(len(draw.index))
         frames = config.task.max_steps
         times = alternate(
             {
@@ -196,9 +198,9 @@ def run_rows(effort: Effort) -> Iterable[Row]:
                 **{
                     name: partial(_repeat, action, frames)
                     for name, action in {
-                        "sample": parts.replay.sample,
-                        "update": lambda: parts.update(batch, True),
-                        "prioritize": lambda: parts.replay.update_tensordict_priority(batch),
+                        "draw": learner.draw,
+                        "update": lambda: learner.update(True, *draw),
+                        "prioritize": lambda: learner.prioritize(draw.index, priority),
                     }.items()
                 },
                 "log": lambda: parts._log.write(row) or frames,
@@ -409,10 +411,12 @@ def updates(
         compile=False,
     )
     experiment = Experiment(config)
-    batch = _batch(experiment)
+    replay = experiment.replay
+    replay.extend(experiment._remembered(experiment.collector.rollout()))
     if device == "cpu":
-        update = make_update(experiment.agent, compile=compile)
-        return lambda: update(batch, True)
+        learner = ReplayUpdate(experiment.agent, replay, compile=compile)
+        draw = learner.draw()
+        return lambda: learner.update(True, *draw)
     agent = make_agent(config, experiment.env)
     agent.loss.to(device)
     agent.optimizer = AdaTerm(agent.loss.parameters())
@@ -421,15 +425,8 @@ def updates(
     if compile:
         torch._dynamo.config.trace_autograd_ops = True
         update = torch.compile(update, fullgraph=True, mode="reduce-overhead")
-    batch = batch.to(device)
-    return lambda: update(batch, True)
-
-
-def _batch(experiment: Experiment) -> TensorDictBase:
-    experiment.replay.extend(experiment._remembered(experiment.collector.rollout()))
-    batch = experiment.replay.sample()
-    # The update writes it; there from the start, one compilation is enough.
-    return batch.set("td_error", torch.zeros(batch.batch_size))
+    batch = replay.sample().to(device)
+    return lambda: update(True, batch)
 
 
 def matrix_products(update: Callable[[], object]) -> partial[None]:

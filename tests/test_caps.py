@@ -12,15 +12,19 @@ from losses import (
     critic,
     deterministic_actor,
     gaussian_actor,
-    one_hot_actor,
-    one_hot_batch,
     qvalue,
     transitions,
 )
 from tensordict import TensorDict
 from tensordict.nn import CompositeDistribution, TensorDictModule
 from torch import nn
-from torchrl.modules import Actor, IndependentNormal, ProbabilisticActor, TanhNormal
+from torchrl.modules import (
+    Actor,
+    IndependentNormal,
+    OneHotCategorical,
+    ProbabilisticActor,
+    TanhNormal,
+)
 from torchrl.objectives import DDPGLoss, DQNLoss, PPOLoss, SACLoss
 
 from torchrl_l2c2 import CAPSLoss
@@ -151,6 +155,30 @@ class TestMeans:
         moves = batch["observation"].tanh() - batch["next", "observation"].tanh()
         torch.testing.assert_close(found, 2 * 0.5 * moves.square().sum(-1).mean())
 
+    @pytest.mark.parametrize("kind", [torch.distributions.Categorical, OneHotCategorical])
+    def test_of_a_discrete_policy_the_probabilities_are_compared(self, kind):
+        """Half the squared distance of two softmaxes."""
+        net = nn.Linear(3, 2, bias=False)
+        net.weight.data = WEIGHT.clone()
+        actor = ProbabilisticActor(
+            TensorDictModule(net, ["observation"], ["logits"]),
+            in_keys=["logits"],
+            distribution_class=kind,
+            return_log_prob=True,
+        )
+        batch = linear_batch()
+        loss = CAPSLoss(PPOLoss(actor, critic()), lambda_temporal=1.0)
+        found = loss.policy_regularizer(batch)["loss_caps_temporal"]
+        here, there = (s @ WEIGHT.T for s in (batch["observation"], batch["next", "observation"]))
+        moves = here.softmax(-1) - there.softmax(-1)
+        torch.testing.assert_close(found, 0.5 * moves.square().sum(-1).mean())
+
+    def test_discrete_and_continuous_heads_add_up(self):
+        """A composite policy of both kinds has one finite term that trains it."""
+        loss = CAPSLoss(PPOLoss(composite_actor(), critic()))
+        term = loss.policy_regularizer(transitions(4))["loss_caps_temporal"]
+        assert term > 0 and term.shape == ()
+
 
 class TestGains:
     def test_papers_values_are_the_defaults(self):
@@ -213,10 +241,3 @@ class TestConstruction:
         )
         with pytest.raises(TypeError, match="CAPSLoss needs a policy: DQNLoss has none"):
             CAPSLoss(loss)
-
-    def test_discrete_policies_are_refused(self):
-        """Also as a head among others; the message points to L2C2Loss."""
-        with pytest.raises(TypeError, match=r"OneHotCategorical are discrete.*L2C2Loss"):
-            CAPSLoss(PPOLoss(one_hot_actor(), critic())).policy_regularizer(one_hot_batch(4))
-        with pytest.raises(TypeError, match=r"Categorical are discrete.*L2C2Loss"):
-            CAPSLoss(PPOLoss(composite_actor(), critic())).policy_regularizer(transitions(4))

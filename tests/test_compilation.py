@@ -36,3 +36,21 @@ def test_random_numbers_and_gradients_are_those_of_the_plain_function():
     expected = noisy_slope(x)
     torch.manual_seed(0)
     torch.testing.assert_close(compiled(noisy_slope)(x), expected)
+
+
+def test_a_constant_closure_is_looked_at_once_and_arguments_always():
+    """Written into, its tensors are followed; other arguments are another graph."""
+    weight, setting = torch.ones(2), {"scale": 1.0}
+
+    def scaled(x, double):
+        return (2.0 if double else 1.0) * setting["scale"] * weight * x
+
+    ours = compiled(scaled, constant_closure=True)
+    assert ours(torch.ones(2), False).tolist() == [1.0, 1.0]
+    assert ours(torch.ones(2), True).tolist() == [2.0, 2.0]
+    weight.fill_(3.0)
+    assert ours(torch.ones(2), False).tolist() == [3.0, 3.0]
+    assert ours(torch.ones(3, 2), True).shape == (3, 2)
+    setting["scale"] = 10.0
+    assert ours(torch.ones(2), False).tolist() == [3.0, 3.0]
+    assert compiled(scaled)(torch.ones(2), False).tolist() == [30.0, 30.0]

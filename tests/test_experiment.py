@@ -187,12 +187,14 @@ def test_a_batch_that_is_not_finite_can_be_skipped(entry):
     experiment = Experiment(small(on_nonfinite="skip"))
     experiment.train()
     before = [p.clone() for p in experiment.agent.loss.parameters()]
-    batch = experiment.replay.sample()
-    batch[entry][3] = float("nan")
-    assert experiment.update(batch, True) is None
+    rows = experiment.replay.storage._storage[entry]
+    finite = rows.clone()
+    rows.fill_(float("nan"))
+    assert experiment.update(True) is None
     after = experiment.agent.loss.parameters()
     assert all(torch.equal(a, b) for a, b in zip(before, after, strict=True))
-    assert experiment.update(experiment.replay.sample(), True).isfinite().all()
+    rows.copy_(finite)
+    assert experiment.update(True)[0].isfinite().all()
     assert experiment.metrics[-1]["skipped_updates"] == 0
 
 
@@ -201,10 +203,10 @@ def test_a_loss_that_is_not_finite_stops_the_run_with_its_name(monkeypatch):
     experiment = Experiment(small())
     original = experiment.update
 
-    def update(batch, with_policy):
-        values = original(batch, with_policy)
+    def update(with_policy):
+        values, priority = original(with_policy)
         values[1] = float("inf")
-        return values
+        return values, priority
 
     experiment.update = update
     with pytest.raises(FloatingPointError, match=r"loss_critic is inf at update 1 \(frame 40\)"):

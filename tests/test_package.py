@@ -24,12 +24,25 @@ def test_importing_the_components_needs_nothing_of_the_experiment():
     code = (
         "import sys, torchrl, torchrl.modules, torchrl.objectives, torchrl.envs\n"
         "before = set(sys.modules)\n"
-        "import torchrl_l2c2\n"
+        "from torchrl_l2c2 import *\n"
         "new = {name.split('.')[0] for name in set(sys.modules) - before}\n"
         "print(sorted(new & {'hydra', 'gymnasium', 'pybullet', 'matplotlib', 'tqdm'}))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_importing_the_package_puts_off_what_it_exports():
+    """Not one of its modules is imported before a name of it is used; then it is there."""
+    code = (
+        "import sys, torchrl, torchrl_l2c2\n"
+        "ours = lambda: sorted(name for name in sys.modules if name.startswith('torchrl_l2c2.'))\n"
+        "print(ours(), 'torchrl.objectives' in sys.modules)\n"
+        "assert 'L2C2Loss' in dir(torchrl_l2c2)\n"
+        "print(torchrl_l2c2.L2C2Loss.__name__, 'torchrl_l2c2.objectives' in ours())\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == ["[] False", "L2C2Loss True"]
 
 
 def test_every_public_name_is_documented_with_an_example():

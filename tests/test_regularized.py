@@ -423,8 +423,47 @@ class TestNetworks:
         loss.set_keys(value="other_value")
         torch.testing.assert_close(loss.value_regularizer(batch)["loss_l2c2_critic"], 4 * before)
         heads = TensorDictModule(mlp(OBSERVATION, 1), ["observation"], ["v"])
-        with pytest.raises(ValueError, match=r"critic_network writes \['v'\].*set_keys before"):
-            L2C2Loss(PPOLoss(gaussian_actor(), heads))
+        loss = L2C2Loss(PPOLoss(gaussian_actor(), heads), NEAR)
+        with pytest.raises(
+            ValueError, match=r"critic_network writes \['v'\].*name it with set_keys"
+        ):
+            loss.value_regularizer(batch)
+        loss.set_keys(value="v")
+        assert loss.value_regularizer(batch)["loss_l2c2_critic"] > 0
+
+    @pytest.mark.parametrize("regularizer", [L2C2Loss, CAPSLoss])
+    def test_a_batch_that_hangs_on_the_policy_trains_it_no_further(self, regularizer):
+        """Terms on values do not reach the policy that made the batch's actions."""
+        torch.manual_seed(0)
+        actor, value = deterministic_actor(), qvalue()
+        batch = actor(transitions(6))
+        assert batch["action"].requires_grad
+        encoder = nn.Linear(OBSERVATION, OBSERVATION)
+        batch["observation"] = encoder(batch["observation"])
+        terms = regularizer(DDPGLoss(actor, value))(batch)
+        for key in (key for key in terms.keys() if "l2c2" in key or "caps" in key):
+            if not terms[key].requires_grad:
+                continue
+            found = torch.autograd.grad(
+                terms[key],
+                [*encoder.parameters(), *actor.parameters()],
+                retain_graph=True,
+                allow_unused=True,
+            )
+            reached = [gradient is not None for gradient in found]
+            trains_policy = key == "loss_l2c2_actor" or key.startswith("loss_caps")
+            assert reached == [False, False] + [trains_policy] * (len(reached) - 2), key
+
+    def test_networks_have_to_declare_their_keys(self):
+        """Otherwise it is not known what to evaluate them at."""
+
+        class Plain(nn.Module):
+            pass
+
+        loss = DDPGLoss(deterministic_actor(), qvalue())
+        loss.__dict__["actor_network"] = Plain()
+        with pytest.raises(TypeError, match="actor_network is a Plain, which does not say"):
+            L2C2Loss(loss)
 
     def test_masked_actions(self):
         """A mask of allowed actions is an input of the policy like any other."""

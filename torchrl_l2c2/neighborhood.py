@@ -154,17 +154,80 @@ class Neighborhood:
             TypeError: if the states are not floating point.
             ValueError: if the shapes differ, or ``num_samples`` or ``batch_dims`` is out of range.
         """
+        uniform = self.draw(state, num_samples, generator, batch_dims=batch_dims)
+        return self.place(state, next_state, uniform, batch_dims=batch_dims)
+
+    def draw(
+        self,
+        state: Tensor,
+        num_samples: int = 1,
+        generator: torch.Generator | None = None,
+        *,
+        batch_dims: int = 1,
+    ) -> Tensor:
+        """The random numbers that :meth:`sample` needs, for :meth:`place`.
+
+        A compiled function cannot draw from a generator of its own: it takes these numbers instead.
+
+        Args:
+            state: states, shape ``[*B, *F]``, floating point; only their shape matters.
+            num_samples: as in :meth:`sample`.
+            generator: as in :meth:`sample`.
+            batch_dims: as in :meth:`sample`.
+
+        Returns:
+            Numbers in ``[0, 1)``, shape ``[*B, K, *F]``, in the dtype of ``state``.
+
+        Raises:
+            TypeError: if the states are not floating point.
+            ValueError: if ``num_samples`` or ``batch_dims`` is out of range.
+        """
         check_num_samples(num_samples)
+        _check_states(state, state, batch_dims)
+        shape = (*state.shape[:batch_dims], num_samples, *state.shape[batch_dims:])
+        return torch.rand(shape, generator=generator, dtype=state.dtype, device=state.device)
+
+    def place(
+        self, state: Tensor, next_state: Tensor, uniform: Tensor, *, batch_dims: int = 1
+    ) -> tuple[Tensor, Tensor]:
+        """The neighbors that belong to the random numbers of :meth:`draw`, and their distances.
+
+        Args:
+            state: states, shape ``[*B, *F]``, floating point.
+            next_state: their successors, the same shape.
+            uniform: numbers in ``[0, 1)``, shape ``[*B, K, *F]``: 0.5 is the state itself, 0 and 1
+                are the edges of the box.
+            batch_dims: how many leading dimensions are batch dimensions. Defaults to ``1``.
+
+        Returns:
+            As :meth:`sample`.
+
+        Raises:
+            TypeError: if the states are not floating point.
+            ValueError: if the shapes differ, or ``batch_dims`` is out of range.
+
+        Examples:
+            >>> import torch
+            >>> near = Neighborhood(sigma=1.0)
+            >>> uniform = torch.tensor([[[0.5, 0.5]], [[0.75, 0.5]]])
+            >>> neighbor, _ = near.place(torch.zeros(2, 2), torch.ones(2, 2), uniform)
+            >>> neighbor.tolist()
+            [[[0.0, 0.0]], [[0.5, 0.0]]]
+        """
         _check_states(state, next_state, batch_dims)
         batch, features = state.shape[:batch_dims], state.shape[batch_dims:]
-        shape = (*batch, num_samples, *features)
-        uniform = torch.rand(shape, generator=generator, dtype=state.dtype, device=state.device)
+        expected = (*batch, *uniform.shape[batch_dims : batch_dims + 1], *features)
+        if uniform.shape != expected:
+            raise ValueError(
+                f"uniform must have the shape [*B, K, *F] of states {tuple(state.shape)} with "
+                f"{batch_dims} batch dimensions, got {tuple(uniform.shape)}."
+            )
         u = (2.0 * uniform - 1.0) * self.radius
         displacement = (next_state - state).to(state.dtype)
         displacement = torch.nan_to_num(displacement, nan=0.0, posinf=0.0, neginf=0.0)
         neighbor = state.unsqueeze(batch_dims) + displacement.unsqueeze(batch_dims) * u
         # An explicit size: -1 is ambiguous for empty batches.
-        extent = u.abs().reshape(*batch, num_samples, features.numel()).amax(-1)
+        extent = u.abs().reshape(*uniform.shape[: batch_dims + 1], features.numel()).amax(-1)
         return neighbor, extent + self.epsilon
 
 

@@ -147,15 +147,52 @@ class NeighborTransform(_RandomTransform):
         Returns:
             The same tensordict.
         """
-        drawn = {key: self._draw(tensordict, key) for key in self.in_keys}
+        return self.place(tensordict, self.draw(tensordict))
+
+    def draw(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The random numbers that :meth:`forward` uses, for use in :meth:`place`.
+
+        A compiled function cannot draw from a generator: draw first and give it the numbers.
+
+        Args:
+            tensordict: states and successors; only their shapes matter.
+
+        Returns:
+            Numbers in ``[0, 1)``, an entry ``[*B, K, *F]`` per key of ``in_keys``.
+        """
+        uniform = TensorDict(batch_size=tensordict.batch_size, device=tensordict.device)
+        for key in self.in_keys:
+            state, _ = self._transition(tensordict, key)
+            numbers = self.neighborhood.draw(
+                state, self.num_samples, self.generator, batch_dims=tensordict.batch_dims
+            )
+            uniform.set(key, numbers)
+        return uniform
+
+    def place(self, tensordict: TensorDictBase, uniform: TensorDictBase) -> TensorDictBase:
+        """Writes the neighbors that belong to given random numbers.
+
+        Args:
+            tensordict: states and successors.
+            uniform: what :meth:`draw` returned.
+
+        Returns:
+            The same tensordict.
+        """
         neighbors = TensorDict(batch_size=tensordict.batch_size, device=tensordict.device)
-        for key, (neighbor, _) in drawn.items():
+        distances = []
+        for key in self.in_keys:
+            neighbor, distance = self.neighborhood.place(
+                *self._transition(tensordict, key),
+                uniform.get(key),
+                batch_dims=tensordict.batch_dims,
+            )
             neighbors.set(key, neighbor)
-        distances = torch.stack([distance for _, distance in drawn.values()])
-        neighbors.set("distance", distances.amax(0))
+            distances.append(distance)
+        neighbors.set("distance", torch.stack(distances).amax(0))
         return tensordict.set(self.out_key, neighbors)
 
-    def _draw(self, tensordict: TensorDictBase, key: NestedKey) -> tuple[Tensor, Tensor]:
+    def _transition(self, tensordict: TensorDictBase, key: NestedKey) -> tuple[Tensor, Tensor]:
         next_key = unravel_key(("next", key))
         state, next_state = tensordict.get(key, None), tensordict.get(next_key, None)
         for name, entry in ((key, state), (next_key, next_state)):
@@ -164,13 +201,7 @@ class NeighborTransform(_RandomTransform):
                     f"NeighborTransform needs {name!r}, which the tensordict lacks; it has "
                     f"{_listed(tensordict)}. Store it, or name the state's entries in in_keys."
                 )
-        return self.neighborhood.sample(
-            state,
-            next_state,
-            self.num_samples,
-            self.generator,
-            batch_dims=tensordict.batch_dims,
-        )
+        return state, next_state
 
     def set_container(self, container: Any) -> None:
         super().set_container(container)

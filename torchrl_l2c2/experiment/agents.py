@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -93,37 +94,42 @@ def _make_optimizer(optimizer: OptimizerConfig, loss: LossModule) -> torch.optim
 
 
 def make_update(
-    agent: Agent, *, compile: bool, skip_nonfinite: bool = False
-) -> Callable[[TensorDictBase, bool], Tensor | None]:
+    agent: Agent,
+    *,
+    compile: bool,
+    skip_nonfinite: bool = False,
+    read: Callable[..., TensorDictBase] | None = None,
+) -> Callable[..., tuple[Tensor, Tensor | None] | None]:
     """One gradient step as a function of a batch: loss, gradients, optimizer, target networks.
 
     Args:
-        agent (Agent): what is updated, in place.
+        agent (Agent): what is updated, in place. Compiled, the step is made for the agent's tensors
+            and settings as they are at its first call: make another after replacing any.
         compile (bool): whether to compile: with AdaTerm and the t-soft update the whole step is
             one graph; with others, loss and gradients are.
         skip_nonfinite (bool): whether a batch with a loss or gradient that is NaN or infinite
             changes nothing and gives ``None``. The step is two graphs then.
+        read (Callable, optional): makes the batch of other things, as the first part of the graph.
 
     Returns:
-        Callable: takes a batch and whether the policy is updated too; writes the new priorities
-        into the batch and returns the means of ``agent.loss.out_keys``, in their order, as one
-        tensor.
+        Callable: takes whether the policy is updated too, then the batch or what ``read`` makes it
+        of. Returns the means of ``agent.loss.out_keys``, in their order, as one tensor, and the
+        new priorities of the batch, if the loss gives any.
     """
     parameters = [p for group in agent.optimizer.param_groups for p in group["params"]]
     keys = agent.loss.out_keys
 
     def differentiate(
-        batch: TensorDictBase, with_policy: bool
-    ) -> tuple[Tensor, tuple[Tensor | None, ...]]:
-        # Some losses write what still has a gradient; only the priority is to come out.
-        entries = batch.copy()
-        terms = agent.loss(entries)
-        priority = entries.get("td_error", None)
-        if priority is not None:
-            batch.set("td_error", priority.detach())
+        with_policy: bool, *drawn: Any
+    ) -> tuple[Tensor, Tensor | None, tuple[Tensor | None, ...]]:
+        # A copy, as losses write into what they are given, some of it with a gradient.
+        batch = drawn[0].copy() if read is None else read(*drawn)
+        terms = agent.loss(batch)
+        priority = batch.get("td_error", None)
         total = sum(terms[key] for key in keys if is_loss(key) and (with_policy or on_values(key)))
         gradients = torch.autograd.grad(total, parameters, allow_unused=True)
-        return torch.stack([terms[key].detach().float().mean() for key in keys]), gradients
+        values = torch.stack([terms[key].detach().float().mean() for key in keys])
+        return values, None if priority is None else priority.detach(), gradients
 
     def apply(gradients: tuple[Tensor | None, ...]) -> None:
         for parameter, gradient in zip(parameters, gradients, strict=True):
@@ -134,29 +140,29 @@ def make_update(
         if agent.target_updater is not None:
             agent.target_updater.step()
 
-    def update(batch: TensorDictBase, with_policy: bool) -> Tensor:
-        values, gradients = differentiate(batch, with_policy)
+    def update(with_policy: bool, *drawn: Any) -> tuple[Tensor, Tensor | None]:
+        values, priority, gradients = differentiate(with_policy, *drawn)
         apply(gradients)
-        return values
+        return values, priority
 
     # torch's own optimizers and TorchRL's updaters break the graph.
     compile = compile and agent.compilable
     whole = isinstance(agent.optimizer, AdaTerm) and isinstance(agent.target_updater, TSoftUpdate)
     if compile and whole and not skip_nonfinite:
-        return compiled(update)
+        return compiled(update, constant_closure=True)
     if compile:
-        differentiate = compiled(differentiate)
-        apply = compiled(apply) if whole else apply
+        differentiate = compiled(differentiate, constant_closure=True)
+        apply = compiled(apply, constant_closure=True) if whole else apply
     if not skip_nonfinite:
         return update
 
-    def checked_update(batch: TensorDictBase, with_policy: bool) -> Tensor | None:
-        values, gradients = differentiate(batch, with_policy)
+    def checked_update(with_policy: bool, *drawn: Any) -> tuple[Tensor, Tensor | None] | None:
+        values, priority, gradients = differentiate(with_policy, *drawn)
         tensors = (values, *(g for g in gradients if g is not None))
         if not all(bool(tensor.isfinite().all()) for tensor in tensors):
             return None
         apply(gradients)
-        return values
+        return values, priority
 
     return checked_update
 

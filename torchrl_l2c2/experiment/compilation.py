@@ -2,25 +2,50 @@
 
 from __future__ import annotations
 
+import inspect
+import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 
 
-def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+def compiled(function: Callable[..., Any], *, constant_closure: bool = False) -> Callable[..., Any]:
     """Compiles a function, which may take gradients, into one graph.
 
     Random numbers are drawn as without compilation.
+
+    Args:
+        function (Callable): what is compiled, at its first call.
+
+    Keyword Args:
+        constant_closure (bool): whether all that the function reaches other than by its arguments
+            stays as it is at the first call, but for what is written *into* its tensors. It is
+            then not checked at every call, which for an agent's hundreds of tensors takes longer
+            than the smallest networks; a setting changed or a tensor replaced later would be
+            overlooked. Default ``False``.
+
+    Returns:
+        Callable: the compiled function.
     """
     # Without it the graph ends at the gradient, and the step is several small ones.
     torch._dynamo.config.trace_autograd_ops = True
+    options: dict[str, Any] = {"fallback_random": True}
+    if constant_closure:
+        options["guard_filter_fn"] = _only_arguments_of(function)
     # Every run of a sweep compiles the same code for objects of its own: counted together, they
     # would soon meet the limit of recompilations.
-    return torch.compile(
-        function, fullgraph=True, isolate_recompiles=True, options={"fallback_random": True}
-    )
+    return torch.compile(function, fullgraph=True, isolate_recompiles=True, options=options)
+
+
+def _only_arguments_of(function: Callable[..., Any]) -> Callable[[Sequence[Any]], list[bool]]:
+    """Keeps the checks of a function's arguments and of torch's global state."""
+    code = function.__code__
+    # A check of torch's own state, such as the gradient mode, has no name.
+    arguments = code.co_argcount + bool(code.co_flags & inspect.CO_VARARGS)
+    kept = {"", *code.co_varnames[:arguments]}
+    return lambda guards: [re.split(r"[.\[]", guard.name)[0] in kept for guard in guards]
 
 
 def compiler_available() -> bool:

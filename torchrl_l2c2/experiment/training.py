@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -20,13 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDictBase
-from torchrl.data import (
-    LazyTensorStorage,
-    SamplerWithoutReplacement,
-    TensorDictPrioritizedReplayBuffer,
-    TensorDictReplayBuffer,
-)
-from torchrl.envs import ExplorationType, RewardScaling, set_exploration_type
+from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.modules import EGreedyModule
 from tqdm import tqdm
 
@@ -43,21 +37,14 @@ from torchrl_l2c2.experiment.checkpoints import (
 )
 from torchrl_l2c2.experiment.collection import EpisodeCollector
 from torchrl_l2c2.experiment.compilation import compiler_available
-from torchrl_l2c2.experiment.config import (
-    AlgorithmConfig,
-    ExperimentConfig,
-    L2C2Config,
-    PrioritizedReplayConfig,
-    RolloutReplayConfig,
-)
+from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
 from torchrl_l2c2.experiment.evaluate import Evaluation, evaluate_policy
 from torchrl_l2c2.experiment.files import make_folder, write_atomically, write_json
 from torchrl_l2c2.experiment.metrics_log import MetricsLog
+from torchrl_l2c2.experiment.replay import ReplayUpdate, make_replay, scale_reward
 from torchrl_l2c2.experiment.reports import FinishedRun, draw_learning_curves
 from torchrl_l2c2.metrics import action_variation
-from torchrl_l2c2.neighborhood import Neighborhood
-from torchrl_l2c2.transforms import NeighborTransform
 
 VERSIONED = ("torchrl-l2c2", "torch", "torchrl", "tensordict", "gymnasium", "pybullet", "numpy")
 
@@ -105,11 +92,7 @@ class Experiment:
         self.agent = make_agent(self.config, self.env)
         self.replay = make_replay(self.config)
         self._compile = self.config.compile and compiler_available()
-        self.update = make_update(
-            self.agent,
-            compile=self._compile,
-            skip_nonfinite=self.config.on_nonfinite == "skip",
-        )
+        self.update = self._make_update()
         self.collector = self._make_collector()
         self.metrics: list[dict[str, float]] = []
         self.frames = 0
@@ -210,6 +193,8 @@ class Experiment:
         self.frames, self.updates, self.skipped_updates = state["counters"]
         self.metrics = json.loads(state["metrics"])
         self._log.load_state_dict(state["metrics_log"])
+        # A compiled update is made for the tensors that were there, and some are others now.
+        self.update = self._make_update()
         # Last: making and loading the above may have drawn from the global generators.
         set_global_rng_state(state["global_rng"])
 
@@ -317,6 +302,12 @@ class Experiment:
         draw_learning_curves([run], self.folder / "learning_curves.png")
         return run
 
+    def _make_update(self) -> Callable[..., tuple[torch.Tensor, torch.Tensor | None] | None]:
+        options = {"compile": self._compile, "skip_nonfinite": self.config.on_nonfinite == "skip"}
+        if self.config.algorithm.schedule == "rollout":
+            return make_update(self.agent, **options)
+        return ReplayUpdate(self.agent, self.replay, **options)
+
     def _make_collector(self) -> EpisodeCollector:
         by_step = self.config.algorithm.schedule == "step"
         return EpisodeCollector(
@@ -348,8 +339,9 @@ class Experiment:
     @torch.no_grad()
     def _remembered(self, batch: TensorDictBase) -> TensorDictBase:
         """The entries that the loss reads, and no others: sampling copies every one of them."""
+        batch = scale_reward(batch, self.config.algorithm)
         if self.agent.advantage is not None:
-            batch = self.agent.advantage(scale_reward(batch, self.config.algorithm))
+            batch = self.agent.advantage(batch)
         return batch.select(*self.agent.loss.in_keys, strict=False)
 
     def _updates_after_episode(self, terms: list[torch.Tensor]) -> None:
@@ -360,25 +352,24 @@ class Experiment:
         elif len(self.replay) >= algorithm.frames:
             for _ in range(algorithm.epochs):
                 for batch in self.replay:
-                    self._one_update(batch, terms)
+                    self._one_update(terms, batch)
             self.replay.empty()
 
     def _replay_updates(self, count: int, terms: list[torch.Tensor]) -> None:
         if len(self.replay) < self.config.replay.batch_size or self.frames < self._random_frames:
             return
         for _ in range(count):
-            self._one_update(self.replay.sample(), terms)
+            self._one_update(terms)
 
-    def _one_update(self, batch: TensorDictBase, terms: list[torch.Tensor]) -> None:
+    def _one_update(self, terms: list[torch.Tensor], *batch: TensorDictBase) -> None:
+        """An update with a batch, or with one of the update's own from the replay buffer."""
         with_policy = (self.updates + 1) % self.agent.policy_delay == 0
-        values = self.update(batch, with_policy)
-        if values is None:
+        result = self.update(with_policy, *batch)
+        if result is None:
             self.skipped_updates += 1
             return
-        if isinstance(self.replay, TensorDictPrioritizedReplayBuffer):
-            self.replay.update_tensordict_priority(batch)
         self.updates += 1
-        terms.append(values)
+        terms.append(result[0])
 
     def _mean_terms(self, terms: list[torch.Tensor]) -> dict[str, float]:
         """The mean of every entry of the loss over an episode's updates.
@@ -515,60 +506,6 @@ def seed_everything(seed: int) -> None:
     random.seed(seed)
     np.random.seed(seed)
     torch.manual_seed(seed)
-
-
-def make_replay(config: ExperimentConfig) -> TensorDictReplayBuffer:
-    """The replay buffer, with the reward's scale and, for L2C2, the neighbors as transforms."""
-    replay, algorithm = config.replay, config.algorithm
-    generator = torch.Generator().manual_seed(config.seed)
-    if isinstance(replay, RolloutReplayConfig):
-        # The last episode may go past the rollout's frames.
-        storage = LazyTensorStorage(algorithm.frames + config.task.max_steps)
-        buffer = TensorDictReplayBuffer(
-            storage=storage,
-            sampler=SamplerWithoutReplacement(),
-            batch_size=replay.batch_size,
-            generator=generator,
-        )
-    elif isinstance(replay, PrioritizedReplayConfig):
-        buffer = TensorDictPrioritizedReplayBuffer(
-            alpha=replay.alpha,
-            beta=replay.beta,
-            priority_key="td_error",
-            storage=LazyTensorStorage(replay.capacity),
-            batch_size=replay.batch_size,
-            generator=generator,
-        )
-    else:
-        buffer = TensorDictReplayBuffer(
-            storage=LazyTensorStorage(replay.capacity),
-            batch_size=replay.batch_size,
-            generator=generator,
-        )
-    if not isinstance(replay, RolloutReplayConfig):
-        scaling = RewardScaling(0.0, reward_scale(algorithm), in_keys=[("next", "reward")])
-        buffer.append_transform(scaling)
-    if isinstance(config.regularizer, L2C2Config):
-        regularizer = config.regularizer
-        buffer.append_transform(
-            NeighborTransform(
-                Neighborhood(regularizer.sigma, regularizer.lambda_min, regularizer.lambda_max),
-                num_samples=regularizer.num_samples,
-                generator=torch.Generator().manual_seed(config.seed),
-            )
-        )
-    return buffer
-
-
-def reward_scale(algorithm: AlgorithmConfig) -> float:
-    """Factor on rewards while learning."""
-    return 1.0 - algorithm.gamma if algorithm.reward_scale is None else algorithm.reward_scale
-
-
-def scale_reward(batch: TensorDictBase, algorithm: AlgorithmConfig) -> TensorDictBase:
-    """A batch with the rewards that are learned from."""
-    reward = batch["next", "reward"] * reward_scale(algorithm)
-    return batch.copy().set(("next", "reward"), reward)
 
 
 def check_finite(batch: TensorDictBase, first_frame: int) -> None:

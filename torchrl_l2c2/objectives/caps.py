@@ -37,7 +37,9 @@ class CAPSLoss(RegularizedLoss):
     Gradients flow into the policy's parameters alone, through both states.
 
     The mean :math:`\mu` is that of the normal distribution. [inferred] The paper's policy is a
-    plain normal; of a squashed one, ``mean`` says which side of the squashing is compared.
+    plain normal; of a squashed one, ``mean`` says which side of the squashing is compared. Of
+    discrete policies the probabilities are compared, the mean of an action written as one-hot
+    vector.
     Coordinates of the next observation that are not finite, as at the ends of some episodes, count
     as not having moved.
 
@@ -61,8 +63,8 @@ class CAPSLoss(RegularizedLoss):
             to ``"loc"``.
 
     Raises:
-        TypeError: the loss has no policy or cannot be regularized, the policy's actions are
-            discrete, or an argument has the wrong type.
+        TypeError: the loss has no policy or cannot be regularized, or an argument has the wrong
+            type.
         ValueError: an argument is out of its range.
 
     Examples:
@@ -141,10 +143,7 @@ def _mean(policy: Policy, squashed: bool) -> Tensor:
     if isinstance(policy, Tensor):
         return policy
     if isinstance(policy, Bernoulli | Categorical | OneHotCategorical):
-        raise TypeError(
-            f"CAPSLoss compares mean actions, and the actions of a {type(policy).__name__} are "
-            "discrete. L2C2Loss compares distributions of any kind."
-        )
+        return policy.probs
     if not squashed:
         while isinstance(policy, TransformedDistribution):
             policy = policy.base_dist

@@ -217,19 +217,11 @@ class RegularizedLoss(LossModule):
     def _value_networks(self) -> list[str]:
         """The value functions that the loss trains."""
         untrained = "critic_network" if getattr(self, "critic_coeff", 1.0) is None else None
-        networks = [
+        return [
             name
             for name in VALUE_NETWORKS
             if name != untrained and getattr(self, name, None) is not None
         ]
-        for name in networks:
-            if self._value_key(name) is None:
-                raise ValueError(
-                    f"{name} writes {list(getattr(self, name).out_keys)}, and none of it is a "
-                    f"value to this loss, whose keys are {self.tensor_keys}: name it with "
-                    "set_keys before the loss is regularized."
-                )
-        return networks
 
     # For regularizers: evaluations, made in the two methods.
 
@@ -246,6 +238,7 @@ class RegularizedLoss(LossModule):
         among them.
         """
         keys = dict.fromkeys(key for name in networks for key in self._wiring[name].states)
+        tensordict = tensordict.select(*keys, *map(_next, keys), strict=False).detach()
         found = {key: tensordict.get(key, None) for key in keys}
         floating = {
             key: value
@@ -253,10 +246,14 @@ class RegularizedLoss(LossModule):
             if isinstance(value, Tensor) and value.is_floating_point()
         }
         if not floating:
-            dtypes = {key: getattr(value, "dtype", "missing") for key, value in found.items()}
+            kinds = {
+                key: value.dtype if isinstance(value, Tensor) else type(value).__name__
+                for key, value in found.items()
+            }
             raise TypeError(
-                f"{type(self).__name__} needs a floating-point observation, got {dtypes}: cast it "
-                "in the environment, the collector or the replay buffer."
+                f"{type(self).__name__} needs a floating-point observation among the inputs of "
+                f"{', '.join(networks)}, got {kinds}: cast it in the environment, the collector or "
+                "the replay buffer. A network that reads no observation has nothing to regularize."
             )
         successors = {key: tensordict.get(_next(key), None) for key in floating}
         pairs = {key: (floating[key], s) for key, s in successors.items() if s is not None}
@@ -302,6 +299,12 @@ class RegularizedLoss(LossModule):
             both where the loss has expanded the network's parameters.
         """
         key = self._wiring[network].output
+        if key is None:
+            # Not earlier: set_keys may come after the wrapping, as after the making of any loss.
+            raise ValueError(
+                f"{network} writes {list(getattr(self, network).out_keys)}, and none of it is a "
+                f"value to this loss, whose keys are {self.tensor_keys}: name it with set_keys."
+            )
         here, there = self._outputs_at(network, tensordict, states, [key])
         return here.get(key), there.get(key)
 
@@ -376,6 +379,7 @@ class RegularizedLoss(LossModule):
 
     def _wiring_of(self, network: str) -> _Wiring:
         net, actor = getattr(self, network), getattr(self, POLICY_NETWORK, None)
+        _check_declares_keys(net, network)
         _check_not_recurrent(net, network)
         stochastic, actions, made = False, self._action_keys(), set()
         if actor is not None:
@@ -446,7 +450,8 @@ class RegularizedLoss(LossModule):
     ) -> TensorDictBase:
         """A network's inputs at the batch's states and at the others: ``[(1 + K) * B0, ...]``."""
         wiring, batch = self._wiring[network], tensordict.batch_size
-        inputs = tensordict.select(*wiring.inputs, strict=False)
+        # The batch's action may still hang on the policy that made it.
+        inputs = tensordict.select(*wiring.inputs, strict=False).detach()
         moved = {key: states.get(key, None) for key in wiring.inputs}
         moved = {key: state for key, state in moved.items() if state is not None}
         if not moved:
@@ -538,6 +543,14 @@ def _is_stochastic(actor: nn.Module) -> bool:
             "several heads in one CompositeDistribution."
         )
     return True
+
+
+def _check_declares_keys(net: nn.Module, name: str) -> None:
+    if not (hasattr(net, "in_keys") and hasattr(net, "out_keys")):
+        raise TypeError(
+            f"{name} is a {type(net).__name__}, which does not say what it reads and writes: make "
+            "it a TensorDictModule with in_keys and out_keys."
+        )
 
 
 def _check_not_recurrent(net: nn.Module, name: str) -> None:

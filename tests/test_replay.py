@@ -1,0 +1,122 @@
+"""Updates from the replay buffer: the same as sampling, updating and setting priorities by hand."""
+
+import copy
+import logging
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchrl_l2c2 import NeighborTransform
+from torchrl_l2c2.experiment import (
+    Experiment,
+    ExperimentConfig,
+    L2C2Config,
+    NoRegularizerConfig,
+    PPORPEConfig,
+    PrioritizedReplayConfig,
+    TaskConfig,
+    UniformReplayConfig,
+)
+from torchrl_l2c2.experiment.agents import make_update
+from torchrl_l2c2.experiment.checkpoints import replay_state
+from torchrl_l2c2.experiment.compilation import compiler_available
+from torchrl_l2c2.experiment.config import SACConfig
+
+logging.getLogger("torchrl").setLevel(logging.ERROR)
+
+TASK = TaskConfig("pendulum", "Pendulum-v1", episodes=1, max_steps=60)
+PAPER = ExperimentConfig(
+    task=TASK,
+    algorithm=PPORPEConfig(hidden=(8,), num_heads=2),
+    replay=PrioritizedReplayConfig(capacity=50, batch_size=8),
+    compile=False,
+)
+CASES = {
+    "prioritized": PAPER,
+    "without neighbors": replace(PAPER, regularizer=NoRegularizerConfig()),
+    "several neighbors": replace(PAPER, regularizer=L2C2Config(num_samples=3)),
+    "uniform": replace(PAPER, replay=UniformReplayConfig(capacity=50, batch_size=8)),
+    "sac": replace(
+        PAPER,
+        algorithm=SACConfig(hidden=(8,), random_frames=0),
+        replay=PrioritizedReplayConfig(capacity=50, batch_size=8),
+    ),
+}
+
+
+def by_hand(experiment: Experiment) -> None:
+    """An update with what the buffer gives."""
+    batch = experiment.replay.sample()
+    _, priority = make_update(experiment.agent, compile=False)(True, batch)
+    experiment.replay.update_tensordict_priority(batch.set("td_error", priority))
+
+
+def learned(experiment: Experiment) -> dict[str, torch.Tensor]:
+    """Parameters and priorities."""
+    found = {k: v.clone() for k, v in experiment.agent.loss.state_dict().items()}
+    sampler = replay_state(experiment.replay)["_sampler"]
+    return {**found, **({"priorities": sampler["_sum_tree"]} if "_sum_tree" in sampler else {})}
+
+
+def same(found, expected, **tolerance):
+    assert found.keys() == expected.keys()
+    for key, value in expected.items():
+        torch.testing.assert_close(
+            found[key], value, msg=lambda m, key=key: f"{key}: {m}", **tolerance
+        )
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_an_update_is_what_sampling_updating_and_prioritizing_by_hand_gives(name):
+    """To the bit: rows, weights, neighbors, and the priorities that decide the next rows."""
+    results = []
+    for step in (lambda experiment: experiment.update(True), by_hand):
+        experiment = Experiment(CASES[name])
+        experiment.train()
+        before = learned(experiment)
+        for _ in range(5):
+            step(experiment)
+        results.append(learned(experiment))
+        assert any(not torch.equal(v, before[k]) for k, v in results[-1].items())
+    same(*results, rtol=0, atol=0)
+
+
+def test_the_batch_has_the_entries_and_neighbors_that_the_buffer_gives():
+    """Whatever the buffer's transform writes, at its own random numbers."""
+    experiment = Experiment(PAPER)
+    experiment.train()
+    update, state = experiment.update, experiment.state_dict()
+    expected = experiment.replay.sample()
+    experiment.load_state_dict(state)
+    draw = experiment.update.draw()
+    assert experiment.update is not update
+    batch = experiment.update._read(*draw)
+    assert set(batch.keys(True, True)) == set(expected.keys(True, True))
+    assert all(torch.equal(batch[key], expected[key]) for key in expected.keys(True, True))
+    (transform,) = experiment.replay.transform.transforms
+    assert isinstance(transform, NeighborTransform)
+
+
+@pytest.mark.skipif(not compiler_available(), reason="no C++ compiler")
+def test_compiled_it_learns_the_same_and_follows_what_may_change():
+    """A gain that is scheduled, a policy left out, and a state that is loaded over its tensors."""
+    seen = []
+    for compile in (True, False):
+        experiment = Experiment(replace(PAPER, compile=compile))
+        experiment.train()
+        start, values = copy.deepcopy(experiment.state_dict()), []
+        values.append(experiment.update(True)[0])
+        experiment.agent.loss.l2c2_coeff = 100.0
+        values.append(experiment.update(True)[0])
+        values.append(experiment.update(False)[0])
+        # Loading replaces the optimizer's tensors: a step that kept the old ones would go wrong.
+        experiment.load_state_dict(start)
+        experiment.agent.loss.l2c2_coeff = 1.0
+        values += [experiment.update(True)[0] for _ in range(3)]
+        seen.append((torch.stack(values), learned(experiment)))
+    (compiled, ours), (eager, plain) = seen
+    torch.testing.assert_close(compiled, eager, rtol=1e-3, atol=1e-4)
+    same(ours, plain, rtol=1e-3, atol=1e-4)
+    actor = experiment.agent.loss.out_keys.index("loss_l2c2_actor")
+    assert compiled[1, actor] > 30.0 * compiled[0, actor]

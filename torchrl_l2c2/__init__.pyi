@@ -1,0 +1,32 @@
+# The public names and where they live: for type checkers, and for __init__.py, which imports a
+# name's module when the name is first used.
+from ._version import __version__
+from .distances import register_hellinger, squared_error, squared_hellinger
+from .metrics import action_variation, local_lipschitz
+from .modules import Squish, make_actor, make_critic
+from .neighborhood import Neighborhood
+from .objectives import CAPSLoss, L2C2Loss, PPORPELoss, RegularizedLoss
+from .optim import AdaTerm
+from .transforms import NeighborTransform, ObservationNoise
+from .updaters import TSoftUpdate
+
+__all__ = [
+    "AdaTerm",
+    "CAPSLoss",
+    "L2C2Loss",
+    "NeighborTransform",
+    "Neighborhood",
+    "ObservationNoise",
+    "PPORPELoss",
+    "RegularizedLoss",
+    "Squish",
+    "TSoftUpdate",
+    "__version__",
+    "action_variation",
+    "local_lipschitz",
+    "make_actor",
+    "make_critic",
+    "register_hellinger",
+    "squared_error",
+    "squared_hellinger",
+]
