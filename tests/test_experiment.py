@@ -247,6 +247,15 @@ def test_every_algorithm_learns_from_its_batches(name, regularizer):
     assert len(experiment.test().returns) == 2
 
 
+@pytest.mark.parametrize("regularizer", [NoRegularizerConfig(), L2C2Config()])
+def test_what_sac_keeps_is_there_before_it_is_compiled(regularizer):
+    """Its target entropy, which it otherwise makes in its first, compiled, call, and loses."""
+    config = small(
+        algorithm=ALGORITHMS["sac"], replay=UniformReplayConfig(), regularizer=regularizer
+    )
+    assert Experiment(config).state_dict()["loss"]["_target_entropy"] == -1.0
+
+
 def test_a_discrete_task_is_refused_by_algorithms_for_continuous_ones():
     """And the other way round; the error says which kind is needed."""
     with pytest.raises(ValueError, match="dqn needs discrete actions"):

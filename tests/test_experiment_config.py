@@ -51,6 +51,23 @@ def test_an_algorithm_brings_its_usual_replay_and_optimizer(algorithm):
     assert files == ExperimentConfig(algorithm=GROUPS["algorithm"][algorithm]())
 
 
+@pytest.mark.parametrize("name", sorted(p.stem for p in (CONF / "experiment").glob("*.yaml")))
+@pytest.mark.parametrize("regularizer", ["none", "l2c2"])
+def test_every_comparison_is_made_of_valid_runs(name, regularizer):
+    """With the task and sizes that its file says."""
+    config = ExperimentConfig.from_dict(
+        composed(f"experiment={name}", f"regularizer={regularizer}")
+    )
+    env_id, algorithm, size = {
+        "swingup_table": (TaskConfig().env_id, "ppo_rpe", 32),
+        "pendulum": ("Pendulum-v1", "ppo_rpe", 64),
+        "cartpole": ("CartPole-v1", "dqn", 64),
+    }[name]
+    assert config.algorithm.name == algorithm and config.replay.batch_size == size
+    assert config.regularizer.name == regularizer
+    assert config.task.env_id == env_id
+
+
 @pytest.mark.parametrize("task", ["swingup", "reacher", "hopper", "ant"])
 def test_the_papers_tasks_have_the_papers_noise(task):
     """Scale .01 for Swingup and Reacher, .001 for Hopper and Ant."""

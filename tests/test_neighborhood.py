@@ -188,3 +188,26 @@ def test_sample_compiles_without_a_break():
     state = torch.zeros(16, 3)
     neighbor, distance = sample(state, state + 1.0, 2)
     torch.testing.assert_close(distance, neighbor.abs().amax(-1) + near.epsilon)
+
+
+@pytest.mark.parametrize("batch_dims", [0, 1, 2])
+def test_drawing_and_placing_is_sampling(batch_dims):
+    """In two steps, the same neighbors; the edges of the numbers are the edges of the box."""
+    near = Neighborhood(sigma=0.5)
+    state, next_state = torch.randn(4, 3, 2), torch.randn(4, 3, 2)
+    seeds = [torch.Generator().manual_seed(0) for _ in range(2)]
+    expected = near.sample(state, next_state, 5, seeds[0], batch_dims=batch_dims)
+    uniform = near.draw(state, 5, seeds[1], batch_dims=batch_dims)
+    found = near.place(state, next_state, uniform, batch_dims=batch_dims)
+    assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
+    edge, distance = near.place(state, next_state, torch.ones(4, 1, 3, 2))
+    torch.testing.assert_close(edge[:, 0], state + near.radius * (next_state - state))
+    torch.testing.assert_close(distance, torch.full((4, 1), near.radius + near.epsilon))
+
+
+def test_numbers_of_another_shape_are_refused():
+    """The message has the shapes."""
+    with pytest.raises(ValueError, match=r"uniform must have the shape \[\*B, K, \*F\].*\(4, 3\)"):
+        Neighborhood().place(torch.zeros(4, 3), torch.zeros(4, 3), torch.zeros(4, 3))
+    with pytest.raises(TypeError, match="must be floating point"):
+        Neighborhood().draw(torch.zeros(4, 3, dtype=torch.long))

@@ -476,3 +476,18 @@ def test_wrong_environments_are_refused(transforms, error, message):
     with pytest.raises(error, match=message):
         for transform in transforms:
             env.append_transform(transform.clone())
+
+
+def test_drawing_and_placing_is_what_forward_does():
+    """For several keys, from the transform's own generator."""
+    batch = TensorDict(
+        {"a": torch.randn(4, 3), "b": torch.randn(4, 2, 2), "next": {}}, batch_size=[4]
+    )
+    batch["next", "a"], batch["next", "b"] = torch.randn(4, 3), torch.randn(4, 2, 2)
+    make = functools.partial(NeighborTransform, NEAR, ["a", "b"], num_samples=2)
+    expected = make(generator=generator(0))(batch.clone())["neighbor"]
+    transform = make(generator=generator(0))
+    uniform = transform.draw(batch)
+    assert uniform["b"].shape == (4, 2, 2, 2)
+    found = transform.place(batch.clone(), uniform)["neighbor"]
+    assert all(torch.equal(found[key], expected[key]) for key in ("a", "b", "distance"))

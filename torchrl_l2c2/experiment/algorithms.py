@@ -135,6 +135,8 @@ def _sac(config: SACConfig, env: EnvBase, regularize: Regularize) -> Parts:
         action_spec=env.action_spec,
     )
     loss.make_value_estimator(gamma=config.gamma)
+    # A buffer that is made when first read: in a compiled function it would be lost again.
+    loss.target_entropy  # noqa: B018
     loss = regularize(loss)
     return Parts(loss, sharing(actor, loss.actor_network_params), SoftUpdate(loss, tau=config.tau))
 

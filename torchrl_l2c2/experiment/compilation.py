@@ -31,7 +31,8 @@ def compiled(function: Callable[..., Any], *, constant_closure: bool = False) ->
     """
     # Without it the graph ends at the gradient, and the step is several small ones.
     torch._dynamo.config.trace_autograd_ops = True
-    options: dict[str, Any] = {"fallback_random": True}
+    # The sizes of the inputs are checked before the graph is chosen: once is enough.
+    options: dict[str, Any] = {"fallback_random": True, "size_asserts": False}
     if constant_closure:
         options["guard_filter_fn"] = _only_arguments_of(function)
     # Every run of a sweep compiles the same code for objects of its own: counted together, they

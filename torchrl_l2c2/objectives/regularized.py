@@ -350,7 +350,8 @@ class RegularizedLoss(LossModule):
         in_keys = getattr(base_loss, "in_keys", [])
         if in_keys and not any(isinstance(key, tuple) and key[0] == "next" for key in in_keys):
             raise TypeError(
-                f"{type(base_loss).__name__} is not trained on transitions (it reads {in_keys}): "
+                f"{type(base_loss).__name__} is not trained on transitions (it reads "
+                f"{sorted(in_keys, key=str)}): "
                 "without a next observation there is nothing to regularize between."
             )
         state = self.__dict__
