@@ -190,31 +190,32 @@ def run_rows(effort: Effort) -> Iterable[Row]:
         learner, row = parts.update, parts.metrics[-1]
         draw = learner.draw()
         priority = torch.rand(len(draw.index))
+        episode = parts.collector.rollout()
         frames = config.task.max_steps
+        summed = {
+            "collect": lambda: parts.collector.rollout().numel(),
+            "store": lambda: parts.replay.extend(parts._remembered(episode)).numel(),
+            "learn": partial(_repeat, lambda: learner(True), frames),
+            "log": lambda: parts._log.write(row) or frames,
+            "checkpoint": lambda: parts.save() and frames,
+        }
+        # What learning is made of: shown, but a loop of one of them alone flatters it.
+        detail = {
+            "draw": partial(_repeat, learner.draw, frames),
+            "update": partial(_repeat, lambda: learner.update(True, *draw), frames),
+            "prioritize": partial(
+                _repeat, lambda: learner.prioritize(draw.index, priority), frames
+            ),
+        }
         times = alternate(
-            {
-                "run": play_episode(run),
-                "collect": lambda: parts.collector.rollout().numel(),
-                **{
-                    name: partial(_repeat, action, frames)
-                    for name, action in {
-                        "draw": learner.draw,
-                        "update": lambda: learner.update(True, *draw),
-                        "prioritize": lambda: learner.prioritize(draw.index, priority),
-                    }.items()
-                },
-                "log": lambda: parts._log.write(row) or frames,
-                "checkpoint": lambda: parts.save() and frames,
-            },
-            repeats=max(1, effort.rounds // 3),
+            {"run": play_episode(run), **summed, **detail}, repeats=max(1, effort.rounds // 3)
         )
-    us = {f"{name} us": 1e6 * seconds for name, seconds in times.items()}
     yield Row(
         "run",
         "whole Swingup run / sum of its parts, per frame",
-        us["run us"] / sum(value for name, value in us.items() if name != "run us"),
+        times["run"] / sum(times[name] for name in summed),
         at_most=1.15,
-        parts=us,
+        parts={f"{name} us": 1e6 * seconds for name, seconds in times.items()},
     )
 
 

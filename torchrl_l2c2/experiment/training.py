@@ -98,6 +98,7 @@ class Experiment:
         self.frames = 0
         self.updates = 0
         self.skipped_updates = 0
+        self._first_update_seconds: float | None = None
         self._log = MetricsLog(self.folder, tensorboard=self.config.logger.name == "tensorboard")
         self._resume(resume)
         if self.folder is not None:
@@ -125,7 +126,8 @@ class Experiment:
         started, first_frame = time.monotonic(), self.frames
         total, done = self.config.task.episodes, len(self.metrics)
         bar = tqdm(total=total, initial=done, unit="episode", disable=not progress)
-        if self._compile:
+        compiling = progress and self._compile and self.agent.compilable
+        if compiling:
             bar.set_postfix_str("compiling at the first updates, up to two minutes")
         saved = time.monotonic()
         with bar, stop_on_signals() as signals:
@@ -137,6 +139,9 @@ class Experiment:
                 self.metrics.append(row)
                 self._log.write(row)
                 bar.update()
+                if compiling and self._first_update_seconds is not None:
+                    compiling = False
+                    bar.write(f"compiled within {self._first_update_seconds:.0f} s", sys.stderr)
                 bar.set_postfix_str(describe(self.metrics[-10:]))
                 ended = len(self.metrics) == total
                 if ended or signals or time.monotonic() - saved > self.config.checkpoint_interval:
@@ -364,7 +369,10 @@ class Experiment:
     def _one_update(self, terms: list[torch.Tensor], *batch: TensorDictBase) -> None:
         """An update with a batch, or with one of the update's own from the replay buffer."""
         with_policy = (self.updates + 1) % self.agent.policy_delay == 0
+        started = time.monotonic()
         result = self.update(with_policy, *batch)
+        if self._first_update_seconds is None:
+            self._first_update_seconds = time.monotonic() - started
         if result is None:
             self.skipped_updates += 1
             return
