@@ -59,7 +59,17 @@ from torchrl.objectives import (
     SACLoss,
 )
 
-from torchrl_l2c2 import CAPSLoss, L2C2Loss, Neighborhood, NeighborTransform, RegularizedLoss
+from torchrl_l2c2 import (
+    CAPSLoss,
+    L2C2Loss,
+    Neighborhood,
+    NeighborTransform,
+    PPORPELoss,
+    RegularizedLoss,
+    make_actor,
+    make_critic,
+)
+from torchrl_l2c2.objectives import regularized
 
 NEAR = Neighborhood(sigma=1.0, lambda_min=0.1, lambda_max=1.0)
 
@@ -559,3 +569,96 @@ class TestEvaluationsThatAreSpared:
         with pytest.raises(KeyError):
             loss(batch.exclude("neighbor", ("next", "observation")))
         torch.testing.assert_close(loss.value_regularizer(other)["loss_l2c2_value"], expected)
+
+
+def replayed(size: int) -> TensorDict:
+    """Transitions for PPO-RPE, with neighbors."""
+    batch = transitions(size).set("action_log_prob", torch.zeros(size))
+    return with_neighbors(batch)
+
+
+def ppo_rpe(*layers: nn.Module) -> PPORPELoss:
+    """PPO-RPE with the paper's networks; further layers end the actor's body."""
+    actor, critic = make_actor(OBSERVATION, ACTION, hidden=(8,)), make_critic(OBSERVATION)
+    body = actor[0].module.body
+    body[-1] = nn.Sequential(body[-1], *layers)
+    return PPORPELoss(actor, critic)
+
+
+class TestOnePass:
+    """Compiled, small batches and their neighbors share a pass over each network."""
+
+    def both(self, loss, batch, monkeypatch):
+        """Rows of every pass where it believes it is compiled; the terms there and else."""
+        rows = []
+        for network in (loss.actor_network[0], loss.critic_network):
+            network.register_forward_pre_hook(lambda _, inputs: rows.append(len(inputs[0])))
+        found = []
+        for compiling in (False, True):
+            rows.clear()
+            monkeypatch.setattr(regularized, "is_compiling", lambda c=compiling: c)
+            torch.manual_seed(0)
+            # The adaptive threshold is a state that every forward pass moves.
+            loss.delta.fill_(0.5)
+            found.append(loss(batch.copy()))
+        return rows, *found
+
+    @pytest.mark.parametrize(
+        "size, passes", [(256, [512, 256, 512]), (257, [257] * 5)], ids=["small", "large"]
+    )
+    def test_up_to_a_size(self, size, passes, monkeypatch):
+        """Critic, its target at the next states, actor; above, two of them at the neighbors."""
+        torch.manual_seed(0)
+        rows, *terms = self.both(L2C2Loss(ppo_rpe(), NEAR), replayed(size), monkeypatch)
+        assert rows == passes
+        for key in terms[0].keys():
+            torch.testing.assert_close(terms[1][key], terms[0][key])
+
+    def test_gradients_are_the_same(self, monkeypatch):
+        """Of the plain terms and of the regularizer's, from both sides."""
+        torch.manual_seed(0)
+        loss = L2C2Loss(ppo_rpe(), NEAR)
+        _, *terms = self.both(loss, replayed(32), monkeypatch)
+        parameters = list(loss.parameters())
+        for key in (key for key in terms[0].keys() if key.startswith("loss_")):
+            gradients = [
+                torch.autograd.grad(t[key], parameters, retain_graph=True, allow_unused=True)
+                for t in terms
+            ]
+            torch.testing.assert_close(*gradients)
+
+    def test_another_regularizer_has_states_of_its_own(self, monkeypatch):
+        """CAPS around L2C2 compares with the next states, not with the neighbors."""
+        torch.manual_seed(0)
+        loss = CAPSLoss(L2C2Loss(ppo_rpe(), NEAR), sigma=0.1)
+        _, *terms = self.both(loss, replayed(32), monkeypatch)
+        for key in terms[0].keys():
+            torch.testing.assert_close(terms[1][key], terms[0][key])
+
+    @pytest.mark.parametrize(
+        "case", ["drawn by the loss", "batch statistics", "running ones", "dropout"]
+    )
+    def test_not_where_more_than_rounding_would_differ(self, case, monkeypatch):
+        """Neighbors that are drawn later, statistics over both, other random numbers."""
+        torch.manual_seed(0)
+        layers = {
+            "batch statistics": [nn.BatchNorm1d(2 * ACTION, track_running_stats=False)],
+            "running ones": [nn.BatchNorm1d(2 * ACTION)],
+            "dropout": [nn.Dropout(0.5)],
+        }
+        loss, batch = L2C2Loss(ppo_rpe(*layers.get(case, [])), NEAR), replayed(32)
+        if case == "drawn by the loss":
+            del batch["neighbor"]
+        rows, *terms = self.both(loss, batch, monkeypatch)
+        assert rows[-2:] == [32, 32]
+        for key in ("loss_actor", "loss_l2c2_actor", "loss_l2c2_critic"):
+            assert torch.equal(terms[1][key], terms[0][key])
+
+    def test_not_where_it_would_cut_a_gradient(self, monkeypatch):
+        """The action that a value is of may be the policy's own."""
+        torch.manual_seed(0)
+        monkeypatch.setattr(regularized, "is_compiling", lambda: True)
+        loss = L2C2Loss(Cooperating(deterministic_actor(), qvalue()), NEAR)
+        batch = with_neighbors(transitions(6))
+        batch["action"].requires_grad_()
+        assert torch.autograd.grad(loss(batch)["loss_value"], batch["action"])[0].any()

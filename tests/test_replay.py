@@ -49,6 +49,7 @@ def by_hand(experiment: Experiment) -> None:
     """An update with what the buffer gives."""
     batch = experiment.replay.sample()
     _, priority = make_update(experiment.agent, compile=False)(True, batch)
+    assert all(parameter.grad is None for parameter in experiment.agent.loss.parameters())
     experiment.replay.update_tensordict_priority(batch.set("td_error", priority))
 
 

@@ -114,7 +114,7 @@ def make_update(
     Returns:
         Callable: takes whether the policy is updated too, then the batch or what ``read`` makes it
         of. Returns the means of ``agent.loss.out_keys``, in their order, as one tensor, and the
-        new priorities of the batch, if the loss gives any.
+        new priorities of the batch, if the loss gives any. Parameters have no ``grad`` after it.
     """
     parameters = [p for group in agent.optimizer.param_groups for p in group["params"]]
     keys = agent.loss.out_keys
@@ -139,6 +139,9 @@ def make_update(
         agent.optimizer.step()
         if agent.target_updater is not None:
             agent.target_updater.step()
+        # Kept, they would be outputs of the graph, and each output takes time.
+        for parameter in parameters:
+            parameter.grad = None
 
     def update(with_policy: bool, *drawn: Any) -> tuple[Tensor, Tensor | None]:
         values, priority, gradients = differentiate(with_policy, *drawn)

@@ -215,8 +215,21 @@ class L2C2Loss(RegularizedLoss):
             distances.append(distance)
         return neighbor.set("distance", torch.stack(distances).amax(0))
 
+    def _known_states(self, tensordict: TensorDictBase) -> TensorDictBase | None:
+        if tensordict.get(self.l2c2_neighbor_key, None) is None:
+            return super()._known_states(tensordict)
+        return self._neighbors(tensordict)[0]
+
     def _neighbors(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
-        """The neighbors and their distances, both ``[K, *B]``."""
+        """The neighbors and their distances, both ``[K, *B]``; made once in a forward pass."""
+        if "neighbors" not in self._evaluated:
+            neighbors = self._read_neighbors(tensordict)
+            if "batch" not in self._evaluated:
+                return neighbors
+            self._evaluated["neighbors"] = neighbors
+        return self._evaluated["neighbors"]
+
+    def _read_neighbors(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
         neighbor = tensordict.get(self.l2c2_neighbor_key, None)
         if neighbor is None:
             neighbor = self._draw(tensordict)

@@ -15,7 +15,10 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import ProbabilisticTensorDictModule, TensorDictModuleBase, dispatch
 from torch import Tensor, nn
+from torch.compiler import is_compiling
 from torch.distributions import Distribution
+from torch.nn.modules.batchnorm import _BatchNorm
+from torch.nn.modules.dropout import _DropoutNd
 from torchrl.envs.utils import set_exploration_type
 from torchrl.modules import Delta, GRUModule, LSTMModule, TanhDelta
 from torchrl.objectives import LossModule
@@ -28,6 +31,9 @@ POLICY_NETWORK = "actor_network"
 VALUE_NETWORKS = ("critic_network", "qvalue_network", "value_network", "local_value_network")
 # The vector of an ensemble, or of all actions, comes before the one number made of it.
 _VALUE_KEYS = ("value_heads", "state_action_value", "action_value", "value")
+# Up to so many states, a pass through a small network costs what calling it costs. Measured on a
+# CPU with layers of 100: one pass instead of two is faster by 12 % at 32, slower by 1 % at 512.
+ONE_PASS_STATES = 256
 
 # What nn.Module itself keeps: dictionaries that two losses must not share.
 _REGISTRIES = frozenset(vars(nn.Module()))
@@ -43,6 +49,7 @@ class _Wiring:
     output: NestedKey | None  # a value function's value, a deterministic policy's action
     stochastic: bool
     has_buffers: bool
+    rowwise: bool  # an output depends on its own row alone, and on no random numbers
 
 
 class RegularizedLoss(LossModule):
@@ -312,12 +319,38 @@ class RegularizedLoss(LossModule):
         """Keeps what the loss has evaluated at the batch's states until ``forward`` is done.
 
         Only for losses that do so through a method of this name, as :class:`PPORPELoss`: their
-        networks then need to be evaluated at the other states alone.
+        networks then need to be evaluated at the other states alone. Compiled, small batches are
+        evaluated together with the other states, where these are known by now: that differs by
+        rounding, and so it is left to where compiling does anyway.
         """
-        out = super()._evaluate_batch(network, tensordict)
-        if "batch" in self._evaluated:
-            self._evaluated[network] = out
-        return out
+        if "batch" not in self._evaluated:
+            return super()._evaluate_batch(network, tensordict)
+        states = None
+        if is_compiling() and self._fits_one_pass(network, tensordict):
+            states = self._known_states(tensordict)
+        if states is None:
+            here = super()._evaluate_batch(network, tensordict)
+        else:
+            rows = self._rows(network, tensordict, states, with_batch=True)
+            out = super()._evaluate_batch(network, rows)
+            here, there = self._split(network, out, [1, len(states)], tensordict)
+            here = here.squeeze(int(self._is_ensemble(network)))
+            self._evaluated[network, "others"] = states, there
+        self._evaluated[network] = here
+        return here
+
+    def _fits_one_pass(self, network: str, tensordict: TensorDictBase) -> bool:
+        wiring = self._wiring.get(network)
+        if wiring is None or wiring.trunk or wiring.has_buffers or not wiring.rowwise:
+            return False
+        inputs = tensordict.select(*wiring.inputs, strict=False).values(True, True)
+        if any(value.requires_grad for value in inputs):
+            return False
+        return tensordict.ndim == 1 and tensordict.numel() <= ONE_PASS_STATES
+
+    def _known_states(self, tensordict: TensorDictBase) -> TensorDictBase | None:
+        """States to compare the batch's with that are in the batch; ``None`` if drawn later."""
+        return None
 
     def _is_ensemble(self, network: str) -> bool:
         params = self._parameters_of(network)
@@ -403,6 +436,7 @@ class RegularizedLoss(LossModule):
             output=output,
             stochastic=stochastic,
             has_buffers=self._has_buffers(network),
+            rowwise=not any(isinstance(m, _BatchNorm | _DropoutNd) for m in net.modules()),
         )
 
     def _action_keys(self) -> list[NestedKey]:
@@ -433,18 +467,28 @@ class RegularizedLoss(LossModule):
     ) -> tuple[TensorDictBase, TensorDictBase]:
         """A network's outputs at the batch's states, ``[1, *B]``, and at others, ``[K, *B]``."""
         wiring, known = self._wiring[network], self._evaluated.get(network)
+        dim, num = int(self._is_ensemble(network)), len(states)
+        evaluated, there = self._evaluated.get((network, "others"), (None, None))
+        if evaluated is states:
+            return known.select(*keys).unsqueeze(dim), there.select(*keys)
         rows = self._rows(network, tensordict, states, with_batch=known is None)
         if wiring.trunk:
             hidden = self._evaluate(POLICY_NETWORK, rows).select(*wiring.trunk)
             rows.update(hidden.detach() if getattr(self, "separate_losses", False) else hidden)
         out = self._evaluate(network, rows).select(*keys)
-        dim, (num, *batch) = int(self._is_ensemble(network)), states.batch_size
-        if batch:
-            # Explicit sizes: an inferred one does not compile.
-            out = out.unflatten(dim, (num + (known is None), batch[0]))
         if known is None:
-            return tuple(out.split([1, num], dim))
-        return known.select(*keys).unsqueeze(dim), out
+            return self._split(network, out, [1, num], tensordict)
+        return known.select(*keys).unsqueeze(dim), self._split(network, out, [num], tensordict)[0]
+
+    def _split(
+        self, network: str, out: TensorDictBase, parts: list[int], tensordict: TensorDictBase
+    ) -> tuple[TensorDictBase, ...]:
+        """Outputs at rows as :meth:`_rows` gives them, by what the rows are: ``[part, *B]``."""
+        dim = int(self._is_ensemble(network))
+        if tensordict.batch_size:
+            # Explicit sizes: an inferred one does not compile.
+            out = out.unflatten(dim, (sum(parts), tensordict.batch_size[0]))
+        return out.split(parts, dim)
 
     def _rows(
         self, network: str, tensordict: TensorDictBase, states: TensorDictBase, with_batch: bool
