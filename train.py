@@ -6,6 +6,7 @@
 import logging
 import sys
 import warnings
+from contextlib import closing
 from pathlib import Path
 
 import hydra
@@ -29,9 +30,9 @@ def main(settings: DictConfig) -> None:
         print(f"{describe(config)}: {folder}")
         run = finished_run(folder, config)
         if run is None:
-            experiment = Experiment(config, folder, resume=settings.resume)
-            experiment.train(progress=True)
-            run = experiment.finish(experiment.test(progress=True))
+            with closing(Experiment(config, folder, resume=settings.resume)) as experiment:
+                experiment.train(progress=True)
+                run = experiment.finish(experiment.test(progress=True))
     except Interrupted as interruption:
         print(interruption, file=sys.stderr)
         sys.exit(interruption.exit_status)

@@ -1,5 +1,7 @@
 """The lean collector gives what TorchRL's own gives, to the bit."""
 
+from functools import partial
+
 import pytest
 import torch
 from torchrl.collectors import Collector
@@ -14,7 +16,7 @@ from torchrl.envs import (
 
 from torchrl_l2c2 import make_actor
 from torchrl_l2c2.experiment import TaskConfig, make_env
-from torchrl_l2c2.experiment.collection import EpisodeCollector
+from torchrl_l2c2.experiment.collection import EpisodeCollector, MultiEpisodeCollector
 
 HOPPER = TaskConfig("hopper", "pybullet_envs_gymnasium:HopperBulletEnv-v0", noise_scale=0.001)
 
@@ -81,3 +83,71 @@ def test_other_environments_are_referred_to_torchrls_collector():
         EpisodeCollector(SerialEnv(2, lambda: GymEnv("Pendulum-v1")), actor, frames_per_batch=5)
     with pytest.raises(TypeError, match=r"RewardSum.*torchrl.collectors"):
         EpisodeCollector(TransformedEnv(env, RewardSum()), actor, frames_per_batch=5)
+
+
+class TestSeveralWorkers:
+    """Processes of their own; one collector serves all tests, as starting it takes seconds."""
+
+    @pytest.fixture(scope="class")
+    def actor(self):
+        return make(TaskConfig(max_steps=20))[1]
+
+    @pytest.fixture(scope="class")
+    def collector(self, actor):
+        env = partial(make_env, TaskConfig(max_steps=20), 3)
+        collector = MultiEpisodeCollector(
+            env, actor, num_workers=2, max_steps=20, seed=5, random_frames=41
+        )
+        yield collector
+        collector.shutdown()
+
+    def test_a_round_is_an_episode_of_each_with_draws_of_their_own(self, collector):
+        """The entries of the lean collector; noise, starts and actions differ between workers."""
+        first, second = collector.rollout()
+        env, actor = make(TaskConfig(max_steps=20))
+        alone = EpisodeCollector(env, actor, frames_per_batch=20).rollout()
+        for episode in (first, second):
+            assert set(episode.keys(True, True)) == set(alone.keys(True, True))
+            assert episode.shape == (20,) and episode["next", "done"][-1]
+        for key in ("observation", "action"):
+            assert (first[key] != second[key]).any(-1).all()
+        noise = first["observation"][:, 1] - second["observation"][:, 1]
+        assert noise.unique().numel() == 20
+
+    def test_first_frames_are_random_and_later_ones_the_policys(self, collector, actor):
+        """Rounds that begin before frame 41; a stored likelihood tells which action was drawn."""
+        collector.set_generator_state({"rounds_played": 1, "frames": 40})
+        drawn, chosen = collector.rollout()[0], collector.rollout()[0]
+        expected = actor.get_dist(chosen.select("observation")).log_prob(chosen["action"])
+        torch.testing.assert_close(chosen["action_log_prob"], expected, rtol=1e-3, atol=1e-3)
+        unlike = actor.get_dist(drawn.select("observation")).log_prob(drawn["action"])
+        assert ((drawn["action_log_prob"] - unlike).abs() > 0.1).any()
+
+    def test_from_a_saved_state_the_rounds_are_the_same_again(self, collector):
+        """To the bit, and no round is like the one before."""
+        collector.rollout()
+        state = collector.generator_state()
+        rounds = [torch.stack(collector.rollout()) for _ in range(2)]
+        collector.set_generator_state(state)
+        again = [torch.stack(collector.rollout()) for _ in range(2)]
+        for ours, theirs in zip(again, rounds, strict=True):
+            assert (ours == theirs).all()
+        assert (rounds[0]["observation"] != rounds[1]["observation"]).any()
+
+    def test_workers_act_with_the_policy_as_it_is_now(self, collector, actor):
+        """Parameters that training has changed in place."""
+        state = collector.generator_state()
+        before = collector.rollout()[0]
+        with torch.no_grad():
+            list(actor.parameters())[-1].add_(1.0)
+        collector.set_generator_state(state)
+        after = collector.rollout()[0]
+        assert torch.equal(before["observation"][0], after["observation"][0])
+        assert (after["scale"][0] > before["scale"][0]).all()
+
+    def test_the_death_of_a_worker_is_an_error_and_no_endless_wait(self, collector):
+        """Last, as it ends the collector: killed between rounds, as by a lack of memory."""
+        collector.procs[1].kill()
+        collector.procs[1].join()
+        with pytest.raises(RuntimeError):
+            collector.rollout()

@@ -1,5 +1,6 @@
 """Runs of the experiment, as a user starts them: short, but of every task and regularizer."""
 
+import contextlib
 import csv
 import json
 import os
@@ -196,6 +197,26 @@ def test_a_batch_that_is_not_finite_can_be_skipped(entry):
     rows.copy_(finite)
     assert experiment.update(True)[0].isfinite().all()
     assert experiment.metrics[-1]["skipped_updates"] == 0
+
+
+def test_workers_play_rounds_that_are_learned_from_as_episodes(tmp_path):
+    """As many updates as of one process's episodes; a worker that dies leaves a checkpoint."""
+    task = replace(PENDULUM, episodes=4)
+    config = small(num_workers=2, task=task, checkpoint_interval=0.0)
+    with contextlib.closing(Experiment(config, tmp_path)) as experiment:
+        rows = experiment.train()
+        assert [row["episode"] for row in rows] == [1, 2, 3, 4]
+        assert [row["frames"] for row in rows] == [40, 80, 120, 160]
+        # Two passes over what the buffer holds after the round: 80 frames, then 160.
+        assert [row["updates"] for row in rows] == [2, 4, 9, 14]
+        assert len({row["return"] for row in rows}) == 4
+        experiment.config = replace(config, task=replace(task, episodes=6))
+        experiment.collector.procs[0].kill()
+        experiment.collector.procs[0].join()
+        message = r"Pendulum-v1 failed after frame 160.*Last good checkpoint: .*_0+4.pt"
+        with pytest.raises(SimulatorError, match=message):
+            experiment.train()
+        assert len(experiment.metrics) == 4
 
 
 def test_a_loss_that_is_not_finite_stops_the_run_with_its_name(monkeypatch):

@@ -8,7 +8,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
 from torchrl_l2c2.experiment import ExperimentConfig, TaskConfig
-from torchrl_l2c2.experiment.config import GROUPS
+from torchrl_l2c2.experiment.config import GROUPS, SACConfig
 
 CONF = Path(__file__).parent.parent / "conf"
 
@@ -111,3 +111,20 @@ def test_wrong_settings_are_refused_with_what_is_allowed(settings, message):
     """The error names the setting, what was given and what is allowed."""
     with pytest.raises(ValueError, match=message):
         ExperimentConfig.from_dict(settings)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"num_workers": 0}, "num_workers must be a whole number of at least 1, got 0"),
+        ({"num_workers": 3}, r"task.episodes=200 must be a multiple of num_workers=3.*use 198"),
+        (
+            {"num_workers": 2, "algorithm": SACConfig()},
+            "algorithm.schedule=step updates after every frame",
+        ),
+    ],
+)
+def test_workers_that_cannot_share_the_episodes_are_refused(settings, message):
+    """With what would be allowed."""
+    with pytest.raises(ValueError, match=message):
+        ExperimentConfig(**settings)

@@ -1,9 +1,11 @@
-"""Collecting at nearly the speed of the simulator: TorchRL's collector with a plain inner loop."""
+"""Collecting at nearly the speed of the simulator: TorchRL's collectors with a plain inner loop."""
 
 from __future__ import annotations
 
 import json
+import signal
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,7 +13,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torchrl.collectors import Collector
+from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.envs import (
     Compose,
     EnvBase,
@@ -24,6 +26,9 @@ from torchrl.envs import (
 
 from torchrl_l2c2.experiment.compilation import compiled
 from torchrl_l2c2.transforms import ObservationNoise
+
+# Added to the seed of an environment for its noise: the two are not to draw the same numbers.
+NOISE_SEED = 7_919
 
 
 class EpisodeCollector(Collector):
@@ -122,6 +127,22 @@ class EpisodeCollector(Collector):
         self._observation = observation
         return self._stack(steps)
 
+    def set_seed(self, seed: int, static_seed: bool = False) -> int:
+        """Seeds the simulator and, with another seed, its noise; the next episode starts anew.
+
+        Args:
+            seed (int): at least 0.
+            static_seed (bool): whether to return the seed as it is.
+
+        Returns:
+            int: a seed for another environment.
+        """
+        following = super().set_seed(seed, static_seed=static_seed)
+        if self._noise is not None and self._noise.generator is not None:
+            self._noise.generator.manual_seed(seed + NOISE_SEED)
+        self._observation = None
+        return following
+
     def generator_state(self) -> dict[str, Any]:
         """The states of the simulator's and the noise's random generators, between episodes.
 
@@ -173,6 +194,130 @@ class EpisodeCollector(Collector):
             },
             [len(steps)],
         )
+
+
+class MultiEpisodeCollector(MultiSyncCollector):
+    """An :class:`EpisodeCollector` in each of several processes, which play an episode at a time.
+
+    Episodes depend on the seed, the number of rounds played before and their place in the round,
+    not on how fast a process is: after :meth:`set_generator_state` they are the same again.
+
+    Args:
+        create_env (callable): makes an environment as :class:`EpisodeCollector` takes it; pickled.
+        policy (TensorDictModule): reads ``"observation"``; its current parameters are sent to the
+            processes before every round.
+
+    Keyword Args:
+        num_workers (int): processes. More give more frames a second, up to the number of cores,
+            and play more episodes with one policy.
+        max_steps (int): frames of the longest episode.
+        seed (int): of all randomness in the processes, the policy's included. Default 0.
+        compile_policy (bool): as for :class:`EpisodeCollector`, in every process.
+        random_frames (int): rounds that begin before so many frames draw their actions from the
+            action's bounds. Default 0.
+        exploration_type (ExplorationType): default ``RANDOM``.
+
+    Raises:
+        RuntimeError: an environment or a policy failed in a process, or the process died.
+
+    Examples:
+        >>> from functools import partial
+        >>> from torchrl.envs import GymEnv
+        >>> from torchrl_l2c2 import make_actor
+        >>> create_env = partial(GymEnv, "Pendulum-v1", max_episode_steps=7)
+        >>> actor = make_actor(3, create_env().action_spec)
+        >>> collector = MultiEpisodeCollector(create_env, actor, num_workers=2, max_steps=7)
+        >>> [episode.shape for episode in collector.rollout()]
+        [torch.Size([7]), torch.Size([7])]
+        >>> collector.shutdown()
+    """
+
+    def __init__(
+        self,
+        create_env: Callable[[], EnvBase],
+        policy: TensorDictModule,
+        *,
+        num_workers: int,
+        max_steps: int,
+        seed: int = 0,
+        compile_policy: bool = False,
+        random_frames: int = 0,
+        exploration_type: ExplorationType = ExplorationType.RANDOM,
+    ) -> None:
+        self._seed = seed
+        self._rounds_played = 0
+        super().__init__(
+            [create_env] * num_workers,
+            policy,
+            frames_per_batch=max_steps * num_workers,
+            total_frames=-1,
+            init_random_frames=random_frames,
+            exploration_type=exploration_type,
+            collector_class=partial(_EpisodeWorker, compiled_policy=compile_policy),
+            init_fn=_leave_signals_to_parent,
+            update_at_each_batch=True,
+            use_buffers=False,
+            cat_results="stack",
+            auto_register_policy_transforms=False,
+        )
+        self._rounds: Iterator[TensorDictBase] | None = None
+
+    def rollout(self) -> list[TensorDictBase]:
+        """One episode of every process, as :meth:`EpisodeCollector.rollout` gives them."""
+        entropy = np.random.SeedSequence([self._seed, self._rounds_played])
+        self.set_seed(int(entropy.generate_state(1)[0]))
+        self._rounds = self._rounds or iter(self)
+        episodes = next(self._rounds).unbind(0)
+        self._rounds_played += 1
+        return [episode.exclude("collector") for episode in episodes]
+
+    def generator_state(self) -> dict[str, Any]:
+        """What the following episodes depend on, but for the policy."""
+        return {"rounds_played": self._rounds_played, "frames": self._frames}
+
+    def set_generator_state(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`generator_state` gave."""
+        self._rounds_played, self._frames = state["rounds_played"], state["frames"]
+
+
+class _EpisodeWorker(EpisodeCollector):
+    """What a process of :class:`MultiEpisodeCollector` runs."""
+
+    def __init__(
+        self,
+        create_env: Callable[[], EnvBase],
+        *,
+        policy_factory: Callable[[], TensorDictModule],
+        frames_per_batch: int,
+        exploration_type: ExplorationType,
+        compiled_policy: bool,
+        **_: Any,
+    ) -> None:
+        torch.set_num_threads(1)
+        super().__init__(
+            create_env(),
+            policy_factory(),
+            frames_per_batch=frames_per_batch,
+            compile_policy=compiled_policy,
+            exploration_type=exploration_type,
+        )
+        self._use_buffers = False
+
+    def reset(self, index: Tensor | None = None, **kwargs: Any) -> None:
+        """The next episode resets the simulator by itself."""
+        self._observation = None
+
+    def rollout(self) -> TensorDictBase:
+        # What the parent's message said: all of the round is random or none.
+        self._random_frames_left = self.frames_per_batch if self.init_random_frames > 0 else 0
+        episode = super().rollout()
+        # The parent counts frames by this entry.
+        return episode.set(("collector", "traj_ids"), torch.zeros(len(episode), dtype=torch.int64))
+
+
+def _leave_signals_to_parent() -> None:
+    """Ctrl-C reaches all processes; the parent lets the episodes end and saves them."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _parts(env: EnvBase) -> tuple[GymEnv, ObservationNoise | None]:

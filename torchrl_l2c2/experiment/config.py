@@ -304,6 +304,7 @@ class ExperimentConfig:
     logger: LoggerConfig = field(default_factory=LoggerConfig)
     seed: int = 0
     threads: int = 1
+    num_workers: int = 1
     compile: bool = True
     on_nonfinite: str = "stop"
     test_episodes: int = 100
@@ -320,7 +321,8 @@ class ExperimentConfig:
                 f"algorithm={self.algorithm.name} cannot learn from replay={self.replay.name}: "
                 "ppo needs replay=rollout, the others replay=prioritized or replay=uniform."
             )
-        _whole(self, "threads", "test_episodes", "checkpoint_keep")
+        _whole(self, "threads", "num_workers", "test_episodes", "checkpoint_keep")
+        _check_rounds(self)
         _nonnegative(self, "checkpoint_interval")
         _choice(self, "on_nonfinite", "stop", "skip")
         if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
@@ -394,6 +396,21 @@ def _whole(config: object, *names: str) -> None:
             raise ValueError(
                 f"{_where(config, name)} must be a whole number of at least 1, got {value!r}."
             )
+
+
+def _check_rounds(config: ExperimentConfig) -> None:
+    """Several workers play whole episodes, and all of them as many."""
+    workers, episodes = config.num_workers, config.task.episodes
+    if workers > 1 and config.algorithm.schedule == "step":
+        raise ValueError(
+            f"num_workers={workers} play whole episodes, and algorithm.schedule=step updates after "
+            "every frame: use algorithm.schedule=episode, or num_workers=1."
+        )
+    if episodes % workers:
+        raise ValueError(
+            f"task.episodes={episodes} must be a multiple of num_workers={workers}, which play "
+            f"one each in a round: use {episodes - episodes % workers or workers}, for example."
+        )
 
 
 def _off_policy(config: SACConfig | TD3Config | DQNConfig) -> None:

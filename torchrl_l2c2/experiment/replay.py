@@ -31,8 +31,8 @@ def make_replay(config: ExperimentConfig) -> TensorDictReplayBuffer:
     replay, algorithm = config.replay, config.algorithm
     generator = torch.Generator().manual_seed(config.seed)
     if isinstance(replay, RolloutReplayConfig):
-        # The last episode may go past the rollout's frames.
-        storage = LazyTensorStorage(algorithm.frames + config.task.max_steps)
+        # The last episodes may go past the rollout's frames.
+        storage = LazyTensorStorage(algorithm.frames + config.num_workers * config.task.max_steps)
         buffer = TensorDictReplayBuffer(
             storage=storage,
             sampler=SamplerWithoutReplacement(),

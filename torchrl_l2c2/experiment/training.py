@@ -13,6 +13,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -35,7 +36,7 @@ from torchrl_l2c2.experiment.checkpoints import (
     save_checkpoint,
     set_global_rng_state,
 )
-from torchrl_l2c2.experiment.collection import EpisodeCollector
+from torchrl_l2c2.experiment.collection import EpisodeCollector, MultiEpisodeCollector
 from torchrl_l2c2.experiment.compilation import compiler_available
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
@@ -132,13 +133,12 @@ class Experiment:
         saved = time.monotonic()
         with bar, stop_on_signals() as signals:
             while len(self.metrics) < total:
-                row = self._play_episode()
-                row["frames_per_second"] = (self.frames - first_frame) / (
-                    time.monotonic() - started
-                )
-                self.metrics.append(row)
-                self._log.write(row)
-                bar.update()
+                for row in self._play_round():
+                    seconds = time.monotonic() - started
+                    row["frames_per_second"] = (self.frames - first_frame) / seconds
+                    self.metrics.append(row)
+                    self._log.write(row)
+                    bar.update()
                 if compiling and self._first_update_seconds is not None:
                     compiling = False
                     bar.write(f"compiled within {self._first_update_seconds:.0f} s", sys.stderr)
@@ -221,25 +221,43 @@ class Experiment:
         self.load_state_dict(state)
         print(f"continuing after episode {len(self.metrics)} from {path}", file=sys.stderr)
 
-    def _play_episode(self) -> dict[str, float]:
-        """One episode and the updates that belong to it; its metrics."""
-        parts: list[TensorDictBase] = []
-        terms: list[torch.Tensor] = []
-        while not parts or not parts[-1]["next", "done"][-1]:
-            batch = self._collect()
-            parts.append(batch)
-            self.frames += batch.numel()
-            if isinstance(self.agent.exploration, EGreedyModule):
-                self.agent.exploration.step(batch.numel())
-            if self.config.algorithm.schedule == "step":
-                self.replay.extend(self._remembered(batch))
-                self._replay_updates(self.config.algorithm.updates or 1, terms)
-        episode = torch.cat(parts)
-        # Of the policy that played it, where the updates come after the episode.
-        variation = self._action_variation(episode)
-        if self.config.algorithm.schedule != "step":
+    def _play_round(self) -> Iterator[dict[str, float]]:
+        """The episodes of one round, with the updates that belong to each; their metrics."""
+        if self.config.algorithm.schedule == "step":
+            yield self._learn_by_step()
+            return
+        episodes = self._collect()
+        # Of the policy that played them: the updates come after the episodes.
+        variations = [self._action_variation(episode) for episode in episodes]
+        for episode in episodes:
             self.replay.extend(self._remembered(episode))
+        for episode, variation in zip(episodes, variations, strict=True):
+            self._count(episode)
+            terms: list[torch.Tensor] = []
             self._updates_after_episode(terms)
+            yield self._row(episode, variation, terms)
+
+    def _learn_by_step(self) -> dict[str, float]:
+        """One episode with updates after every frame; its metrics."""
+        frames: list[TensorDictBase] = []
+        terms: list[torch.Tensor] = []
+        while not frames or not frames[-1]["next", "done"][-1]:
+            (frame,) = self._collect()
+            frames.append(frame)
+            self._count(frame)
+            self.replay.extend(self._remembered(frame))
+            self._replay_updates(self.config.algorithm.updates or 1, terms)
+        episode = torch.cat(frames)
+        return self._row(episode, self._action_variation(episode), terms)
+
+    def _count(self, batch: TensorDictBase) -> None:
+        self.frames += batch.numel()
+        if isinstance(self.agent.exploration, EGreedyModule):
+            self.agent.exploration.step(batch.numel())
+
+    def _row(
+        self, episode: TensorDictBase, variation: float, terms: list[torch.Tensor]
+    ) -> dict[str, float]:
         return {
             "episode": len(self.metrics) + 1,
             "frames": self.frames,
@@ -307,27 +325,45 @@ class Experiment:
         draw_learning_curves([run], self.folder / "learning_curves.png")
         return run
 
+    def close(self) -> None:
+        """Ends the processes of ``num_workers``; the experiment cannot train any further."""
+        self.collector.shutdown()
+
     def _make_update(self) -> Callable[..., tuple[torch.Tensor, torch.Tensor | None] | None]:
         options = {"compile": self._compile, "skip_nonfinite": self.config.on_nonfinite == "skip"}
         if self.config.algorithm.schedule == "rollout":
             return make_update(self.agent, **options)
         return ReplayUpdate(self.agent, self.replay, **options)
 
-    def _make_collector(self) -> EpisodeCollector:
-        by_step = self.config.algorithm.schedule == "step"
-        return EpisodeCollector(
-            self.env,
-            self.agent.policy,
-            frames_per_batch=1 if by_step else self.config.task.max_steps,
+    def _make_collector(self) -> EpisodeCollector | MultiEpisodeCollector:
+        config = self.config
+        options: dict[str, Any] = {
             # Modules that only explore take decisions that cannot be compiled.
-            compile_policy=self._compile and self.agent.exploration is None,
-            random_frames=self._random_frames,
-        )
+            "compile_policy": self._compile and self.agent.exploration is None,
+            "random_frames": self._random_frames,
+        }
+        if config.num_workers > 1:
+            return MultiEpisodeCollector(
+                partial(make_env, config.task, config.seed),
+                self.agent.policy,
+                num_workers=config.num_workers,
+                max_steps=config.task.max_steps,
+                seed=config.seed,
+                **options,
+            )
+        by_step = config.algorithm.schedule == "step"
+        frames = 1 if by_step else config.task.max_steps
+        return EpisodeCollector(self.env, self.agent.policy, frames_per_batch=frames, **options)
 
-    def _collect(self) -> TensorDictBase:
+    def _collect(self) -> list[TensorDictBase]:
+        """One episode of every worker, or the next frame of the one that is being played."""
         try:
-            batch = self.collector.rollout()
-            check_finite(batch, self.frames)
+            played = self.collector.rollout()
+            batches = played if isinstance(played, list) else [played]
+            first_frame = self.frames
+            for batch in batches:
+                check_finite(batch, first_frame)
+                first_frame += batch.numel()
         except FloatingPointError as error:
             raise FloatingPointError(f"{error} {self._last_checkpoint()}") from None
         except Exception as error:
@@ -335,7 +371,7 @@ class Experiment:
                 f"{self.config.task.env_id} failed after frame {self.frames}: "
                 f"{type(error).__name__}: {error} {self._last_checkpoint()}"
             ) from error
-        return batch
+        return batches
 
     @property
     def _random_frames(self) -> int:
