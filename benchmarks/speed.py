@@ -45,7 +45,7 @@ from torchrl_l2c2.experiment import (
     make_env,
 )
 from torchrl_l2c2.experiment.agents import make_agent, make_update
-from torchrl_l2c2.experiment.collection import EpisodeCollector
+from torchrl_l2c2.experiment.collection import EpisodeCollector, MultiEpisodeCollector
 from torchrl_l2c2.experiment.config import SACConfig
 from torchrl_l2c2.experiment.environments import quiet_output
 from torchrl_l2c2.experiment.replay import ReplayUpdate
@@ -156,6 +156,40 @@ def collection_rows(effort: Effort) -> Iterable[Row]:
             fps["collector"] / fps["simulator"],
             at_least=0.6,
             parts={"collected frames/s": fps["collector"], "simulated frames/s": fps["simulator"]},
+        )
+
+
+def worker_rows(effort: Effort) -> Iterable[Row]:
+    """Episodes of two processes at once, against one after another in this process."""
+    for name in ("swingup", "ant"):
+        task = dataclasses.replace(TASKS[name], max_steps=min(1000, effort.steps))
+        env = make_env(task, seed=0)
+        actor = make_actor(env.observation_spec["observation"].shape[-1], env.action_spec)
+        one = EpisodeCollector(
+            env, actor, frames_per_batch=task.max_steps, compile_policy=effort.compile
+        )
+        two = MultiEpisodeCollector(
+            partial(make_env, task, 0),
+            actor,
+            num_workers=2,
+            max_steps=task.max_steps,
+            compile_policy=effort.compile,
+        )
+        times = alternate(
+            {
+                "one": lambda one=one: one.rollout().numel(),
+                "two": lambda two=two: sum(episode.numel() for episode in two.rollout()),
+            },
+            repeats=effort.rounds,
+        )
+        fps = {what: 1.0 / seconds for what, seconds in times.items()}
+        one.shutdown()
+        two.shutdown()
+        yield Row(
+            "workers",
+            f"frames of num_workers=2 / frames of num_workers=1, {name}",
+            fps["two"] / fps["one"],
+            parts={"two frames/s": fps["two"], "one frames/s": fps["one"]},
         )
 
 
@@ -376,6 +410,7 @@ ROWS: dict[str, Callable[[Effort], Iterable[Row]]] = {
     "update": update_rows,
     "update_4096": large_update_rows,
     "collection": collection_rows,
+    "workers": worker_rows,
     "run": run_rows,
     "sb3": baseline_rows,
     "processes": process_rows,
