@@ -1,5 +1,7 @@
 """The lean collector gives what TorchRL's own gives, to the bit."""
 
+import subprocess
+import sys
 from functools import partial
 
 import pytest
@@ -151,3 +153,20 @@ class TestSeveralWorkers:
         collector.procs[1].join()
         with pytest.raises(RuntimeError):
             collector.rollout()
+
+
+def test_a_script_that_leaves_its_workers_running_ends(tmp_path):
+    """They are ended with it, also where nobody closed the experiment."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from torchrl_l2c2.experiment import Experiment, ExperimentConfig, TaskConfig\n"
+        "if __name__ == '__main__':\n"
+        "    task = TaskConfig('pendulum', 'Pendulum-v1', episodes=2, max_steps=20)\n"
+        "    config = ExperimentConfig(task=task, compile=False, num_workers=2)\n"
+        "    experiment = Experiment(config)\n"
+        "    print('episodes', len(experiment.train()))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, script], capture_output=True, text=True, timeout=120, check=True
+    )
+    assert "episodes 2" in done.stdout

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import atexit
 import json
 import signal
+import weakref
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
@@ -202,6 +204,9 @@ class MultiEpisodeCollector(MultiSyncCollector):
     Episodes depend on the seed, the number of rounds played before and their place in the round,
     not on how fast a process is: after :meth:`set_generator_state` they are the same again.
 
+    .. note:: The processes import the script that made them: as everywhere in multiprocessing, it
+        needs ``if __name__ == "__main__":`` around what it does. Notebooks do not.
+
     Args:
         create_env (callable): makes an environment as :class:`EpisodeCollector` takes it; pickled.
         policy (TensorDictModule): reads ``"observation"``; its current parameters are sent to the
@@ -244,6 +249,9 @@ class MultiEpisodeCollector(MultiSyncCollector):
         random_frames: int = 0,
         exploration_type: ExplorationType = ExplorationType.RANDOM,
     ) -> None:
+        # Python would wait for the processes to end before it ends itself.
+        self._at_exit = partial(_shut_down, weakref.ref(self))
+        atexit.register(self._at_exit)
         self._seed = seed
         self._rounds_played = 0
         super().__init__(
@@ -261,6 +269,11 @@ class MultiEpisodeCollector(MultiSyncCollector):
             auto_register_policy_transforms=False,
         )
         self._rounds: Iterator[TensorDictBase] | None = None
+
+    def shutdown(self, *args: Any, **kwargs: Any) -> None:
+        """Ends the processes; nothing can be collected any more."""
+        atexit.unregister(self._at_exit)
+        super().shutdown(*args, **kwargs)
 
     def rollout(self) -> list[TensorDictBase]:
         """One episode of every process, as :meth:`EpisodeCollector.rollout` gives them."""
@@ -313,6 +326,11 @@ class _EpisodeWorker(EpisodeCollector):
         episode = super().rollout()
         # The parent counts frames by this entry.
         return episode.set(("collector", "traj_ids"), torch.zeros(len(episode), dtype=torch.int64))
+
+
+def _shut_down(collector: weakref.ref[MultiEpisodeCollector]) -> None:
+    if (alive := collector()) is not None:
+        alive.shutdown(raise_on_error=False)
 
 
 def _leave_signals_to_parent() -> None:

@@ -62,7 +62,8 @@ class RegularizedLoss(LossModule):
     parameters and buffers of ``loss`` themselves, not copies, and ``loss`` stays the plain loss.
     From then on, move or cast the regularized one.
 
-    ``forward`` returns the loss's own terms, unchanged, and the regularizer's. Loops that call
+    ``forward`` returns the loss's own terms, unchanged (compiled: to rounding), and the
+    regularizer's. Loops that call
     ``actor_loss`` and ``value_loss`` themselves add :meth:`policy_regularizer` and
     :meth:`value_regularizer`.
 
