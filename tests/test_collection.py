@@ -147,6 +147,16 @@ class TestSeveralWorkers:
         assert torch.equal(before["observation"][0], after["observation"][0])
         assert (after["scale"][0] > before["scale"][0]).all()
 
+    def test_an_error_of_the_pipes_says_what_it_means(self, collector, monkeypatch):
+        """What TorchRL raises while it cleans up differs with the time that a process takes."""
+
+        def closes(*_):
+            raise ValueError("Cannot close a process while it is still running.")
+
+        monkeypatch.setattr(collector, "set_seed", closes)
+        with pytest.raises(RuntimeError, match=r"a worker process died .*still running"):
+            collector.rollout()
+
     def test_the_death_of_a_worker_is_an_error_and_no_endless_wait(self, collector):
         """Last, as it ends the collector: killed between rounds, as by a lack of memory."""
         collector.procs[1].kill()

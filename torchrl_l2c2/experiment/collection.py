@@ -278,9 +278,15 @@ class MultiEpisodeCollector(MultiSyncCollector):
     def rollout(self) -> list[TensorDictBase]:
         """One episode of every process, as :meth:`EpisodeCollector.rollout` gives them."""
         entropy = np.random.SeedSequence([self._seed, self._rounds_played])
-        self.set_seed(int(entropy.generate_state(1)[0]))
         self._rounds = self._rounds or iter(self)
-        episodes = next(self._rounds).unbind(0)
+        try:
+            self.set_seed(int(entropy.generate_state(1)[0]))
+            episodes = next(self._rounds).unbind(0)
+        except (OSError, EOFError, ValueError) as error:
+            # Pipes and process handles of one that died fail in their own ways.
+            raise RuntimeError(
+                f"a worker process died ({type(error).__name__}: {error})."
+            ) from error
         self._rounds_played += 1
         return [episode.exclude("collector") for episode in episodes]
 
