@@ -3,6 +3,7 @@
 import contextlib
 import csv
 import json
+import math
 import os
 import subprocess
 import sys
@@ -48,6 +49,11 @@ def small(**settings):
     return ExperimentConfig(**{"task": PENDULUM, "compile": False, "test_episodes": 2, **settings})
 
 
+def known(row):
+    """A row of metrics without the clock's, and without what was not measured."""
+    return {k: v for k, v in row.items() if k != "frames_per_second" and not math.isnan(v)}
+
+
 @pytest.mark.parametrize("regularizer", [NoRegularizerConfig(), CAPSConfig(), L2C2Config()])
 @pytest.mark.parametrize("task", TASKS)
 def test_200_steps_of_every_task_with_every_regularizer(task, regularizer):
@@ -77,8 +83,7 @@ def test_the_same_seed_gives_the_same_numbers_and_another_seed_others():
     """Everything random hangs on the seed."""
 
     def numbers(seed):
-        row = Experiment(small(seed=seed)).train()[-1]
-        return {key: value for key, value in row.items() if key != "frames_per_second"}
+        return known(Experiment(small(seed=seed)).train()[-1])
 
     assert numbers(0) == numbers(0)
     assert numbers(0) != numbers(1)
@@ -120,6 +125,35 @@ def test_updates_follow_the_schedule():
     step.train()
     # From the step on that fills the first batch of 32.
     assert step.updates == 2 * (2 * 40 - 31)
+
+
+def test_the_replay_ratio_is_how_often_a_transition_is_drawn():
+    """updates = ratio * frames / batch after each episode; what is left over comes later."""
+    ratio = Experiment(small(algorithm=PPORPEConfig(replay_ratio=2.0)))
+    # 40 frames an episode, batches of 32: 2.5 updates each.
+    assert [row["updates"] for row in ratio.train()] == [2, 5]
+    with pytest.raises(ValueError, match="says how many updates follow an episode"):
+        PPORPEConfig(replay_ratio=2.0, updates=3)
+
+
+def test_late_policies_play_test_episodes_that_change_nothing_else():
+    """The last part of training has figures of the mean policy; without them all else is equal."""
+    task = replace(PENDULUM, episodes=4)
+    rows, others = (Experiment(small(task=task, late_share=share)).train() for share in (0.5, 0.0))
+    assert [math.isnan(row["test_return"]) for row in rows] == [True, True, False, False]
+    assert rows[2]["test_return"] != rows[3]["test_return"]
+    assert rows[3]["test_action_variation"] > 0.0
+    for row, other in zip(rows, others, strict=True):
+        measured = {key: value for key, value in row.items() if not key.startswith("test_")}
+        assert known(measured) == known(other)
+
+
+def test_the_policys_scale_is_logged():
+    """L2C2's distance is relative to it; a deterministic policy has none."""
+    row = Experiment(small()).train()[0]
+    assert 0.5 < row["policy_scale"] < 2.0  # 1 where the network's output is 0
+    td3 = small(algorithm=TD3Config(hidden=(8,)))
+    assert math.isnan(Experiment(td3).train()[0]["policy_scale"])
 
 
 def test_the_acting_policy_is_the_current_target():

@@ -58,6 +58,7 @@ class PPORPEConfig:
     num_heads: int = 5
     squish_b: float = 4.0
     schedule: str = "episode"
+    replay_ratio: float | None = None
     updates: int | None = None
     tau: float = 0.1
     nu: float = 1.0
@@ -69,6 +70,14 @@ class PPORPEConfig:
         _whole(self, "num_heads")
         if self.updates is not None:
             _whole(self, "updates")
+        if self.replay_ratio is not None:
+            _positive(self, "replay_ratio")
+            if self.updates is not None or self.schedule != "episode":
+                raise ValueError(
+                    f"{_where(self, 'replay_ratio')}={self.replay_ratio} says how many updates "
+                    "follow an episode: it needs schedule='episode' and updates=None, got "
+                    f"schedule={self.schedule!r} and updates={self.updates}."
+                )
 
 
 @dataclass(frozen=True)
@@ -308,6 +317,7 @@ class ExperimentConfig:
     compile: bool = True
     on_nonfinite: str = "stop"
     test_episodes: int = 100
+    late_share: float = 0.1
     checkpoint_interval: float = 60.0
     checkpoint_keep: int = 2
 
@@ -323,7 +333,9 @@ class ExperimentConfig:
             )
         _whole(self, "threads", "num_workers", "test_episodes", "checkpoint_keep")
         _check_rounds(self)
-        _nonnegative(self, "checkpoint_interval")
+        _nonnegative(self, "checkpoint_interval", "late_share")
+        if self.late_share > 1:
+            raise ValueError(f"late_share must be at most 1, got {self.late_share!r}.")
         _choice(self, "on_nonfinite", "stop", "skip")
         if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
             raise ValueError(f"seed must be a whole number of at least 0, got {self.seed!r}.")
@@ -387,6 +399,13 @@ def _nonnegative(config: object, *names: str) -> None:
         value = getattr(config, name)
         if not (math.isfinite(value) and value >= 0):
             raise ValueError(f"{_where(config, name)} must be at least 0, got {value!r}.")
+
+
+def _positive(config: object, *names: str) -> None:
+    for name in names:
+        value = getattr(config, name)
+        if not (math.isfinite(value) and value > 0):
+            raise ValueError(f"{_where(config, name)} must be greater than 0, got {value!r}.")
 
 
 def _whole(config: object, *names: str) -> None:

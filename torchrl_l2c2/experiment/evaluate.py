@@ -90,13 +90,20 @@ def evaluate_policy(
     )
     bar = tqdm(range(episodes), "test", unit="episode", disable=not progress, leave=False)
     for _ in bar:
-        episode = collector.rollout()
-        returns.append(episode["next", "reward"].sum().item())
-        variations.append(_variation(episode["action"]))
-        lengths.append(episode.shape[-1])
+        for values, value in zip(
+            (returns, variations, lengths), play_test_episode(collector), strict=True
+        ):
+            values.append(value)
         bar.set_postfix_str(f"return {statistics.fmean(returns):.1f}")
     collector.shutdown(close_env=False)
     return Evaluation(returns, variations, lengths)
+
+
+def play_test_episode(collector: EpisodeCollector) -> tuple[float, float, int]:
+    """Plays one episode; its return, its action variation and its length."""
+    episode = collector.rollout()
+    total = episode["next", "reward"].sum().item()
+    return total, _variation(episode["action"]), episode.shape[-1]
 
 
 def _variation(actions: torch.Tensor) -> float:

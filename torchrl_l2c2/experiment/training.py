@@ -40,7 +40,7 @@ from torchrl_l2c2.experiment.collection import EpisodeCollector, MultiEpisodeCol
 from torchrl_l2c2.experiment.compilation import compiler_available
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
-from torchrl_l2c2.experiment.evaluate import Evaluation, evaluate_policy
+from torchrl_l2c2.experiment.evaluate import Evaluation, evaluate_policy, play_test_episode
 from torchrl_l2c2.experiment.files import make_folder, write_atomically, write_json
 from torchrl_l2c2.experiment.metrics_log import MetricsLog
 from torchrl_l2c2.experiment.replay import ReplayUpdate, make_replay, scale_reward
@@ -100,6 +100,7 @@ class Experiment:
         self.updates = 0
         self.skipped_updates = 0
         self._first_update_seconds: float | None = None
+        self._late_tester: EpisodeCollector | None = None
         self._log = MetricsLog(self.folder, tensorboard=self.config.logger.name == "tensorboard")
         self._resume(resume)
         if self.folder is not None:
@@ -228,14 +229,14 @@ class Experiment:
             return
         episodes = self._collect()
         # Of the policy that played them: the updates come after the episodes.
-        variations = [self._action_variation(episode) for episode in episodes]
+        smoothness = [self._smoothness(episode) for episode in episodes]
         for episode in episodes:
             self.replay.extend(self._remembered(episode))
-        for episode, variation in zip(episodes, variations, strict=True):
+        for episode, measured in zip(episodes, smoothness, strict=True):
             self._count(episode)
             terms: list[torch.Tensor] = []
-            self._updates_after_episode(terms)
-            yield self._row(episode, variation, terms)
+            self._updates_after_episode(episode.numel(), terms)
+            yield self._row(episode, measured, terms)
 
     def _learn_by_step(self) -> dict[str, float]:
         """One episode with updates after every frame; its metrics."""
@@ -248,7 +249,7 @@ class Experiment:
             self.replay.extend(self._remembered(frame))
             self._replay_updates(self.config.algorithm.updates or 1, terms)
         episode = torch.cat(frames)
-        return self._row(episode, self._action_variation(episode), terms)
+        return self._row(episode, self._smoothness(episode), terms)
 
     def _count(self, batch: TensorDictBase) -> None:
         self.frames += batch.numel()
@@ -256,7 +257,7 @@ class Experiment:
             self.agent.exploration.step(batch.numel())
 
     def _row(
-        self, episode: TensorDictBase, variation: float, terms: list[torch.Tensor]
+        self, episode: TensorDictBase, smoothness: dict[str, float], terms: list[torch.Tensor]
     ) -> dict[str, float]:
         return {
             "episode": len(self.metrics) + 1,
@@ -264,8 +265,9 @@ class Experiment:
             "updates": self.updates,
             "skipped_updates": self.skipped_updates,
             "return": episode["next", "reward"].sum().item(),
-            "action_variation": variation,
+            **smoothness,
             "length": episode.numel(),
+            **self._late_test(),
             **self._mean_terms(terms),
         }
 
@@ -328,6 +330,8 @@ class Experiment:
     def close(self) -> None:
         """Ends the processes of ``num_workers``; the experiment cannot train any further."""
         self.collector.shutdown()
+        if self._late_tester is not None:
+            self._late_tester.shutdown()
 
     def _make_update(self) -> Callable[..., tuple[torch.Tensor, torch.Tensor | None] | None]:
         options = {"compile": self._compile, "skip_nonfinite": self.config.on_nonfinite == "skip"}
@@ -385,11 +389,20 @@ class Experiment:
             batch = self.agent.advantage(batch)
         return batch.select(*self.agent.loss.in_keys, strict=False)
 
-    def _updates_after_episode(self, terms: list[torch.Tensor]) -> None:
+    def _updates_per_episode(self, frames: int) -> int:
+        """As many as the settings say; fractions of an update are made up for later."""
+        algorithm, batch = self.config.algorithm, self.config.replay.batch_size
+        if algorithm.updates is not None:
+            return algorithm.updates
+        ratio = getattr(algorithm, "replay_ratio", None)
+        if ratio is None:
+            return len(self.replay) // batch
+        return int(ratio * self.frames / batch) - int(ratio * (self.frames - frames) / batch)
+
+    def _updates_after_episode(self, frames: int, terms: list[torch.Tensor]) -> None:
         algorithm = self.config.algorithm
         if algorithm.schedule == "episode":
-            one_pass = len(self.replay) // self.config.replay.batch_size
-            self._replay_updates(algorithm.updates or one_pass, terms)
+            self._replay_updates(self._updates_per_episode(frames), terms)
         elif len(self.replay) >= algorithm.frames:
             for _ in range(algorithm.epochs):
                 for batch in self.replay:
@@ -451,13 +464,44 @@ class Experiment:
         return f"Last good checkpoint: {paths[0] if paths else 'none was written yet'}."
 
     @torch.no_grad()
-    def _action_variation(self, episode: TensorDictBase) -> float:
-        """Of the policy's mean, at the states of an episode in which it explored."""
-        if episode.numel() < 2:
-            return 0.0
+    def _smoothness(self, episode: TensorDictBase) -> dict[str, float]:
+        """Of the policy's mean, at the states of an episode in which it explored.
+
+        With the mean scale of a stochastic policy: the Hellinger distance is relative to it, so a
+        policy can satisfy L2C2 by becoming wider.
+        """
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            mean = self.agent.policy(episode.select("observation"))["action"]
-        return action_variation(mean.float()).item()
+            written = self.agent.policy(episode.select("observation"))
+        mean, scale = written["action"].float(), written.get("scale", None)
+        return {
+            "action_variation": action_variation(mean).item() if len(mean) > 1 else 0.0,
+            "policy_scale": float("nan") if scale is None else scale.mean().item(),
+        }
+
+    def _late_test(self) -> dict[str, float]:
+        """One test episode of the policy as it is now, in the last part of training."""
+        row = {"test_return": float("nan"), "test_action_variation": float("nan")}
+        number, total = len(self.metrics) + 1, self.config.task.episodes
+        if number <= round(total * (1.0 - self.config.late_share)):
+            return row
+        # Seeded by its number, and outside the run's own randomness: whether and when it is played
+        # changes nothing else.
+        before = global_rng_state()
+        if self._late_tester is None:
+            self._late_tester = self._make_tester()
+        self._late_tester.set_seed(self.config.seed + TEST_SEED + number)
+        result = play_test_episode(self._late_tester)
+        set_global_rng_state(before)
+        return dict(zip(row, result[:2], strict=True))
+
+    def _make_tester(self) -> EpisodeCollector:
+        return EpisodeCollector(
+            make_env(self.config.task, self.config.seed + TEST_SEED),
+            self.agent.policy,
+            frames_per_batch=self.config.task.max_steps,
+            compile_policy=self._compile,
+            exploration_type=ExplorationType.DETERMINISTIC,
+        )
 
 
 def _state_of(part: Any) -> dict[str, Any] | None:
@@ -517,7 +561,7 @@ def finished_run(folder: str | Path, config: ExperimentConfig) -> FinishedRun | 
 
 
 # What may differ between a run and its continuation: it changes none of the numbers.
-FREE_SETTINGS = {"test_episodes", "threads", "checkpoint_interval", "checkpoint_keep"}
+FREE_SETTINGS = {"test_episodes", "late_share", "threads", "checkpoint_interval", "checkpoint_keep"}
 # More episodes are a longer run of the same kind.
 FREE_TASK_SETTINGS = {"episodes", "solved_at"}
 
