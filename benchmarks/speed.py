@@ -34,33 +34,27 @@ from tqdm import tqdm
 
 from benchmarks.timing import Row, alternate, machine, to_markdown, to_text
 from torchrl_l2c2.experiment import (
+    TASKS,
+    EpisodeCollector,
     Experiment,
     ExperimentConfig,
     L2C2Config,
+    MultiEpisodeCollector,
     NoRegularizerConfig,
     PPORPEConfig,
     PrioritizedReplayConfig,
+    SACConfig,
     TaskConfig,
     UniformReplayConfig,
     make_env,
 )
-from torchrl_l2c2.experiment.agents import make_agent, make_update
-from torchrl_l2c2.experiment.collection import EpisodeCollector, MultiEpisodeCollector
-from torchrl_l2c2.experiment.config import SACConfig
 from torchrl_l2c2.experiment.environments import quiet_output
-from torchrl_l2c2.experiment.replay import ReplayUpdate
+from torchrl_l2c2.experiment.folder import MetricsLog
+from torchrl_l2c2.experiment.update import ReplayUpdate, make_update
 from torchrl_l2c2.modules import make_actor
-from torchrl_l2c2.optim import AdaTerm
 from torchrl_l2c2.updaters import TSoftUpdate
 
-BULLET = "pybullet_envs_gymnasium"
 ROOT = Path(__file__).parent.parent
-TASKS = {
-    "swingup": TaskConfig(),
-    "reacher": TaskConfig("reacher", f"{BULLET}:ReacherBulletEnv-v0", max_steps=150),
-    "hopper": TaskConfig("hopper", f"{BULLET}:HopperBulletEnv-v0", noise_scale=0.001),
-    "ant": TaskConfig("ant", f"{BULLET}:AntBulletEnv-v0", noise_scale=0.001),
-}
 REGULARIZERS = {"vanilla": NoRegularizerConfig(), "l2c2": L2C2Config()}
 
 
@@ -195,7 +189,6 @@ def worker_rows(effort: Effort) -> Iterable[Row]:
 
 def _simulation(task: TaskConfig, collector: EpisodeCollector) -> Callable[[], int]:
     """As many frames as the collector's batch has, by the collector's own compiled policy."""
-    policy, action = collector._act, collector._policy_keys.index("action")
     with quiet_output():
         simulator = gymnasium.make(task.env_id, max_episode_steps=task.max_steps)
         observation, _ = simulator.reset()
@@ -205,7 +198,7 @@ def _simulation(task: TaskConfig, collector: EpisodeCollector) -> Callable[[], i
         nonlocal observation
         with set_exploration_type(ExplorationType.RANDOM):
             for _ in range(collector.frames_per_batch):
-                acted = policy(torch.as_tensor(observation, dtype=torch.float32))[action]
+                acted = collector.act(torch.as_tensor(observation, dtype=torch.float32))
                 observation, _, terminated, truncated, _ = simulator.step(acted.numpy())
                 if terminated or truncated:
                     observation, _ = simulator.reset()
@@ -221,16 +214,17 @@ def run_rows(effort: Effort) -> Iterable[Row]:
         run, parts = Experiment(config, folder), Experiment(config, Path(folder) / "parts")
         parts_episode = play_episode(parts)
         parts_episode()
-        learner, row = parts.update, parts.metrics[-1]
+        learner, row = parts.learner.update, parts.metrics[-1]
+        log = MetricsLog(Path(folder) / "parts", tensorboard=False)
         draw = learner.draw()
         priority = torch.rand(len(draw.index))
-        episode = parts.collector.rollout()
+        episode = parts.player.collector.rollout()
         frames = config.task.max_steps
         summed = {
-            "collect": lambda: parts.collector.rollout().numel(),
-            "store": lambda: parts.replay.extend(parts._remembered(episode)).numel(),
+            "collect": lambda: parts.player.collector.rollout().numel(),
+            "store": lambda: parts.learner.remember(episode) or frames,
             "learn": partial(_repeat, lambda: learner(True), frames),
-            "log": lambda: parts._log.write(row) or frames,
+            "log": lambda: log.write(row) or frames,
             "checkpoint": lambda: parts.save() and frames,
         }
         # What learning is made of: shown, but a loop of one of them alone flatters it.
@@ -431,11 +425,9 @@ def play_episode(experiment: Experiment) -> Callable[[], int]:
     """Training of one more episode, as a function; returns its frames."""
 
     def play() -> int:
-        config, before = experiment.config, experiment.frames
-        task = dataclasses.replace(config.task, episodes=len(experiment.metrics) + 1)
-        experiment.config = dataclasses.replace(config, task=task)
-        experiment.train()
-        return experiment.frames - before
+        before = experiment.player.frames
+        experiment.train(len(experiment.metrics) + 1)
+        return experiment.player.frames - before
 
     return play
 
@@ -451,22 +443,21 @@ def updates(
         compile=False,
     )
     experiment = Experiment(config)
-    replay = experiment.replay
-    replay.extend(experiment._remembered(experiment.collector.rollout()))
+    learner, agent = experiment.learner, experiment.agent
+    learner.remember(experiment.player.collector.rollout())
     if device == "cpu":
-        learner = ReplayUpdate(experiment.agent, replay, compile=compile)
-        draw = learner.draw()
-        return lambda: learner.update(True, *draw)
-    agent = make_agent(config, experiment.env)
+        update = ReplayUpdate(agent, learner.replay, compile=compile)
+        draw = update.draw()
+        return lambda: update.update(True, *draw)
     agent.loss.to(device)
-    agent.optimizer = AdaTerm(agent.loss.parameters())
+    agent.optimizer = config.optimizer.make(agent.loss.parameters())
     agent.target_updater = TSoftUpdate(agent.loss)
-    update = make_update(agent, compile=False)
+    step = make_update(agent, compile=False)
     if compile:
         torch._dynamo.config.trace_autograd_ops = True
-        update = torch.compile(update, fullgraph=True, mode="reduce-overhead")
-    batch = replay.sample().to(device)
-    return lambda: update(True, batch)
+        step = torch.compile(step, fullgraph=True, mode="reduce-overhead")
+    batch = learner.replay.sample().to(device)
+    return lambda: step(True, batch)
 
 
 def matrix_products(update: Callable[[], object]) -> partial[None]:

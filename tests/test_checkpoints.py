@@ -6,17 +6,15 @@ import struct
 import pytest
 import torch
 
-from torchrl_l2c2.experiment.checkpoints import (
+from torchrl_l2c2.experiment.folder import (
     FORMAT_VERSION,
     HEADER,
     MAGIC,
     CheckpointError,
-    global_rng_state,
     list_checkpoints,
     load_checkpoint,
     load_newest,
     save_checkpoint,
-    set_global_rng_state,
 )
 
 STATE = {"weights": torch.arange(100.0), "episode": 7, "names": ["a", "b"]}
@@ -127,20 +125,3 @@ def test_code_in_a_checkpoint_does_not_run(tmp_path):
     with pytest.raises(CheckpointError, match="content cannot be read"):
         load_checkpoint(path)
     assert not (tmp_path / "harm").exists()
-
-
-def test_global_generators_continue_where_they_were():
-    """Python's, NumPy's and PyTorch's next numbers."""
-    import random
-
-    import numpy as np
-
-    def draw():
-        return random.random(), np.random.rand(), torch.rand(()).item(), random.gauss(0, 1)
-
-    draw()
-    state = global_rng_state()
-    first = draw()
-    draw()
-    set_global_rng_state(state)
-    assert draw() == first

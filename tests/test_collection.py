@@ -17,8 +17,12 @@ from torchrl.envs import (
 )
 
 from torchrl_l2c2 import make_actor
-from torchrl_l2c2.experiment import TaskConfig, make_env
-from torchrl_l2c2.experiment.collection import EpisodeCollector, MultiEpisodeCollector
+from torchrl_l2c2.experiment import (
+    EpisodeCollector,
+    MultiEpisodeCollector,
+    TaskConfig,
+    make_env,
+)
 
 HOPPER = TaskConfig("hopper", "pybullet_envs_gymnasium:HopperBulletEnv-v0", noise_scale=0.001)
 

@@ -16,7 +16,6 @@ import torch
 from torchrl_l2c2 import make_actor
 from torchrl_l2c2.experiment import (
     AdamConfig,
-    AdaTermConfig,
     CAPSConfig,
     DQNConfig,
     Experiment,
@@ -32,8 +31,8 @@ from torchrl_l2c2.experiment import (
     UniformReplayConfig,
     make_env,
 )
+from torchrl_l2c2.experiment.player import SimulatorError, check_finite
 from torchrl_l2c2.experiment.reports import read_runs, table
-from torchrl_l2c2.experiment.training import SimulatorError, check_finite
 
 ROOT = Path(__file__).parent.parent
 TASKS = {
@@ -67,8 +66,8 @@ def test_200_steps_of_every_task_with_every_regularizer(task, regularizer):
         ExperimentConfig(task=config, regularizer=regularizer, compile=False, test_episodes=1)
     )
     metrics = experiment.train()
-    assert experiment.frames >= 200
-    assert experiment.updates > 0
+    assert experiment.player.frames >= 200
+    assert experiment.learner.updates > 0
     terms = {key for key in metrics[-1] if key.startswith("loss_")}
     added = {
         "none": set(),
@@ -120,11 +119,11 @@ def test_updates_follow_the_schedule():
     """One pass over the buffer after each episode, or so many after each step."""
     episode = Experiment(small())
     episode.train()
-    assert episode.updates == 40 // 32 + 80 // 32
+    assert episode.learner.updates == 40 // 32 + 80 // 32
     step = Experiment(small(algorithm=PPORPEConfig(schedule="step", updates=2)))
     step.train()
     # From the step on that fills the first batch of 32.
-    assert step.updates == 2 * (2 * 40 - 31)
+    assert step.learner.updates == 2 * (2 * 40 - 31)
 
 
 def test_the_replay_ratio_is_how_often_a_transition_is_drawn():
@@ -132,7 +131,7 @@ def test_the_replay_ratio_is_how_often_a_transition_is_drawn():
     ratio = Experiment(small(algorithm=PPORPEConfig(replay_ratio=2.0)))
     # 40 frames an episode, batches of 32: 2.5 updates each.
     assert [row["updates"] for row in ratio.train()] == [2, 5]
-    with pytest.raises(ValueError, match="says how many updates follow an episode"):
+    with pytest.raises(ValueError, match="replay_ratio and updates both say"):
         PPORPEConfig(replay_ratio=2.0, updates=3)
 
 
@@ -181,7 +180,7 @@ def test_nan_from_the_environment_stops_the_run_with_key_and_frame():
 
 def broken_after(experiment, frames, outcome):
     """Lets the simulator give (or raise) something else once so many frames were played."""
-    original, left = experiment.collector._gymnasium.step, [frames]
+    original, left = experiment.player.collector._gymnasium.step, [frames]
 
     def step(action):
         left[0] -= 1
@@ -192,7 +191,7 @@ def broken_after(experiment, frames, outcome):
         observation, _, *ends = original(action)
         return observation, outcome, *ends
 
-    experiment.collector._gymnasium.step = step
+    experiment.player.collector._gymnasium.step = step
 
 
 @pytest.mark.parametrize(
@@ -222,14 +221,14 @@ def test_a_batch_that_is_not_finite_can_be_skipped(entry):
     experiment = Experiment(small(on_nonfinite="skip"))
     experiment.train()
     before = [p.clone() for p in experiment.agent.loss.parameters()]
-    rows = experiment.replay.storage._storage[entry]
+    rows = experiment.learner.replay.storage._storage[entry]
     finite = rows.clone()
     rows.fill_(float("nan"))
-    assert experiment.update(True) is None
+    assert experiment.learner.update(True) is None
     after = experiment.agent.loss.parameters()
     assert all(torch.equal(a, b) for a, b in zip(before, after, strict=True))
     rows.copy_(finite)
-    assert experiment.update(True)[0].isfinite().all()
+    assert experiment.learner.update(True)[0].isfinite().all()
     assert experiment.metrics[-1]["skipped_updates"] == 0
 
 
@@ -244,26 +243,25 @@ def test_workers_play_rounds_that_are_learned_from_as_episodes(tmp_path):
         # Two passes over what the buffer holds after the round: 80 frames, then 160.
         assert [row["updates"] for row in rows] == [2, 4, 9, 14]
         assert len({row["return"] for row in rows}) == 4
-        experiment.config = replace(config, task=replace(task, episodes=6))
-        experiment.collector.procs[0].kill()
-        experiment.collector.procs[0].join()
+        experiment.player.collector.procs[0].kill()
+        experiment.player.collector.procs[0].join()
         message = r"Pendulum-v1 failed after frame 160.*Last good checkpoint: .*_0+4.pt"
         with pytest.raises(SimulatorError, match=message):
-            experiment.train()
+            experiment.train(6)
         assert len(experiment.metrics) == 4
 
 
 def test_a_loss_that_is_not_finite_stops_the_run_with_its_name(monkeypatch):
     """The term, the update and the frame."""
     experiment = Experiment(small())
-    original = experiment.update
+    original = experiment.learner.update
 
     def update(with_policy):
         values, priority = original(with_policy)
         values[1] = float("inf")
         return values, priority
 
-    experiment.update = update
+    experiment.learner.update = update
     with pytest.raises(FloatingPointError, match=r"loss_critic is inf at update 1 \(frame 40\)"):
         experiment.train()
 
@@ -292,7 +290,7 @@ def test_every_algorithm_learns_from_its_batches(name, regularizer):
     before = [p.clone() for p in experiment.agent.loss.parameters()]
     metrics = experiment.train()
     after = list(experiment.agent.loss.parameters())
-    assert experiment.updates > 0
+    assert experiment.learner.updates > 0
     assert all(p.isfinite().all() for p in after)
     assert all(not torch.equal(a, b) for a, b in zip(before, after, strict=True))
     added = {key for key in metrics[-1] if key.startswith("loss_l2c2")}
@@ -378,7 +376,7 @@ def test_in_a_sweep_a_failed_job_is_told_and_the_others_go_on(tmp_path):
     overrides = ("-m", *PENDULUM_OVERRIDES, "regularizer.sigma=-1,1", "hydra/launcher=basic")
     failed = run_train(*overrides, folder=tmp_path, check=False)
     assert failed.returncode == 1
-    assert "sigma must be finite and greater than 0" in failed.stderr
+    assert "sigma must be greater than 0, got -1" in failed.stderr
     (run,) = read_runs(tmp_path)
     written = (run.folder / "evaluation.json").stat().st_mtime_ns
     run_train(*overrides, folder=tmp_path, check=False)
@@ -389,7 +387,7 @@ def test_in_a_sweep_a_failed_job_is_told_and_the_others_go_on(tmp_path):
     ("overrides", "message"),
     [
         (["task=gymnasium", "task.env_id=Nowhere-v0"], "Nowhere-v0' is not a task that Gymnasium"),
-        (["regularizer.sigma=-1"], "sigma must be finite and greater than 0"),
+        (["regularizer.sigma=-1"], "sigma must be greater than 0, got -1"),
     ],
 )
 def test_a_wrong_setting_ends_with_one_clear_line(tmp_path, overrides, message):
@@ -406,10 +404,7 @@ def test_a_wrong_setting_ends_with_one_clear_line(tmp_path, overrides, message):
     ("settings", "message"),
     [
         ({"regularizer": L2C2Config(lambda_min=2.0)}, "lambda_max must be greater than"),
-        ({"regularizer": L2C2Config(beta=-0.1)}, "beta must be finite and at least 0, got -0.1"),
         ({"algorithm": PPORPEConfig(kappa=9.0)}, "kappa must be in"),
-        ({"regularizer": CAPSConfig(mean="median")}, "mean must be 'loc' or 'action'"),
-        ({"optimizer": AdaTermConfig(lr=-1.0)}, "lr must be finite and at least 0, got -1.0"),
         (
             {"task": TaskConfig("cartpole", "CartPole-v1")},
             "ppo_rpe needs continuous actions, this task's are OneHot",

@@ -1,5 +1,9 @@
-"""The settings: YAML and Python agree, and what cannot be is refused with what is allowed."""
+"""The settings: declared once, and what cannot be is refused with what is allowed."""
 
+import dataclasses
+import inspect
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -7,48 +11,96 @@ from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
-from torchrl_l2c2.experiment import ExperimentConfig, TaskConfig
-from torchrl_l2c2.experiment.config import GROUPS, SACConfig
+import torchrl_l2c2
+from torchrl_l2c2.experiment import (
+    AdamConfig,
+    CAPSConfig,
+    ExperimentConfig,
+    L2C2Config,
+    PPOConfig,
+    PPORPEConfig,
+    SACConfig,
+    TaskConfig,
+)
+from torchrl_l2c2.experiment.command import CONF, register
+from torchrl_l2c2.experiment.config import GROUPS
+from torchrl_l2c2.experiment.manual import manual, page
+from torchrl_l2c2.experiment.regularizers import REGULARIZERS
+from torchrl_l2c2.experiment.settings import SettingError, describe
+from torchrl_l2c2.experiment.tasks import TASKS
 
-CONF = Path(__file__).parent.parent / "conf"
+ROOT = Path(__file__).parent.parent
 
 
 def composed(*overrides):
-    """What `python train.py` composes; other tests store TorchRL's nodes under the same names."""
+    """What the command composes; other tests store TorchRL's nodes under the same names."""
     store = ConfigStore.instance()
     stored = store.repo
     store.repo = {name: nodes for name, nodes in stored.items() if name not in GROUPS}
     try:
+        register()
         with initialize_config_dir(str(CONF), version_base="1.3"):
             return OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
     finally:
         store.repo = stored
 
 
-def test_the_defaults_of_the_files_are_those_of_the_classes():
-    """A script without Hydra has the defaults of the command line."""
+def test_the_command_has_the_defaults_of_the_classes():
+    """A script without Hydra runs what `python train.py` runs."""
     assert ExperimentConfig.from_dict(composed()) == ExperimentConfig()
 
 
-@pytest.mark.parametrize(
-    ("group", "name"),
-    [(g, p.stem) for g in GROUPS for p in sorted((CONF / g).glob("*.yaml"))],
-)
-def test_every_file_of_every_group_is_a_valid_choice(group, name):
-    """The file's values are the class's defaults, but for a variant's own."""
+@pytest.mark.parametrize(("group", "name"), [(g, name) for g in GROUPS for name in GROUPS[g]])
+def test_every_choice_is_the_object_of_its_name(group, name):
+    """From the command line and from its name alone."""
     # The frames of one rollout are what on-policy learning alone can use.
     extra = ["algorithm=ppo"] if name == "rollout" else []
-    config = getattr(ExperimentConfig.from_dict(composed(f"{group}={name}", *extra)), group)
-    assert config.name == name
-    if name not in ("l2c2_policy",):
-        assert config == GROUPS[group][name](name=name)
+    config = ExperimentConfig.from_dict(composed(f"{group}={name}", *extra))
+    assert getattr(config, group) == GROUPS[group][name]
+    assert GROUPS[group][name].name == name
 
 
 @pytest.mark.parametrize("algorithm", GROUPS["algorithm"])
 def test_an_algorithm_brings_its_usual_replay_and_optimizer(algorithm):
-    """From the files as from the classes."""
+    """On the command line as in a script."""
     files = ExperimentConfig.from_dict(composed(f"algorithm={algorithm}"))
-    assert files == ExperimentConfig(algorithm=GROUPS["algorithm"][algorithm]())
+    assert files == ExperimentConfig(algorithm=GROUPS["algorithm"][algorithm])
+
+
+@pytest.mark.parametrize("name", REGULARIZERS)
+def test_a_partial_group_has_the_defaults_of_its_name(name):
+    """What is not given is the choice's, not the class's."""
+    read = ExperimentConfig.from_dict({"regularizer": {"name": name}}).regularizer
+    assert read == REGULARIZERS[name]
+
+
+def signature_defaults(component):
+    return {
+        name: parameter.default
+        for name, parameter in inspect.signature(component).parameters.items()
+        if parameter.default is not inspect.Parameter.empty
+    }
+
+
+@pytest.mark.parametrize(
+    ("settings", "component"),
+    [
+        (L2C2Config(), torchrl_l2c2.Neighborhood),
+        (L2C2Config(), torchrl_l2c2.L2C2Loss.__init__),
+        (CAPSConfig(), torchrl_l2c2.CAPSLoss.__init__),
+        (PPORPEConfig(), torchrl_l2c2.PPORPELoss),
+        (GROUPS["optimizer"]["adaterm"], torchrl_l2c2.AdaTerm),
+        (PPORPEConfig(), torchrl_l2c2.make_critic),
+    ],
+    ids=lambda value: getattr(value, "__qualname__", ""),
+)
+def test_settings_and_components_have_the_same_defaults(settings, component):
+    """The paper's values, whether a component is used alone or by the experiment."""
+    shared = signature_defaults(component).keys() & vars(settings).keys()
+    assert shared
+    assert {n: getattr(settings, n) for n in shared} == {
+        n: signature_defaults(component)[n] for n in shared
+    }
 
 
 @pytest.mark.parametrize("name", sorted(p.stem for p in (CONF / "experiment").glob("*.yaml")))
@@ -68,63 +120,91 @@ def test_every_comparison_is_made_of_valid_runs(name, regularizer):
     assert config.task.env_id == env_id
 
 
-@pytest.mark.parametrize("task", ["swingup", "reacher", "hopper", "ant"])
+@pytest.mark.parametrize("task", TASKS)
 def test_the_papers_tasks_have_the_papers_noise(task):
-    """Scale .01 for Swingup and Reacher, .001 for Hopper and Ant."""
-    config = ExperimentConfig.from_dict(composed(f"task={task}")).task
-    assert config.noise_scale == {"swingup": 0.01, "reacher": 0.01}.get(task, 0.001)
+    """Scale .01 for Swingup and Reacher, .001 for Hopper and Ant; none for what is not its own."""
+    expected = {"swingup": 0.01, "reacher": 0.01}.get(task, 0.001)
+    assert ExperimentConfig.from_dict(composed(f"task={task}")).task.noise_scale == expected
+    other = composed("task=gymnasium", "task.env_id=Pendulum-v1")
+    assert ExperimentConfig.from_dict(other).task.noise_scale == 0.0
 
 
-def test_every_key_of_every_file_has_a_comment():
-    """No setting without a word on what it is."""
-    bare = [
-        f"{path.relative_to(CONF)}: {line}"
-        for path in CONF.rglob("*.yaml")
-        for line in path.read_text().splitlines()
-        if line[:1].isalpha()
-        and not line.startswith(("name:", "defaults:", "hydra:"))
-        and "#" not in line
-    ]
-    assert bare == []
+def test_every_setting_says_what_it_is():
+    """In the help of the command and on the page of the docs, which is made of the same."""
+    text, written = " ".join(manual(10_000).split()), page()
+    for group, choices in {"": {"": ExperimentConfig()}, **GROUPS}.items():
+        for chosen in choices.values():
+            described = describe(type(chosen))
+            groups = {*GROUPS, "name"}
+            assert described.keys() == {
+                f.name for f in dataclasses.fields(chosen) if f.name not in groups
+            }
+            for name, (_, meaning) in described.items():
+                prefix = f"{group}." if group else ""
+                assert f"{prefix}{name}=" in text and " ".join(meaning.split()) in text
+                assert f"| `{prefix}{name}` |" in written
+    assert (ROOT / "docs" / "settings.md").read_text() == written, "write it anew"
+
+
+def test_settings_are_read_without_torch():
+    """So that help and errors come at once."""
+    code = (
+        "import sys, torchrl_l2c2.experiment.command as command; command.register()\n"
+        "from torchrl_l2c2.experiment import ExperimentConfig; ExperimentConfig()\n"
+        "assert not {'torch', 'torchrl', 'tensordict', 'gymnasium'} & sys.modules.keys()"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_settings_survive_a_round_trip():
     """What a run's folder holds can be read back."""
-    config = ExperimentConfig(task=TaskConfig(episodes=3), seed=7)
+    config = ExperimentConfig(task=TaskConfig(episodes=3), optimizer=AdamConfig(), seed=7)
     assert ExperimentConfig.from_dict(config.to_dict()) == config
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"task": {"episode": 3}}, "unknown setting task.episode; allowed here are task.env_id"),
-        ({"task": {"episodes": 0}}, "TaskConfig.episodes must be a whole number of at least 1"),
-        ({"task": {"noise_scale": -1.0}}, "noise_scale must be at least 0, got -1.0"),
+        ({"task": {"episode": 3}}, "task.episode is not a setting; here there are env_id, episode"),
+        ({"task": {"episodes": 0}}, "task.episodes must be greater than or equal to 1, got 0"),
+        ({"task": {"noise_scale": -1.0}}, "task.noise_scale must be greater than or equal to 0"),
         ({"regularizer": {"name": "lipsnet"}}, "regularizer.name must be one of .*'l2c2'"),
-        ({"algorithm": {"name": "ppo_rpe", "schedule": "now"}}, "schedule must be one of"),
-        ({"replay": {"name": "uniform", "capacity": 8}}, "capacity must be at least the batch"),
-        ({"seed": -1}, "seed must be a whole number of at least 0, got -1"),
-        ({"sed": 1}, "unknown setting sed"),
+        ({"regularizer": {"name": "caps", "mean": "median"}}, "mean must be 'loc' or 'action'"),
+        ({"algorithm": {"name": "ppo_rpe", "schedule": "now"}}, "schedule must be 'episode' or"),
+        ({"algorithm": {"name": "sac", "hidden": 100}}, "algorithm.hidden must be a list, got 100"),
+        ({"algorithm": {"name": "sac", "hidden": [0]}}, "algorithm.hidden must be greater than"),
+        ({"optimizer": {"name": "adam", "lr": "fast"}}, "optimizer.lr must be a valid number, got"),
+        ({"replay": {"name": "uniform", "capacity": 8}}, "replay.capacity must be at least the b"),
+        ({"seed": -1}, "seed must be greater than or equal to 0, got -1"),
+        ({"compile": 1}, "compile must be a valid boolean, got 1"),
+        ({"test_episodes": True}, "test_episodes must be a valid integer, got True"),
+        ({"sed": 1}, "sed is not a setting; here there are algorithm"),
     ],
 )
 def test_wrong_settings_are_refused_with_what_is_allowed(settings, message):
-    """The error names the setting, what was given and what is allowed."""
-    with pytest.raises(ValueError, match=message):
+    """One line names the setting, what was given and what is allowed."""
+    with pytest.raises(SettingError, match=message) as refused:
         ExperimentConfig.from_dict(settings)
+    assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"num_workers": 0}, "num_workers must be a whole number of at least 1, got 0"),
-        ({"num_workers": 3}, r"task.episodes=200 must be a multiple of num_workers=3.*use 198"),
+        ({"num_workers": 0}, "num_workers must be greater than or equal to 1, got 0"),
+        ({"num_workers": 3}, r"task.episodes must be a multiple of num_workers=3.*use 198"),
         (
             {"num_workers": 2, "algorithm": SACConfig()},
-            "algorithm.schedule=step updates after every frame",
+            "num_workers must be 1 with algorithm.schedule=step",
+        ),
+        ({"replay": GROUPS["replay"]["rollout"]}, "'rollout' is nothing that algorithm 'ppo_rpe'"),
+        (
+            {"algorithm": PPOConfig(), "replay": GROUPS["replay"]["uniform"]},
+            "'uniform' is nothing that algorithm 'ppo' can learn from",
         ),
     ],
 )
-def test_workers_that_cannot_share_the_episodes_are_refused(settings, message):
+def test_settings_that_do_not_go_together_are_refused(settings, message):
     """With what would be allowed."""
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(SettingError, match=message):
         ExperimentConfig(**settings)

@@ -15,13 +15,13 @@ from torchrl_l2c2.experiment import (
     NoRegularizerConfig,
     PPORPEConfig,
     PrioritizedReplayConfig,
+    SACConfig,
     TaskConfig,
     UniformReplayConfig,
 )
-from torchrl_l2c2.experiment.agents import make_update
-from torchrl_l2c2.experiment.checkpoints import replay_state
 from torchrl_l2c2.experiment.compilation import compiler_available
-from torchrl_l2c2.experiment.config import SACConfig
+from torchrl_l2c2.experiment.replay import replay_state
+from torchrl_l2c2.experiment.update import make_update
 
 logging.getLogger("torchrl").setLevel(logging.ERROR)
 
@@ -47,16 +47,16 @@ CASES = {
 
 def by_hand(experiment: Experiment) -> None:
     """An update with what the buffer gives."""
-    batch = experiment.replay.sample()
+    batch = experiment.learner.replay.sample()
     _, priority = make_update(experiment.agent, compile=False)(True, batch)
     assert all(parameter.grad is None for parameter in experiment.agent.loss.parameters())
-    experiment.replay.update_tensordict_priority(batch.set("td_error", priority))
+    experiment.learner.replay.update_tensordict_priority(batch.set("td_error", priority))
 
 
 def learned(experiment: Experiment) -> dict[str, torch.Tensor]:
     """Parameters and priorities."""
     found = {k: v.clone() for k, v in experiment.agent.loss.state_dict().items()}
-    sampler = replay_state(experiment.replay)["_sampler"]
+    sampler = replay_state(experiment.learner.replay)["_sampler"]
     return {**found, **({"priorities": sampler["_sum_tree"]} if "_sum_tree" in sampler else {})}
 
 
@@ -72,10 +72,11 @@ def same(found, expected, **tolerance):
 def test_an_update_is_what_sampling_updating_and_prioritizing_by_hand_gives(name):
     """To the bit: rows, weights, neighbors, and the priorities that decide the next rows."""
     results = []
-    for step in (lambda experiment: experiment.update(True), by_hand):
+    for step in (lambda experiment: experiment.learner.update(True), by_hand):
         experiment = Experiment(CASES[name])
         experiment.train()
         before = learned(experiment)
+        torch.manual_seed(0)  # SAC draws actions.
         for _ in range(5):
             step(experiment)
         results.append(learned(experiment))
@@ -87,15 +88,15 @@ def test_the_batch_has_the_entries_and_neighbors_that_the_buffer_gives():
     """Whatever the buffer's transform writes, at its own random numbers."""
     experiment = Experiment(PAPER)
     experiment.train()
-    update, state = experiment.update, experiment.state_dict()
-    expected = experiment.replay.sample()
+    update, state = experiment.learner.update, experiment.state_dict()
+    expected = experiment.learner.replay.sample()
     experiment.load_state_dict(state)
-    draw = experiment.update.draw()
-    assert experiment.update is not update
-    batch = experiment.update._read(*draw)
+    draw = experiment.learner.update.draw()
+    assert experiment.learner.update is not update
+    batch = experiment.learner.update.read(*draw)
     assert set(batch.keys(True, True)) == set(expected.keys(True, True))
     assert all(torch.equal(batch[key], expected[key]) for key in expected.keys(True, True))
-    (transform,) = experiment.replay.transform.transforms
+    (transform,) = experiment.learner.replay.transform.transforms
     assert isinstance(transform, NeighborTransform)
 
 
@@ -107,14 +108,14 @@ def test_compiled_it_learns_the_same_and_follows_what_may_change():
         experiment = Experiment(replace(PAPER, compile=compile))
         experiment.train()
         start, values = copy.deepcopy(experiment.state_dict()), []
-        values.append(experiment.update(True)[0])
+        values.append(experiment.learner.update(True)[0])
         experiment.agent.loss.l2c2_coeff = 100.0
-        values.append(experiment.update(True)[0])
-        values.append(experiment.update(False)[0])
+        values.append(experiment.learner.update(True)[0])
+        values.append(experiment.learner.update(False)[0])
         # Loading replaces the optimizer's tensors: a step that kept the old ones would go wrong.
         experiment.load_state_dict(start)
         experiment.agent.loss.l2c2_coeff = 1.0
-        values += [experiment.update(True)[0] for _ in range(3)]
+        values += [experiment.learner.update(True)[0] for _ in range(3)]
         seen.append((torch.stack(values), learned(experiment)))
     (compiled, ours), (eager, plain) = seen
     torch.testing.assert_close(compiled, eager, rtol=1e-3, atol=1e-4)

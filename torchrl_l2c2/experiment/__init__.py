@@ -1,51 +1,9 @@
-"""The paper's experiment, built from the components: needs the ``experiment`` extra."""
+"""The paper's experiment, built from the components: needs the ``experiment`` extra.
 
-import warnings
+The public names are listed, with the modules they live in, in ``__init__.pyi``; a module is
+imported when one of its names is first used, so that settings are read without waiting for torch.
+"""
 
-# `python -m` of a module that the package has imported itself is meant, and harmless here.
-warnings.filterwarnings("ignore", ".*found in sys.modules after import of package", RuntimeWarning)
+import lazy_loader
 
-from torchrl_l2c2.experiment.config import (  # noqa: E402
-    AdamConfig,
-    AdaTermConfig,
-    CAPSConfig,
-    DQNConfig,
-    ExperimentConfig,
-    L2C2Config,
-    LoggerConfig,
-    NoRegularizerConfig,
-    PPOConfig,
-    PPORPEConfig,
-    PrioritizedReplayConfig,
-    RolloutReplayConfig,
-    SACConfig,
-    TaskConfig,
-    TD3Config,
-    UniformReplayConfig,
-)
-from torchrl_l2c2.experiment.environments import make_env  # noqa: E402
-from torchrl_l2c2.experiment.evaluate import Evaluation, evaluate_policy  # noqa: E402
-from torchrl_l2c2.experiment.training import Experiment  # noqa: E402
-
-__all__ = [
-    "AdaTermConfig",
-    "AdamConfig",
-    "CAPSConfig",
-    "DQNConfig",
-    "Evaluation",
-    "Experiment",
-    "ExperimentConfig",
-    "L2C2Config",
-    "LoggerConfig",
-    "NoRegularizerConfig",
-    "PPOConfig",
-    "PPORPEConfig",
-    "PrioritizedReplayConfig",
-    "RolloutReplayConfig",
-    "SACConfig",
-    "TD3Config",
-    "TaskConfig",
-    "UniformReplayConfig",
-    "evaluate_policy",
-    "make_env",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

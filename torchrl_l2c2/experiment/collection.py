@@ -1,13 +1,9 @@
-"""Collecting at nearly the speed of the simulator: TorchRL's collectors with a plain inner loop."""
+"""Collecting at nearly the speed of the simulator: TorchRL's collector with a plain inner loop."""
 
 from __future__ import annotations
 
-import atexit
 import json
-import signal
-import weakref
 from collections.abc import Callable, Iterator
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +11,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.collectors import Collector
 from torchrl.envs import (
     Compose,
     EnvBase,
@@ -100,6 +96,10 @@ class EpisodeCollector(Collector):
         self._act = _on_tensors(policy, self._policy_keys, compile_policy)
         continuous = self._simulator.action_spec.dtype.is_floating_point
         self._to_action = Tensor.numpy if continuous else self._simulator.read_action
+
+    def act(self, observation: Tensor) -> Tensor:
+        """The policy's action at one observation, in the exploration type that is set."""
+        return self._act(observation)[self._policy_keys.index("action")]
 
     @torch.no_grad()
     def rollout(self) -> TensorDictBase:
@@ -196,152 +196,6 @@ class EpisodeCollector(Collector):
             },
             [len(steps)],
         )
-
-
-class MultiEpisodeCollector(MultiSyncCollector):
-    """An :class:`EpisodeCollector` in each of several processes, which play an episode at a time.
-
-    Episodes depend on the seed, the number of rounds played before and their place in the round,
-    not on how fast a process is: after :meth:`set_generator_state` they are the same again.
-
-    .. note:: The processes import the script that made them: as everywhere in multiprocessing, it
-        needs ``if __name__ == "__main__":`` around what it does. Notebooks do not.
-
-    Args:
-        create_env (callable): makes an environment as :class:`EpisodeCollector` takes it; pickled.
-        policy (TensorDictModule): reads ``"observation"``; its current parameters are sent to the
-            processes before every round.
-
-    Keyword Args:
-        num_workers (int): processes. More give more frames a second, up to the number of cores,
-            and play more episodes with one policy.
-        max_steps (int): frames of the longest episode.
-        seed (int): of all randomness in the processes, the policy's included. Default 0.
-        compile_policy (bool): as for :class:`EpisodeCollector`, in every process.
-        random_frames (int): rounds that begin before so many frames draw their actions from the
-            action's bounds. Default 0.
-        exploration_type (ExplorationType): default ``RANDOM``.
-
-    Raises:
-        RuntimeError: an environment or a policy failed in a process, or the process died.
-
-    Examples:
-        >>> from functools import partial
-        >>> from torchrl.envs import GymEnv
-        >>> from torchrl_l2c2 import make_actor
-        >>> create_env = partial(GymEnv, "Pendulum-v1", max_episode_steps=7)
-        >>> actor = make_actor(3, create_env().action_spec)
-        >>> collector = MultiEpisodeCollector(create_env, actor, num_workers=2, max_steps=7)
-        >>> [episode.shape for episode in collector.rollout()]
-        [torch.Size([7]), torch.Size([7])]
-        >>> collector.shutdown()
-    """
-
-    def __init__(
-        self,
-        create_env: Callable[[], EnvBase],
-        policy: TensorDictModule,
-        *,
-        num_workers: int,
-        max_steps: int,
-        seed: int = 0,
-        compile_policy: bool = False,
-        random_frames: int = 0,
-        exploration_type: ExplorationType = ExplorationType.RANDOM,
-    ) -> None:
-        # Python would wait for the processes to end before it ends itself.
-        self._at_exit = partial(_shut_down, weakref.ref(self))
-        atexit.register(self._at_exit)
-        self._seed = seed
-        self._rounds_played = 0
-        super().__init__(
-            [create_env] * num_workers,
-            policy,
-            frames_per_batch=max_steps * num_workers,
-            total_frames=-1,
-            init_random_frames=random_frames,
-            exploration_type=exploration_type,
-            collector_class=partial(_EpisodeWorker, compiled_policy=compile_policy),
-            init_fn=_leave_signals_to_parent,
-            update_at_each_batch=True,
-            use_buffers=False,
-            cat_results="stack",
-            auto_register_policy_transforms=False,
-        )
-        self._rounds: Iterator[TensorDictBase] | None = None
-
-    def shutdown(self, *args: Any, **kwargs: Any) -> None:
-        """Ends the processes; nothing can be collected any more."""
-        atexit.unregister(self._at_exit)
-        super().shutdown(*args, **kwargs)
-
-    def rollout(self) -> list[TensorDictBase]:
-        """One episode of every process, as :meth:`EpisodeCollector.rollout` gives them."""
-        entropy = np.random.SeedSequence([self._seed, self._rounds_played])
-        self._rounds = self._rounds or iter(self)
-        try:
-            self.set_seed(int(entropy.generate_state(1)[0]))
-            episodes = next(self._rounds).unbind(0)
-        except (OSError, EOFError, ValueError) as error:
-            # Pipes and process handles of one that died fail in their own ways.
-            raise RuntimeError(
-                f"a worker process died ({type(error).__name__}: {error})."
-            ) from error
-        self._rounds_played += 1
-        return [episode.exclude("collector") for episode in episodes]
-
-    def generator_state(self) -> dict[str, Any]:
-        """What the following episodes depend on, but for the policy."""
-        return {"rounds_played": self._rounds_played, "frames": self._frames}
-
-    def set_generator_state(self, state: dict[str, Any]) -> None:
-        """Restores what :meth:`generator_state` gave."""
-        self._rounds_played, self._frames = state["rounds_played"], state["frames"]
-
-
-class _EpisodeWorker(EpisodeCollector):
-    """What a process of :class:`MultiEpisodeCollector` runs."""
-
-    def __init__(
-        self,
-        create_env: Callable[[], EnvBase],
-        *,
-        policy_factory: Callable[[], TensorDictModule],
-        frames_per_batch: int,
-        exploration_type: ExplorationType,
-        compiled_policy: bool,
-        **_: Any,
-    ) -> None:
-        torch.set_num_threads(1)
-        super().__init__(
-            create_env(),
-            policy_factory(),
-            frames_per_batch=frames_per_batch,
-            compile_policy=compiled_policy,
-            exploration_type=exploration_type,
-        )
-        self._use_buffers = False
-
-    def reset(self, index: Tensor | None = None, **kwargs: Any) -> None:
-        """The next episode resets the simulator by itself."""
-        self._observation = None
-
-    def rollout(self) -> TensorDictBase:
-        # What the parent's message said: all of the round is random or none.
-        self._random_frames_left = self.frames_per_batch if self.init_random_frames > 0 else 0
-        episode = super().rollout()
-        # The parent counts frames by this entry.
-        return episode.set(("collector", "traj_ids"), torch.zeros(len(episode), dtype=torch.int64))
-
-
-def _shut_down(collector: weakref.ref[MultiEpisodeCollector]) -> None:
-    if (alive := collector()) is not None:
-        alive.shutdown(raise_on_error=False)
-
-
-def _leave_signals_to_parent() -> None:
-    """Ctrl-C reaches all processes; the parent lets the episodes end and saves them."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _parts(env: EnvBase) -> tuple[GymEnv, ObservationNoise | None]:

@@ -31,8 +31,6 @@ def compiled(function: Callable[..., Any], *, constant_closure: bool = False) ->
     Returns:
         Callable: the compiled function.
     """
-    # Without it the graph ends at the gradient, and the step is several small ones.
-    torch._dynamo.config.trace_autograd_ops = True
     # The sizes of the inputs are checked before the graph is chosen: once is enough.
     options: dict[str, Any] = {"fallback_random": True, "size_asserts": False}
     options["post_grad_custom_post_pass"] = _BiasesApart()
@@ -40,7 +38,28 @@ def compiled(function: Callable[..., Any], *, constant_closure: bool = False) ->
         options["guard_filter_fn"] = _only_arguments_of(function)
     # Every run of a sweep compiles the same code for objects of its own: counted together, they
     # would soon meet the limit of recompilations.
-    return torch.compile(function, fullgraph=True, isolate_recompiles=True, options=options)
+    return _tracing_gradients(
+        torch.compile(function, fullgraph=True, isolate_recompiles=True, options=options)
+    )
+
+
+def _tracing_gradients(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Lets Dynamo trace gradients while the function runs, which may be when it is compiled.
+
+    Without it the graph ends at the gradient, and the step is several small ones. The setting is
+    of the whole process: others find it as they left it.
+    """
+    config = torch._dynamo.config
+
+    def call(*args: Any) -> Any:
+        before = config.trace_autograd_ops
+        config.trace_autograd_ops = True
+        try:
+            return function(*args)
+        finally:
+            config.trace_autograd_ops = before
+
+    return call
 
 
 class _BiasesApart(CustomGraphPass):

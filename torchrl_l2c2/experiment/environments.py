@@ -13,7 +13,7 @@ import torch
 from torchrl.data import Bounded, Unbounded
 from torchrl.envs import EnvBase, GymEnv, TransformedEnv
 
-from torchrl_l2c2.experiment.config import TaskConfig
+from torchrl_l2c2.experiment.tasks import TaskConfig
 from torchrl_l2c2.transforms import ObservationNoise
 
 # Added to the seed of test episodes, so that they are not training episodes again.

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import statistics
 import sys
 from collections.abc import Iterable
@@ -19,6 +20,11 @@ from torchrl.envs import EnvBase, ExplorationType
 from tqdm import tqdm
 
 from torchrl_l2c2.experiment.collection import EpisodeCollector
+from torchrl_l2c2.experiment.config import ExperimentConfig
+from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
+from torchrl_l2c2.experiment.folder import load_newest
+from torchrl_l2c2.experiment.process import ProcessState
+from torchrl_l2c2.experiment.tasks import TaskConfig
 from torchrl_l2c2.metrics import action_variation
 
 
@@ -106,6 +112,55 @@ def play_test_episode(collector: EpisodeCollector) -> tuple[float, float, int]:
     return total, _variation(episode["action"]), episode.shape[-1]
 
 
+class LateTests:
+    """One test episode of a policy as it is now, for every policy late in training.
+
+    The mean over them is steadier than any number of test episodes of the last policy alone. An
+    episode is seeded by its number: whether and when others are played changes nothing.
+
+    Args:
+        task (TaskConfig): what is played.
+        seed (int): of the run.
+        policy (TensorDictModule): acts deterministically under ``ExplorationType.DETERMINISTIC``.
+        compile_policy (bool): whether to compile it.
+    """
+
+    def __init__(
+        self, task: TaskConfig, seed: int, policy: TensorDictModule, compile_policy: bool
+    ) -> None:
+        self._task, self._policy, self._compile = task, policy, compile_policy
+        self._seed = seed + TEST_SEED
+        self._collector: EpisodeCollector | None = None
+
+    def play(self, number: int) -> dict[str, float]:
+        """The figures of the test episode that belongs to a training episode's number."""
+        with ProcessState(self._seed, torch.get_num_threads()):
+            # Late, as most calls of a short training need none.
+            if self._collector is None:
+                self._collector = self._make_collector()
+            self._collector.set_seed(self._seed + number)
+            total, variation, _ = play_test_episode(self._collector)
+        return {"test_return": total, "test_action_variation": variation}
+
+    def none(self) -> dict[str, float]:
+        """The same entries where no episode is played."""
+        return {"test_return": math.nan, "test_action_variation": math.nan}
+
+    def close(self) -> None:
+        """Closes the environment."""
+        if self._collector is not None:
+            self._collector.shutdown()
+
+    def _make_collector(self) -> EpisodeCollector:
+        return EpisodeCollector(
+            make_env(self._task, self._seed),
+            self._policy,
+            frames_per_batch=self._task.max_steps,
+            compile_policy=self._compile,
+            exploration_type=ExplorationType.DETERMINISTIC,
+        )
+
+
 def _variation(actions: torch.Tensor) -> float:
     """Zero for an episode of a single step, which has no change of action."""
     return action_variation(actions.float()).item() if actions.shape[-2] > 1 else 0.0
@@ -124,17 +179,12 @@ def load_policy(folder: str | Path) -> tuple[TensorDictModule, EnvBase, int]:
         FileNotFoundError: the folder is not a run's, or holds neither a policy nor a checkpoint.
         CheckpointError: its checkpoints are damaged.
     """
-    from torchrl_l2c2.experiment.agents import make_agent
-    from torchrl_l2c2.experiment.checkpoints import load_newest
-    from torchrl_l2c2.experiment.config import ExperimentConfig
-    from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
-
     folder = Path(folder)
     if not (folder / "config.json").exists():
         raise FileNotFoundError(f"{str(folder)!r} is not the folder of a run: no config.json.")
     config = ExperimentConfig.from_dict(json.loads((folder / "config.json").read_text()))
     env = make_env(config.task, config.seed + TEST_SEED)
-    agent = make_agent(config, env)
+    agent = config.make_agent(env)
     if (folder / "policy.pt").exists():
         agent.policy.load_state_dict(torch.load(folder / "policy.pt", weights_only=True))
     elif newest := load_newest(folder):

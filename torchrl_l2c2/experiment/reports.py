@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torchrl_l2c2.experiment.files import write_atomically
+from torchrl_l2c2.experiment.folder import write_atomically
 
 # Kobayashi (2022), Table III: return and L2 norm of temporal actions, mean and (over 18 seeds)
 # standard deviation.
@@ -77,6 +77,16 @@ class FinishedRun:
             evaluation,
             metrics,
         )
+
+
+def finished_run(folder: str | Path, settings: dict[str, Any]) -> FinishedRun | None:
+    """The finished run of these very settings in a folder; ``None`` where there is none."""
+    folder = Path(folder)
+    if not (folder / "evaluation.json").exists():
+        return None
+    saved = json.loads((folder / "config.json").read_text())
+    # As JSON, where a tuple and a list are the same.
+    return FinishedRun.read(folder) if saved == json.loads(json.dumps(settings)) else None
 
 
 def read_runs(folder: str | Path) -> list[FinishedRun]:

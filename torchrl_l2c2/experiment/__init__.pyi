@@ -1,0 +1,38 @@
+from .algorithms import DQNConfig, PPOConfig, PPORPEConfig, SACConfig, TD3Config
+from .collection import EpisodeCollector
+from .config import ExperimentConfig, LoggerConfig
+from .environments import make_env
+from .evaluate import Evaluation, evaluate_policy, load_policy
+from .optimizers import AdamConfig, AdaTermConfig
+from .regularizers import CAPSConfig, L2C2Config, NoRegularizerConfig
+from .replay import PrioritizedReplayConfig, RolloutReplayConfig, UniformReplayConfig
+from .tasks import TASKS, TaskConfig
+from .training import Experiment
+from .workers import MultiEpisodeCollector
+
+__all__ = [
+    "TASKS",
+    "AdaTermConfig",
+    "AdamConfig",
+    "CAPSConfig",
+    "DQNConfig",
+    "EpisodeCollector",
+    "Evaluation",
+    "Experiment",
+    "ExperimentConfig",
+    "L2C2Config",
+    "LoggerConfig",
+    "MultiEpisodeCollector",
+    "NoRegularizerConfig",
+    "PPOConfig",
+    "PPORPEConfig",
+    "PrioritizedReplayConfig",
+    "RolloutReplayConfig",
+    "SACConfig",
+    "TD3Config",
+    "TaskConfig",
+    "UniformReplayConfig",
+    "evaluate_policy",
+    "load_policy",
+    "make_env",
+]

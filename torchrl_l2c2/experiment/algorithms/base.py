@@ -1,0 +1,84 @@
+"""What every algorithm's settings have in common."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, ClassVar
+
+from pydantic import Field
+
+from torchrl_l2c2.experiment.settings import SettingError
+
+if TYPE_CHECKING:
+    from torchrl.envs import EnvBase
+
+    from torchrl_l2c2.experiment.algorithms.agent import Agent
+    from torchrl_l2c2.experiment.optimizers import OptimizerConfig
+    from torchrl_l2c2.experiment.regularizers import RegularizerConfig
+
+Layers = tuple[Annotated[int, Field(ge=1)], ...]
+"""Neurons of hidden layers."""
+
+
+class AlgorithmConfig:
+    """Makes an agent; says what it usually learns from and with, and when.
+
+    Attributes:
+        usual_replay: name of the replay buffer that it comes with.
+        usual_optimizer: name of the optimizer that it comes with.
+    """
+
+    usual_replay: ClassVar[str] = "uniform"
+    usual_optimizer: ClassVar[str] = "adam"
+
+    name: str
+    gamma: float
+    reward_scale: float | None
+    schedule: str
+
+    def make_agent(
+        self, env: EnvBase, regularizer: RegularizerConfig, optimizer: OptimizerConfig
+    ) -> Agent:
+        """Builds the agent for an environment's observation and action.
+
+        Raises:
+            ValueError: a setting outside its range, or actions that the algorithm cannot take.
+        """
+        raise NotImplementedError
+
+    @property
+    def reward_factor(self) -> float:
+        """What rewards are multiplied with to be learned from."""
+        return 1.0 - self.gamma if self.reward_scale is None else self.reward_scale
+
+
+class OffPolicyConfig(AlgorithmConfig):
+    """An algorithm that learns from a replay buffer."""
+
+    replay_ratio: float | None
+    updates: int | None
+    random_frames: int = 0
+
+    def __post_init__(self) -> None:
+        if self.replay_ratio is not None and self.updates is not None:
+            raise SettingError(
+                "replay_ratio",
+                f"and updates both say how many updates there are: set one to None, got "
+                f"{self.replay_ratio} and {self.updates}.",
+            )
+
+    def updates_after(self, frames: int, last_frame: int, stored: int, batch_size: int) -> int:
+        """How many updates follow some frames.
+
+        Args:
+            frames (int): frames that were played.
+            last_frame (int): frames of the run up to and with them.
+            stored (int): transitions in the replay buffer.
+            batch_size (int): transitions that an update draws.
+        """
+        if self.updates is not None:
+            return self.updates
+        if self.replay_ratio is None:
+            return 1 if self.schedule == "step" else stored // batch_size
+        # A fraction of an update is made up for later.
+        each = self.replay_ratio / batch_size
+        return int(each * last_frame) - int(each * (last_frame - frames))

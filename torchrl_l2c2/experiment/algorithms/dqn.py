@@ -1,0 +1,87 @@
+"""Deep Q-learning."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+from pydantic import Field
+
+from torchrl_l2c2.experiment.algorithms.base import Layers, OffPolicyConfig
+from torchrl_l2c2.experiment.settings import settings
+
+if TYPE_CHECKING:
+    from torchrl.envs import EnvBase
+
+    from torchrl_l2c2.experiment.algorithms.agent import Agent
+    from torchrl_l2c2.experiment.optimizers import OptimizerConfig
+    from torchrl_l2c2.experiment.regularizers import RegularizerConfig
+
+
+@settings
+class DQNConfig(OffPolicyConfig):
+    """Double deep Q-learning, for discrete actions."""
+
+    name: str = "dqn"
+    gamma: float = Field(0.99, ge=0, lt=1, description="discount")
+    tau: float = Field(0.005, gt=0, le=1, description="pace of the target network")
+    epsilon_end: float = Field(0.05, ge=0, le=1, description="last share of random actions")
+    epsilon_frames: int = Field(10_000, ge=1, description="frames until that share is reached")
+    hidden: Layers = Field((120, 84), description="neurons of the hidden layers")
+    random_frames: int = Field(
+        1000, ge=0, description="frames with random actions, before learning starts"
+    )
+    reward_scale: float | None = Field(
+        1.0, description="factor on rewards while learning; null: 1 - gamma"
+    )
+    schedule: Literal["step", "episode"] = Field("step", description="when updates happen")
+    replay_ratio: float | None = Field(
+        None,
+        gt=0,
+        description="times that a transition is drawn on average, instead of updates: "
+        "ratio * frames / batch_size of them",
+    )
+    updates: int | None = Field(
+        1,
+        ge=1,
+        description="per step, or per episode; null: by the replay ratio, else one, or one pass "
+        "over the buffer",
+    )
+
+    def make_agent(
+        self, env: EnvBase, regularizer: RegularizerConfig, optimizer: OptimizerConfig
+    ) -> Agent:
+        from tensordict.nn import TensorDictSequential
+        from torch import nn
+        from torchrl.modules import EGreedyModule, QValueActor
+        from torchrl.objectives import DQNLoss, SoftUpdate
+
+        from torchrl_l2c2.experiment.algorithms.agent import Agent
+        from torchrl_l2c2.experiment.algorithms.networks import (
+            check_actions,
+            observation_size,
+            perceptron,
+            sharing,
+        )
+
+        check_actions(env, self.name, continuous=False)
+        spec = env.action_spec
+        network = perceptron(observation_size(env), spec.shape[-1], self.hidden, nn.ReLU)
+        values = QValueActor(network, spec=spec)
+        loss = DQNLoss(
+            values, action_space=spec, loss_function="l2", delay_value=True, double_dqn=True
+        )
+        loss.make_value_estimator(gamma=self.gamma)
+        loss = regularizer.wrap(loss)
+        greedy = EGreedyModule(
+            spec,
+            eps_init=1.0,
+            eps_end=self.epsilon_end,
+            annealing_num_steps=self.epsilon_frames,
+        )
+        return Agent(
+            loss,
+            policy=TensorDictSequential(sharing(values, loss.value_network_params), greedy),
+            optimizer=optimizer.make(loss.parameters()),
+            target_updater=SoftUpdate(loss, tau=self.tau),
+            exploration=greedy,
+        )

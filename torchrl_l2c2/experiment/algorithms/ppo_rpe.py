@@ -1,0 +1,114 @@
+"""PPO-RPE, the paper's algorithm."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+from pydantic import Field
+
+from torchrl_l2c2.experiment.algorithms.base import Layers, OffPolicyConfig
+from torchrl_l2c2.experiment.settings import settings
+
+if TYPE_CHECKING:
+    from torchrl.envs import EnvBase
+
+    from torchrl_l2c2.experiment.algorithms.agent import Agent
+    from torchrl_l2c2.experiment.optimizers import OptimizerConfig
+    from torchrl_l2c2.experiment.regularizers import RegularizerConfig
+
+
+@settings
+class PPORPEConfig(OffPolicyConfig):
+    """PPO-RPE with target networks, the paper's algorithm; (.5, .5, .999, .1) are its values."""
+
+    usual_replay: ClassVar[str] = "prioritized"
+    usual_optimizer: ClassVar[str] = "adaterm"
+
+    name: str = "ppo_rpe"
+    gamma: float = Field(0.99, ge=0, lt=1, description="discount")
+    kappa: float = Field(
+        0.5, gt=0, description="share of the largest ratio deviation that is allowed"
+    )
+    beta: float = Field(0.5, gt=0, lt=1, description="mixture of the relative density ratio")
+    decay: float = Field(0.999, ge=0, le=1, description="of the largest deviation, per update")
+    delta_min: float = Field(0.1, gt=0, le=1, description="lowest largest deviation")
+    threshold: Literal["max", "ema"] = Field(
+        "max", description="how the deviation is tracked [inferred: max]"
+    )
+    critic_weighting: Literal["ratio", "none"] = Field(
+        "ratio", description="weight of the value loss [inferred: ratio]"
+    )
+    baseline: Literal["stored", "target"] = Field(
+        "stored", description="likelihood that the ratio is taken to [inferred: stored]"
+    )
+    importance: Literal["max", "mean"] = Field(
+        "max",
+        description="what the weights of prioritized replay are divided by [inferred: max]",
+    )
+    acting_policy: Literal["target", "online"] = Field(
+        "target", description="which copy of the policy acts [inferred: target]"
+    )
+    reward_scale: float | None = Field(
+        None, description="factor on rewards while learning; null: 1 - gamma [inferred]"
+    )
+    squash: Literal["tanh", "none"] = Field(
+        "tanh", description="how actions are kept in their bounds [inferred: tanh]"
+    )
+    hidden: Layers = Field(
+        (100, 100), description="neurons of the hidden layers of both networks [paper]"
+    )
+    num_heads: int = Field(
+        5, ge=1, description="outputs of the value network; the value is their mean [paper]"
+    )
+    squish_b: float = Field(4.0, gt=0, description="bend of the Squish activation [inferred]")
+    schedule: Literal["episode", "step"] = Field(
+        "episode", description="when updates happen [inferred: after each episode]"
+    )
+    replay_ratio: float | None = Field(
+        None,
+        gt=0,
+        description="times that a transition is drawn on average, instead of updates: "
+        "ratio * frames / batch_size of them [inferred]",
+    )
+    updates: int | None = Field(
+        None,
+        ge=1,
+        description="per episode, or per step; null: by the replay ratio, else one pass over the "
+        "buffer, or one [inferred]",
+    )
+    tau: float = Field(
+        0.1, gt=0, le=1, description="t-soft update: pace of the target networks [paper]"
+    )
+    nu: float = Field(
+        1.0, gt=0, description="t-soft update: degrees of freedom; larger is less robust [paper]"
+    )
+
+    def make_agent(
+        self, env: EnvBase, regularizer: RegularizerConfig, optimizer: OptimizerConfig
+    ) -> Agent:
+        from torchrl_l2c2.experiment.algorithms.agent import Agent
+        from torchrl_l2c2.experiment.algorithms.networks import (
+            check_actions,
+            observation_size,
+            sharing,
+        )
+        from torchrl_l2c2.modules import make_actor, make_critic
+        from torchrl_l2c2.objectives import PPORPELoss
+        from torchrl_l2c2.updaters import TSoftUpdate
+
+        check_actions(env, self.name, continuous=True)
+        size, layers = observation_size(env), {"hidden": self.hidden, "squish_b": self.squish_b}
+        actor = make_actor(size, env.action_spec, squash=self.squash, **layers)
+        critic = make_critic(size, num_heads=self.num_heads, **layers)
+        passed = ("gamma", "kappa", "beta", "decay", "delta_min")
+        passed += ("threshold", "critic_weighting", "baseline", "importance")
+        loss = PPORPELoss(actor, critic, **{name: getattr(self, name) for name in passed})
+        loss = regularizer.wrap(loss)
+        acting = "target_actor_network" if self.acting_policy == "target" else "actor_network"
+        return Agent(
+            loss,
+            policy=sharing(loss.actor_network, getattr(loss, f"{acting}_params")),
+            optimizer=optimizer.make(loss.parameters()),
+            target_updater=TSoftUpdate(loss, tau=self.tau, nu=self.nu),
+            policy_terms=frozenset({"loss_actor"}),
+        )

@@ -1,0 +1,83 @@
+"""Soft actor-critic."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+from pydantic import Field
+
+from torchrl_l2c2.experiment.algorithms.base import Layers, OffPolicyConfig
+from torchrl_l2c2.experiment.settings import settings
+
+if TYPE_CHECKING:
+    from torchrl.envs import EnvBase
+
+    from torchrl_l2c2.experiment.algorithms.agent import Agent
+    from torchrl_l2c2.experiment.optimizers import OptimizerConfig
+    from torchrl_l2c2.experiment.regularizers import RegularizerConfig
+
+
+@settings
+class SACConfig(OffPolicyConfig):
+    """Soft actor-critic with a learned temperature."""
+
+    name: str = "sac"
+    gamma: float = Field(0.99, ge=0, lt=1, description="discount")
+    tau: float = Field(0.005, gt=0, le=1, description="pace of the target networks")
+    alpha_init: float = Field(1.0, gt=0, description="first temperature; it is learned")
+    hidden: Layers = Field((256, 256), description="neurons of the hidden layers of all networks")
+    random_frames: int = Field(
+        1000, ge=0, description="frames with random actions, before learning starts"
+    )
+    reward_scale: float | None = Field(
+        1.0, description="factor on rewards while learning; null: 1 - gamma"
+    )
+    schedule: Literal["step", "episode"] = Field("step", description="when updates happen")
+    replay_ratio: float | None = Field(
+        None,
+        gt=0,
+        description="times that a transition is drawn on average, instead of updates: "
+        "ratio * frames / batch_size of them",
+    )
+    updates: int | None = Field(
+        1,
+        ge=1,
+        description="per step, or per episode; null: by the replay ratio, else one, or one pass "
+        "over the buffer",
+    )
+
+    def make_agent(
+        self, env: EnvBase, regularizer: RegularizerConfig, optimizer: OptimizerConfig
+    ) -> Agent:
+        from torch import nn
+        from torchrl.objectives import SACLoss, SoftUpdate
+
+        from torchrl_l2c2.experiment.algorithms.agent import Agent
+        from torchrl_l2c2.experiment.algorithms.networks import (
+            action_value,
+            check_actions,
+            sharing,
+            tanh_normal_actor,
+        )
+
+        check_actions(env, self.name, continuous=True)
+        actor = tanh_normal_actor(env, self.hidden, nn.ReLU)
+        loss = SACLoss(
+            actor,
+            action_value(env, self.hidden),
+            num_qvalue_nets=2,
+            loss_function="l2",
+            alpha_init=self.alpha_init,
+            action_spec=env.action_spec,
+        )
+        loss.make_value_estimator(gamma=self.gamma)
+        # A buffer that is made when first read: in a compiled function it would be lost again.
+        loss.target_entropy  # noqa: B018
+        loss = regularizer.wrap(loss)
+        return Agent(
+            loss,
+            policy=sharing(actor, loss.actor_network_params),
+            optimizer=optimizer.make(loss.parameters()),
+            target_updater=SoftUpdate(loss, tau=self.tau),
+            policy_terms=frozenset({"loss_actor"}),
+        )

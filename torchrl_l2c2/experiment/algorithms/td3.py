@@ -1,0 +1,100 @@
+"""Twin delayed DDPG."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+from pydantic import Field
+
+from torchrl_l2c2.experiment.algorithms.base import Layers, OffPolicyConfig
+from torchrl_l2c2.experiment.settings import settings
+
+if TYPE_CHECKING:
+    from torchrl.envs import EnvBase
+
+    from torchrl_l2c2.experiment.algorithms.agent import Agent
+    from torchrl_l2c2.experiment.optimizers import OptimizerConfig
+    from torchrl_l2c2.experiment.regularizers import RegularizerConfig
+
+
+@settings
+class TD3Config(OffPolicyConfig):
+    """Twin delayed DDPG: a deterministic policy."""
+
+    name: str = "td3"
+    gamma: float = Field(0.99, ge=0, lt=1, description="discount")
+    tau: float = Field(0.005, gt=0, le=1, description="pace of the target networks")
+    exploration_noise: float = Field(
+        0.1, ge=0, description="standard deviation of the noise on actions, of half their range"
+    )
+    policy_noise: float = Field(
+        0.2, ge=0, description="of the noise on the target's actions, likewise"
+    )
+    noise_clip: float = Field(0.5, ge=0, description="largest such noise, likewise")
+    policy_delay: int = Field(2, ge=1, description="updates of the value per update of the policy")
+    hidden: Layers = Field((256, 256), description="neurons of the hidden layers of all networks")
+    random_frames: int = Field(
+        1000, ge=0, description="frames with random actions, before learning starts"
+    )
+    reward_scale: float | None = Field(
+        1.0, description="factor on rewards while learning; null: 1 - gamma"
+    )
+    schedule: Literal["step", "episode"] = Field("step", description="when updates happen")
+    replay_ratio: float | None = Field(
+        None,
+        gt=0,
+        description="times that a transition is drawn on average, instead of updates: "
+        "ratio * frames / batch_size of them",
+    )
+    updates: int | None = Field(
+        1,
+        ge=1,
+        description="per step, or per episode; null: by the replay ratio, else one, or one pass "
+        "over the buffer",
+    )
+
+    def make_agent(
+        self, env: EnvBase, regularizer: RegularizerConfig, optimizer: OptimizerConfig
+    ) -> Agent:
+        from tensordict.nn import TensorDictSequential
+        from torch import nn
+        from torchrl.modules import Actor, AdditiveGaussianModule, TanhModule
+        from torchrl.objectives import SoftUpdate, TD3Loss
+
+        from torchrl_l2c2.experiment.algorithms.agent import Agent
+        from torchrl_l2c2.experiment.algorithms.networks import (
+            action_value,
+            check_actions,
+            observation_size,
+            perceptron,
+            sharing,
+        )
+
+        check_actions(env, self.name, continuous=True)
+        spec = env.action_spec
+        network = perceptron(observation_size(env), spec.shape[-1], self.hidden, nn.ReLU)
+        squash = TanhModule(in_keys=["action"], out_keys=["action"], spec=spec)
+        actor = TensorDictSequential(Actor(network, out_keys=["action"]), squash)
+        half_range = ((spec.space.high - spec.space.low) / 2).max().item()
+        loss = TD3Loss(
+            actor,
+            action_value(env, self.hidden),
+            action_spec=spec,
+            num_qvalue_nets=2,
+            loss_function="l2",
+            policy_noise=self.policy_noise * half_range,
+            noise_clip=self.noise_clip * half_range,
+        )
+        loss.make_value_estimator(gamma=self.gamma)
+        loss = regularizer.wrap(loss)
+        sigma = self.exploration_noise * half_range
+        noise = AdditiveGaussianModule(spec, sigma_init=sigma, sigma_end=sigma)
+        return Agent(
+            loss,
+            policy=TensorDictSequential(sharing(actor, loss.actor_network_params), noise),
+            optimizer=optimizer.make(loss.parameters()),
+            target_updater=SoftUpdate(loss, tau=self.tau),
+            exploration=noise,
+            policy_terms=frozenset({"loss_actor"}),
+            policy_delay=self.policy_delay,
+        )

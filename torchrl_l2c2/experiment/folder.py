@@ -1,0 +1,243 @@
+"""Everything that a run writes and reads back: whole, noticing damage, and without running code.
+
+Checkpoints are a short header (magic, format version, SHA-256 of the rest) and then a
+``torch.save`` of tensors and plain values, which ``torch.load(weights_only=True)`` reads back.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import os
+import pickle
+import struct
+import tempfile
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch
+from torchrl.record.loggers.tensorboard import TensorboardLogger
+
+VERSIONED = ("torchrl-l2c2", "torch", "torchrl", "tensordict", "gymnasium", "pybullet", "numpy")
+MAGIC = b"torchrl_l2c2\n"
+FORMAT_VERSION = 1
+HEADER = struct.Struct(f"<{len(MAGIC)}sI32s")
+PATTERN = "checkpoint_*.pt"
+
+
+class CheckpointError(RuntimeError):
+    """A checkpoint that cannot be used, and why."""
+
+
+def versions() -> dict[str, str]:
+    """Versions of the packages that decide the numbers."""
+    found = {}
+    for name in VERSIONED:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def make_folder(path: str | Path) -> Path:
+    """Makes a folder that can be written to.
+
+    Raises:
+        OSError: where it cannot be made or written to; says which and what to do.
+    """
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise OSError(
+            f"the run's folder {str(folder)!r} cannot be written to ({error.strerror}); "
+            "choose another."
+        ) from error
+    return folder
+
+
+def write_atomically(path: str | Path, content: bytes) -> None:
+    """Writes a file whole or not at all: a temporary file, flushed to the disk, then renamed."""
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.partial")
+    try:
+        with open(temporary, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_json(path: str | Path, value: Any) -> None:
+    """Writes a value as indented JSON, whole or not at all."""
+    write_atomically(path, (json.dumps(value, indent=2) + "\n").encode())
+
+
+def save_checkpoint(folder: str | Path, episode: int, state: Mapping[str, Any], keep: int) -> Path:
+    """Writes a checkpoint, proves it readable, and only then removes the oldest ones.
+
+    Args:
+        folder (str or Path): where checkpoints lie.
+        episode (int): the number in the file's name; larger is newer.
+        state (Mapping): tensors and plain values, nested.
+        keep (int): how many of the newest stay, at least 1. Two survive a disk that damages one.
+
+    Raises:
+        OSError: it could not be written, or reads back differently; older ones are untouched.
+    """
+    content = io.BytesIO()
+    torch.save(dict(state), content)
+    payload = content.getvalue()
+    header = HEADER.pack(MAGIC, FORMAT_VERSION, hashlib.sha256(payload).digest())
+    path = Path(folder) / f"checkpoint_{episode:08d}.pt"
+    write_atomically(path, header + payload)
+    try:
+        _payload(path)
+    except CheckpointError as error:
+        path.unlink()
+        raise OSError(f"the checkpoint did not survive being written: {error}") from error
+    for old in list_checkpoints(folder)[keep:]:
+        old.unlink()
+    return path
+
+
+def load_checkpoint(path: str | Path) -> dict[str, Any]:
+    """Reads one checkpoint.
+
+    Raises:
+        CheckpointError: missing, empty, cut short, changed, or of another format version.
+    """
+    path = Path(path)
+    try:
+        return torch.load(io.BytesIO(_payload(path)), weights_only=True)
+    except (RuntimeError, EOFError, pickle.UnpicklingError) as error:
+        if isinstance(error, CheckpointError):
+            raise
+        raise CheckpointError(f"{path}: its content cannot be read ({error}).") from error
+
+
+def list_checkpoints(folder: str | Path) -> list[Path]:
+    """A folder's checkpoints, the newest first."""
+    return sorted(Path(folder).glob(PATTERN), reverse=True)
+
+
+def load_newest(folder: str | Path) -> tuple[Path, dict[str, Any], list[str]] | None:
+    """Reads the newest checkpoint that is whole.
+
+    Returns:
+        Its path, its state and a message for every newer one that was damaged; ``None`` where
+        the folder holds no checkpoint at all.
+
+    Raises:
+        CheckpointError: there are checkpoints, and all of them are damaged.
+    """
+    damaged: list[str] = []
+    for path in list_checkpoints(folder):
+        try:
+            return path, load_checkpoint(path), damaged
+        except CheckpointError as error:
+            damaged.append(str(error))
+    if damaged:
+        raise CheckpointError("no checkpoint can be read: " + " ".join(damaged))
+    return None
+
+
+def _payload(path: Path) -> bytes:
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be read ({error.strerror}).") from error
+    if len(content) < HEADER.size:
+        raise CheckpointError(f"{path}: is cut short, {len(content)} bytes are left.")
+    magic, found, digest = HEADER.unpack_from(content)
+    if magic != MAGIC:
+        raise CheckpointError(f"{path}: is not a checkpoint of torchrl_l2c2.")
+    if found != FORMAT_VERSION:
+        raise CheckpointError(
+            f"{path}: has format version {found}, this version of torchrl_l2c2 reads "
+            f"{FORMAT_VERSION}; use the version that wrote it (versions.json beside it)."
+        )
+    payload = content[HEADER.size :]
+    if hashlib.sha256(payload).digest() != digest:
+        raise CheckpointError(f"{path}: is damaged, its checksum differs.")
+    return payload
+
+
+def save_policy(policy: torch.nn.Module, path: str | Path) -> None:
+    """Writes the policy's ``state_dict``; read it with ``torch.load(path, weights_only=True)``."""
+    content = io.BytesIO()
+    torch.save({k: v.detach().clone() for k, v in policy.state_dict().items()}, content)
+    write_atomically(path, content.getvalue())
+
+
+class MetricsLog:
+    """Writes rows of numbers; a killed process leaves no half of a line.
+
+    Args:
+        folder (Path, optional): where ``metrics.csv`` (and the ``tensorboard`` folder) go;
+            ``None`` writes nothing.
+        tensorboard (bool): whether to write TensorBoard events as well.
+    """
+
+    def __init__(self, folder: Path | None, *, tensorboard: bool) -> None:
+        self.path = None if folder is None else folder / "metrics.csv"
+        self.columns: list[str] | None = None
+        self._tensorboard = None
+        if folder is not None and tensorboard:
+            self._tensorboard = TensorboardLogger("tensorboard", log_dir=str(folder))
+
+    def write(self, row: Mapping[str, float]) -> None:
+        """Adds one line; the first line fixes the columns.
+
+        Raises:
+            ValueError: the row's names differ from the first row's.
+        """
+        if self.path is None:
+            return
+        if self.columns is None:
+            self.columns = list(row)
+            self._write(self.columns, "wb")
+        if list(row) != self.columns:
+            raise ValueError(f"the metrics changed from {self.columns} to {list(row)}.")
+        self._write(row.values(), "ab")
+        if self._tensorboard is not None:
+            for name, value in row.items():
+                self._tensorboard.log_scalar(name, value, step=int(row["frames"]))
+
+    def state_dict(self) -> dict[str, Any]:
+        """How far the file goes."""
+        size = self.path.stat().st_size if self.columns is not None else 0
+        return {"columns": self.columns, "size": size}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Cuts off what was written after the state was taken, so that no line comes twice.
+
+        Raises:
+            ValueError: the file is shorter than it was.
+        """
+        self.columns = state["columns"]
+        if self.path is None or self.columns is None:
+            return
+        size = self.path.stat().st_size if self.path.exists() else 0
+        if size < state["size"]:
+            raise ValueError(
+                f"{self.path} has {size} bytes, the checkpoint was taken at {state['size']}: it "
+                "was changed since. Restore it, or choose another folder."
+            )
+        os.truncate(self.path, state["size"])
+
+    def _write(self, cells: Any, mode: str) -> None:
+        line = io.StringIO()
+        csv.writer(line, lineterminator="\n").writerow(cells)
+        # Unbuffered: one call of the system writes the whole line.
+        with open(self.path, mode, buffering=0) as file:
+            file.write(line.getvalue().encode())

@@ -1,0 +1,132 @@
+"""What is learned from: transitions are remembered, and updates made of them."""
+
+from __future__ import annotations
+
+import time
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.data import TensorDictReplayBuffer
+
+from torchrl_l2c2.experiment.algorithms.agent import Agent
+from torchrl_l2c2.experiment.update import ReplayUpdate, is_loss, make_update
+
+
+class Learner:
+    """Remembers transitions and updates an agent from them.
+
+    Args:
+        agent (Agent): what is updated, in place.
+        replay (TensorDictReplayBuffer): where transitions are kept.
+
+    Keyword Args:
+        reward_factor (float): what rewards are multiplied with when they are remembered.
+        on_policy (bool): whether updates go through all that is remembered, instead of drawing.
+        compile (bool): as for :func:`~.update.make_update`.
+        skip_nonfinite (bool): as for :func:`~.update.make_update`.
+
+    Attributes:
+        updates: gradient steps so far.
+        skipped_updates: batches that were not finite and changed nothing.
+        first_update_seconds: how long the first took, compilation included; ``None`` before it.
+    """
+
+    def __init__(
+        self,
+        agent: Agent,
+        replay: TensorDictReplayBuffer,
+        *,
+        reward_factor: float,
+        on_policy: bool,
+        compile: bool,
+        skip_nonfinite: bool,
+    ) -> None:
+        self.agent = agent
+        self.replay = replay
+        self.updates = 0
+        self.skipped_updates = 0
+        self.first_update_seconds: float | None = None
+        self._reward_factor = reward_factor
+        self._on_policy = on_policy
+        self._options = {"compile": compile, "skip_nonfinite": skip_nonfinite}
+        self._terms: list[torch.Tensor] = []
+        self.renew()
+
+    def renew(self) -> None:
+        """Makes the update anew: a compiled one is made for the tensors that were there."""
+        if self._on_policy:
+            self.update = make_update(self.agent, **self._options)
+        else:
+            self.update = ReplayUpdate(self.agent, self.replay, **self._options)
+
+    @torch.no_grad()
+    def remember(self, transitions: TensorDictBase) -> None:
+        """Keeps the entries that the loss reads, and no others: sampling copies every one."""
+        scaled = transitions["next", "reward"] * self._reward_factor
+        transitions = transitions.copy().set(("next", "reward"), scaled)
+        if self.agent.advantage is not None:
+            transitions = self.agent.advantage(transitions)
+        self.replay.extend(transitions.select(*self.agent.loss.in_keys, strict=False))
+
+    def learn(self, updates: int) -> None:
+        """Makes so many updates with batches from the replay buffer, once it holds one."""
+        if len(self.replay) < self.replay.batch_size:
+            return
+        for _ in range(updates):
+            self._update()
+
+    def learn_rollout(self, epochs: int) -> None:
+        """Goes so many times through all that is remembered, and forgets it."""
+        for _ in range(epochs):
+            for batch in self.replay:
+                self._update(batch)
+        self.replay.empty()
+
+    def _update(self, *batch: TensorDictBase) -> None:
+        with_policy = (self.updates + 1) % self.agent.policy_delay == 0
+        started = time.monotonic()
+        result = self.update(with_policy, *batch)
+        if self.first_update_seconds is None:
+            self.first_update_seconds = time.monotonic() - started
+        if result is None:
+            self.skipped_updates += 1
+            return
+        self.updates += 1
+        self._terms.append(result[0])
+
+    def report(self, last_frame: int) -> dict[str, float]:
+        """Means of every entry of the loss over the updates since the last report.
+
+        A ``share_*`` is the part that a term has of the sum of all terms' sizes: it says at a
+        glance whether a regularizer is on, and how much of the loss it is.
+
+        Args:
+            last_frame (int): frames that were played, for errors.
+
+        Raises:
+            FloatingPointError: an entry was NaN or infinite; names it, the update and the frame.
+        """
+        keys, terms = self.agent.loss.out_keys, self._terms
+        self._terms = []
+        if terms:
+            values = torch.stack(terms)
+            self._check_finite(values, last_frame)
+            values = values.mean(0)
+        else:
+            values = torch.full((len(keys),), float("nan"))
+        means = dict(zip(keys, values.tolist(), strict=True))
+        losses = {k: abs(v) for k, v in means.items() if is_loss(k)}
+        total = sum(losses.values())
+        shares = {
+            k.replace("loss", "share"): v / total if total else 0.0 for k, v in losses.items()
+        }
+        return {**means, **shares}
+
+    def _check_finite(self, values: torch.Tensor, last_frame: int) -> None:
+        bad = ~values.isfinite()
+        if bad.any():
+            step, column = bad.nonzero()[0].tolist()
+            raise FloatingPointError(
+                f"{self.agent.loss.out_keys[column]} is {values[step, column].item()} at update "
+                f"{self.updates - len(values) + step + 1} (frame {last_frame})."
+            )

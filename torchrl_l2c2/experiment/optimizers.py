@@ -1,0 +1,55 @@
+"""The optimizers that a run can choose from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from pydantic import Field
+
+from torchrl_l2c2.experiment.settings import settings
+
+if TYPE_CHECKING:
+    from torch.nn import Parameter
+    from torch.optim import Optimizer
+
+
+@settings
+class AdaTermConfig:
+    """The paper's optimizer, :class:`~torchrl_l2c2.AdaTerm`."""
+
+    name: str = "adaterm"
+    lr: float = Field(1e-3, ge=0, description="learning rate [paper]")
+    beta: float = Field(0.9, gt=0, lt=1, description="decay of the moments [paper]")
+    eps: float = Field(1e-5, gt=1.1e-19, description="smallest scale of a gradient [paper]")
+    nu_min: float = Field(
+        1.0, gt=0, description="fewest degrees of freedom; larger is less robust [paper]"
+    )
+
+    def make(self, parameters: Iterable[Parameter]) -> Optimizer:
+        """The optimizer of these parameters."""
+        from torchrl_l2c2.optim import AdaTerm
+
+        return AdaTerm(parameters, lr=self.lr, beta=self.beta, eps=self.eps, nu_min=self.nu_min)
+
+
+@settings
+class AdamConfig:
+    """Adam."""
+
+    name: str = "adam"
+    lr: float = Field(3e-4, ge=0, description="learning rate")
+    betas: tuple[float, float] = Field(
+        (0.9, 0.999), description="decay of the first and second moment, each in [0, 1)"
+    )
+    eps: float = Field(1e-8, ge=0, description="added to the denominator")
+
+    def make(self, parameters: Iterable[Parameter]) -> Optimizer:
+        """The optimizer of these parameters."""
+        import torch
+
+        return torch.optim.Adam(parameters, lr=self.lr, betas=self.betas, eps=self.eps)
+
+
+OptimizerConfig = AdaTermConfig | AdamConfig
+OPTIMIZERS: dict[str, OptimizerConfig] = {"adaterm": AdaTermConfig(), "adam": AdamConfig()}

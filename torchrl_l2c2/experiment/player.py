@@ -1,0 +1,127 @@
+"""What is played: episodes, checked and measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.envs import ExplorationType, set_exploration_type
+from torchrl.modules import EGreedyModule
+
+from torchrl_l2c2.experiment.algorithms.agent import Agent
+from torchrl_l2c2.experiment.collection import EpisodeCollector
+from torchrl_l2c2.experiment.workers import MultiEpisodeCollector
+from torchrl_l2c2.metrics import action_variation
+
+
+class SimulatorError(RuntimeError):
+    """The environment or the policy in it raised an error; the cause is chained."""
+
+
+@dataclass
+class Episode:
+    """An episode and what was measured of it.
+
+    Attributes:
+        transitions: of the whole episode, ``[T]``.
+        last_frame: frames of the run up to and with its last.
+        measures: return, smoothness of the policy's mean, length.
+        ends_round: whether no other episode was played with the same policy after it.
+    """
+
+    transitions: TensorDictBase
+    last_frame: int
+    measures: dict[str, float]
+    ends_round: bool = True
+
+
+class Player:
+    """Plays an agent's episodes, and measures and counts what is played.
+
+    Args:
+        collector (EpisodeCollector or MultiEpisodeCollector): plays.
+        agent (Agent): whose policy it plays.
+        env_id (str): for errors.
+
+    Attributes:
+        frames: played so far.
+    """
+
+    def __init__(
+        self, collector: EpisodeCollector | MultiEpisodeCollector, agent: Agent, env_id: str
+    ) -> None:
+        self.collector = collector
+        self.frames = 0
+        self._agent = agent
+        self._env_id = env_id
+
+    def play(self) -> list[Episode]:
+        """One episode of every process, all by the policy as it is now.
+
+        Raises:
+            FloatingPointError: NaN or infinity in what the environment gave.
+            SimulatorError: the environment failed.
+        """
+        last_frame, episodes = self.frames, []
+        for batch in self.step():
+            last_frame += batch.numel()
+            episodes.append(self.measured(batch, last_frame))
+        for earlier in episodes[:-1]:
+            earlier.ends_round = False
+        return episodes
+
+    def step(self) -> list[TensorDictBase]:
+        """What the collector gives next: episodes, or a frame of the one that is being played."""
+        first_frame = self.frames
+        try:
+            played = self.collector.rollout()
+            batches = played if isinstance(played, list) else [played]
+            for batch in batches:
+                check_finite(batch, self.frames)
+                self.frames += batch.numel()
+        except FloatingPointError:
+            self.frames = first_frame
+            raise
+        except Exception as error:
+            raise SimulatorError(
+                f"{self._env_id} failed after frame {self.frames}: {type(error).__name__}: {error}"
+            ) from error
+        if isinstance(self._agent.exploration, EGreedyModule):
+            self._agent.exploration.step(self.frames - first_frame)
+        return batches
+
+    @torch.no_grad()
+    def measured(self, transitions: TensorDictBase, last_frame: int) -> Episode:
+        """An episode with its return and, at its states, the smoothness of the policy's mean.
+
+        With the mean scale of a stochastic policy: the Hellinger distance is relative to it, so a
+        policy can satisfy L2C2 by becoming wider.
+        """
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            written = self._agent.policy(transitions.select("observation"))
+        mean, scale = written["action"].float(), written.get("scale", None)
+        measures = {
+            "return": transitions["next", "reward"].sum().item(),
+            "action_variation": action_variation(mean).item() if len(mean) > 1 else 0.0,
+            "policy_scale": float("nan") if scale is None else scale.mean().item(),
+            "length": transitions.numel(),
+        }
+        return Episode(transitions, last_frame, measures)
+
+
+def check_finite(batch: TensorDictBase, first_frame: int) -> None:
+    """Stops at the first NaN or infinity that the environment gave.
+
+    Raises:
+        FloatingPointError: names the key and the frame.
+    """
+    for key in ("observation", ("next", "observation"), ("next", "reward")):
+        bad = ~batch[key].isfinite()
+        if bad.any():
+            step = int(bad.flatten(1).any(1).nonzero()[0])
+            value = batch[key][step].flatten().tolist()
+            raise FloatingPointError(
+                f"{key} is not finite at frame {first_frame + step}: {value}. "
+                "The environment gave it; nothing was learned from this episode."
+            )

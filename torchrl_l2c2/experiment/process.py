@@ -1,0 +1,96 @@
+"""What belongs to the whole process, as one run has it, whatever else the process does."""
+
+from __future__ import annotations
+
+import json
+import random
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import torch
+
+_States = tuple[Any, Any, torch.Tensor]
+"""Of Python, of NumPy and of PyTorch."""
+
+
+class ProcessState:
+    """The global random generators and the number of threads, as a run of its own has them.
+
+    Within the context they are the run's; after it they are those of the process again. Networks
+    are initialized from the generators, policies sample from them.
+
+    Args:
+        seed (int): what the generators of Python, NumPy and PyTorch begin with.
+        threads (int): of PyTorch. Default 1.
+
+    Examples:
+        >>> import torch
+        >>> ours = ProcessState(seed=0)
+        >>> with ours:
+        ...     first = torch.rand(())
+        >>> _ = torch.rand(100)
+        >>> with ours:
+        ...     second = torch.rand(())
+        >>> generator = torch.Generator().manual_seed(0)
+        >>> both = [torch.rand((), generator=generator) for _ in range(2)]
+        >>> [first, second] == both
+        True
+    """
+
+    def __init__(self, seed: int, threads: int = 1) -> None:
+        self._threads = threads
+        outside = _states()
+        random.seed(seed)
+        np.random.seed(seed)
+        torch.manual_seed(seed)
+        self._inside = _states()
+        self._outside: _States | None = None  # While the context is not entered.
+        _set_states(outside)
+
+    def __enter__(self) -> None:
+        self._outside, self._outside_threads = _states(), torch.get_num_threads()
+        _set_states(self._inside)
+        torch.set_num_threads(self._threads)
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        assert self._outside is not None
+        self._inside = _states()
+        _set_states(self._outside)
+        torch.set_num_threads(self._outside_threads)
+        self._outside = None
+
+    def state_dict(self) -> dict[str, Any]:
+        """The generators' states, as tensors and text."""
+        now = self._inside if self._outside is None else _states()
+        python, (name, keys, *rest), state = now
+        return {
+            "python": json.dumps(python),
+            "numpy": json.dumps([name, keys.tolist(), *rest]),
+            "torch": state,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restores what :meth:`state_dict` gave."""
+        version, internal, gauss = json.loads(state["python"])
+        name, keys, *rest = json.loads(state["numpy"])
+        numpy = (name, np.array(keys, dtype=np.uint32), *rest)
+        self._inside = ((version, tuple(internal), gauss), numpy, state["torch"])
+        if self._outside is not None:
+            _set_states(self._inside)
+
+
+def _states() -> _States:
+    return random.getstate(), np.random.get_state(), torch.get_rng_state()
+
+
+def _set_states(states: _States) -> None:
+    random.setstate(states[0])
+    np.random.set_state(states[1])
+    torch.set_rng_state(states[2])

@@ -1,0 +1,37 @@
+"""CAPS, the paper's baseline."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+from pydantic import Field
+
+from torchrl_l2c2.experiment.regularizers.base import RegularizerConfig
+from torchrl_l2c2.experiment.settings import settings
+
+if TYPE_CHECKING:
+    from torchrl.objectives import LossModule
+
+
+@settings
+class CAPSConfig(RegularizerConfig):
+    """The baseline, :class:`~torchrl_l2c2.CAPSLoss`."""
+
+    name: str = "caps"
+    sigma: float = Field(
+        0.2, gt=0, description="standard deviation of the states compared with s [paper]"
+    )
+    lambda_temporal: float = Field(
+        0.01, ge=0, description="gain of the distance between s and s' [paper]"
+    )
+    lambda_spatial: float = Field(
+        0.05, ge=0, description="gain of the distance between s and its noisy copy [paper]"
+    )
+    mean: Literal["loc", "action"] = Field(
+        "loc", description="means compared before or after the squashing [inferred: loc]"
+    )
+
+    def wrap(self, loss: LossModule) -> LossModule:
+        from torchrl_l2c2.objectives import CAPSLoss
+
+        return CAPSLoss(loss, self.sigma, self.lambda_temporal, self.lambda_spatial, mean=self.mean)

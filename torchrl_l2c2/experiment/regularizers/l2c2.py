@@ -1,0 +1,63 @@
+"""L2C2, the paper's method."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pydantic import Field
+
+from torchrl_l2c2.experiment.regularizers.base import RegularizerConfig
+from torchrl_l2c2.experiment.settings import settings
+
+if TYPE_CHECKING:
+    import torch
+    from torchrl.objectives import LossModule
+
+    from torchrl_l2c2.neighborhood import Neighborhood
+    from torchrl_l2c2.transforms import NeighborTransform
+
+
+@settings
+class L2C2Config(RegularizerConfig):
+    """The paper's method, :class:`~torchrl_l2c2.L2C2Loss`."""
+
+    name: str = "l2c2"
+    sigma: float = Field(
+        1.0,
+        gt=0,
+        description="size of the neighborhood relative to the step from s to s' [paper]",
+    )
+    lambda_min: float = Field(
+        0.01, gt=0, description="gain at the edge of the neighborhood [paper]"
+    )
+    lambda_max: float = Field(1.0, gt=0, description="gain at its center [paper]")
+    beta: float = Field(
+        0.1,
+        ge=0,
+        description="gain of the value's regularization relative to the policy's [paper]",
+    )
+    num_samples: int = Field(1, ge=1, description="neighbors per transition [inferred: 1]")
+
+    @property
+    def neighborhood(self) -> Neighborhood:
+        """Where neighbors are drawn, for the loss and the transform alike."""
+        from torchrl_l2c2.neighborhood import Neighborhood
+
+        return Neighborhood(self.sigma, self.lambda_min, self.lambda_max)
+
+    def wrap(self, loss: LossModule) -> LossModule:
+        from torchrl_l2c2.objectives import L2C2Loss
+
+        return L2C2Loss(
+            loss,
+            neighborhood=self.neighborhood,
+            beta=self.beta,
+            num_samples=self.num_samples,
+        )
+
+    def transform(self, generator: torch.Generator) -> NeighborTransform:
+        from torchrl_l2c2.transforms import NeighborTransform
+
+        return NeighborTransform(
+            self.neighborhood, num_samples=self.num_samples, generator=generator
+        )

@@ -1,0 +1,215 @@
+"""One gradient step: rows, batch, loss, gradients, optimizer, targets; eager or compiled.
+
+Read from below: a :class:`ReplayUpdate` draws the rows of a batch, :func:`make_update` makes the
+step that learns from them, and the rows get their new priorities.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import TensorDictPrioritizedReplayBuffer, TensorDictReplayBuffer
+
+from torchrl_l2c2.experiment.algorithms.agent import Agent
+from torchrl_l2c2.experiment.compilation import compiled
+from torchrl_l2c2.optim import AdaTerm
+from torchrl_l2c2.transforms import NeighborTransform
+from torchrl_l2c2.updaters import TSoftUpdate
+
+Step = Callable[..., tuple[Tensor, Tensor | None] | None]
+"""A gradient step: the means of the loss's entries and new priorities, or ``None`` if skipped."""
+
+
+def is_loss(key: str) -> bool:
+    """Whether an entry of a loss's output is one of the terms that are summed."""
+    return key == "loss" or key.startswith("loss_")
+
+
+def make_update(
+    agent: Agent,
+    *,
+    compile: bool,
+    skip_nonfinite: bool = False,
+    read: Callable[..., TensorDictBase] | None = None,
+) -> Step:
+    """One gradient step as a function of a batch: loss, gradients, optimizer, target networks.
+
+    Args:
+        agent (Agent): what is updated, in place. Compiled, the step is made for the agent's tensors
+            and settings as they are at its first call: make another after replacing any.
+        compile (bool): whether to compile: with AdaTerm and the t-soft update the whole step is
+            one graph; with others, loss and gradients are.
+        skip_nonfinite (bool): whether a batch with a loss or gradient that is NaN or infinite
+            changes nothing and gives ``None``. The step is two graphs then.
+        read (Callable, optional): makes the batch of other things, as the first part of the graph.
+
+    Returns:
+        Callable: takes whether the policy is updated too, then the batch or what ``read`` makes it
+        of. Returns the means of ``agent.loss.out_keys``, in their order, as one tensor, and the
+        new priorities of the batch, if the loss gives any. Parameters have no ``grad`` after it.
+    """
+    parameters = [p for group in agent.optimizer.param_groups for p in group["params"]]
+    keys = agent.loss.out_keys
+
+    def differentiate(
+        with_policy: bool, *drawn: Any
+    ) -> tuple[Tensor, Tensor | None, tuple[Tensor | None, ...]]:
+        # A copy, as losses write into what they are given, some of it with a gradient.
+        batch = drawn[0].copy() if read is None else read(*drawn)
+        terms = agent.loss(batch)
+        priority = batch.get("td_error", None)
+        total = sum(
+            terms[key]
+            for key in keys
+            if is_loss(key) and (with_policy or key not in agent.policy_terms)
+        )
+        gradients = torch.autograd.grad(total, parameters, allow_unused=True)
+        values = torch.stack([terms[key].detach().float().mean() for key in keys])
+        return values, None if priority is None else priority.detach(), gradients
+
+    def apply(gradients: tuple[Tensor | None, ...]) -> None:
+        for parameter, gradient in zip(parameters, gradients, strict=True):
+            parameter.grad = gradient
+        if agent.max_grad_norm is not None:
+            torch.nn.utils.clip_grad_norm_(parameters, agent.max_grad_norm)
+        agent.optimizer.step()
+        if agent.target_updater is not None:
+            agent.target_updater.step()
+        # Kept, they would be outputs of the graph, and each output takes time.
+        for parameter in parameters:
+            parameter.grad = None
+
+    def update(with_policy: bool, *drawn: Any) -> tuple[Tensor, Tensor | None]:
+        values, priority, gradients = differentiate(with_policy, *drawn)
+        apply(gradients)
+        return values, priority
+
+    # torch's own optimizers and TorchRL's updaters break the graph.
+    compile = compile and agent.compilable
+    whole = isinstance(agent.optimizer, AdaTerm) and isinstance(agent.target_updater, TSoftUpdate)
+    if compile and whole and not skip_nonfinite:
+        return compiled(update, constant_closure=True)
+    if compile:
+        differentiate = compiled(differentiate, constant_closure=True)
+        apply = compiled(apply, constant_closure=True) if whole else apply
+    if not skip_nonfinite:
+        return update
+
+    def checked_update(with_policy: bool, *drawn: Any) -> tuple[Tensor, Tensor | None] | None:
+        values, priority, gradients = differentiate(with_policy, *drawn)
+        tensors = (values, *(g for g in gradients if g is not None))
+        if not all(bool(tensor.isfinite().all()) for tensor in tensors):
+            return None
+        apply(gradients)
+        return values, priority
+
+    return checked_update
+
+
+class Draw(NamedTuple):
+    """What was drawn for one update: everything that tells its batch from others.
+
+    Attributes:
+        stored: the storage's tensors, ``[capacity, ...]`` each.
+        index: rows of the batch, ``[B]``.
+        weight: importance weights, ``[B]``; ``None`` without priorities.
+        uniform: random numbers of the neighbors; ``None`` without these.
+    """
+
+    stored: tuple[Tensor, ...]
+    index: Tensor
+    weight: Tensor | None
+    uniform: Tensor | None
+
+
+class ReplayUpdate:
+    """Updates from a replay buffer: as ``sample``, update and ``update_tensordict_priority``.
+
+    The numbers are the same, to rounding where the update is compiled. But the batch is gathered
+    from the storage, and its neighbors are placed, within the update: compiled, they are a part of
+    its graph, which then costs next to nothing, whereas making the batch's TensorDicts takes about
+    as long as the rest of the update.
+
+    Args:
+        agent (Agent): what is updated, in place.
+        replay (TensorDictReplayBuffer): as :func:`make_replay` makes it.
+
+    Keyword Args:
+        compile (bool): as for :func:`make_update`.
+        skip_nonfinite (bool): as for :func:`make_update`.
+    """
+
+    def __init__(
+        self,
+        agent: Agent,
+        replay: TensorDictReplayBuffer,
+        *,
+        compile: bool,
+        skip_nonfinite: bool = False,
+    ) -> None:
+        self._replay = replay
+        self._prioritized = isinstance(replay, TensorDictPrioritizedReplayBuffer)
+        transforms = list(replay.transform.transforms)
+        self._neighbors: NeighborTransform | None = transforms[0] if transforms else None
+        self._source: TensorDictBase | None = None
+        self._names: tuple[NestedKey, ...] = ()
+        self._stored: tuple[Tensor, ...] = ()
+        self.update = make_update(
+            agent, compile=compile, skip_nonfinite=skip_nonfinite, read=self.read
+        )
+
+    def __call__(self, with_policy: bool) -> tuple[Tensor, Tensor | None] | None:
+        """One update, which sets the batch's priorities as well.
+
+        Args:
+            with_policy (bool): whether the policy is updated too.
+
+        Returns:
+            tuple: as the function that :func:`make_update` returns.
+        """
+        draw = self.draw()
+        result = self.update(with_policy, *draw)
+        if result is not None:
+            self.prioritize(draw.index, result[1])
+        return result
+
+    def draw(self) -> Draw:
+        """Draws the rows of a batch, and the random numbers for their neighbors."""
+        storage = self._replay.storage
+        if storage._storage is not self._source:
+            self._source = storage._storage
+            self._names, self._stored = zip(*self._source.items(True, True), strict=True)
+        index, info = self._replay.sampler.sample(storage, self._replay.batch_size)
+        uniform = None
+        if self._neighbors is not None:
+            near, count = self._neighbors.neighborhood, self._neighbors.num_samples
+            # Only the shape of the states counts: any rows will do.
+            states = self._source.get("observation")[: len(index)]
+            uniform = near.draw(states, count, self._neighbors.generator)
+        return Draw(self._stored, index, info.get("priority_weight"), uniform)
+
+    def prioritize(self, index: Tensor, priority: Tensor | None) -> None:
+        """Sets the priorities of rows, where the buffer has any."""
+        if self._prioritized and priority is not None:
+            self._replay.sampler.update_priority(index, priority, storage=self._replay.storage)
+
+    def read(
+        self,
+        stored: tuple[Tensor, ...],
+        index: Tensor,
+        weight: Tensor | None,
+        uniform: Tensor | None,
+    ) -> TensorDictBase:
+        """The batch that ``replay.sample`` would have given."""
+        batch = TensorDict(batch_size=index.shape)
+        for name, tensor in zip(self._names, stored, strict=True):
+            batch.set(name, tensor[index])
+        if weight is not None:
+            batch.set("priority_weight", weight)
+        if uniform is None:
+            return batch
+        return self._neighbors.place(batch, TensorDict({"observation": uniform}, index.shape))
