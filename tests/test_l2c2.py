@@ -28,6 +28,7 @@ from torchrl.modules import Actor, IndependentNormal, ProbabilisticActor, ValueO
 from torchrl.objectives import DDPGLoss, DiscreteSACLoss, DQNLoss, PPOLoss, SACLoss, TD3Loss
 
 from torchrl_l2c2 import L2C2Loss, Neighborhood, NeighborTransform, PPORPELoss
+from torchrl_l2c2.objectives.l2c2 import l2c2_penalty
 
 # epsilon = 1/4, lambda_pi = 1/4: the gain is 1 at distance 1/4 and 1/5 at distance 5/4.
 NEAR = Neighborhood(sigma=1.0, lambda_min=0.2, lambda_max=1.0)
@@ -176,6 +177,21 @@ class TestHandComputedNumbers:
         assert loss.l2c2_neighborhood.scale == pytest.approx(0.010101, rel=1e-4)
         assert loss.l2c2_beta.item() == pytest.approx(0.1)
         assert loss.l2c2_coeff.item() == 1.0
+
+
+class TestThePenalty:
+    """The equation, as a function of tensors."""
+
+    def test_it_is_the_mean_over_neighbors_of_gain_times_difference(self):
+        """K = 2 neighbors of two transitions: (1 * 2 + .5 * 4) / 2 and (.2 * 5 + 0) / 2."""
+        difference = torch.tensor([[2.0, 5.0], [4.0, 7.0]])
+        gain = torch.tensor([[1.0, 0.2], [0.5, 0.0]])
+        torch.testing.assert_close(l2c2_penalty(difference, gain), torch.tensor([2.0, 0.5]))
+
+    def test_agents_share_the_gain_of_their_team(self):
+        """Differences [K, B, agents] for gains [K, B]."""
+        found = l2c2_penalty(torch.tensor([[[1.0, 3.0]]]), torch.tensor([[0.5]]))
+        torch.testing.assert_close(found, torch.tensor([[0.5, 1.5]]))
 
 
 class TestAgainstALoop:
@@ -374,11 +390,11 @@ class TestNeighbors:
         """One draw serves the policy and the value function; alone, each draws its own."""
         draws = []
 
-        def sample(self, *args, original=Neighborhood.sample, **kwargs):
+        def draw(self, *args, original=Neighborhood.draw, **kwargs):
             draws.append(args)
             return original(self, *args, **kwargs)
 
-        monkeypatch.setattr(Neighborhood, "sample", sample)
+        monkeypatch.setattr(Neighborhood, "draw", draw)
         loss = L2C2Loss(DDPGLoss(deterministic_actor(), qvalue()))
         loss(transitions(4))
         assert len(draws) == 1
@@ -408,7 +424,7 @@ class TestConstruction:
     @pytest.mark.parametrize(
         ("settings", "error", "message"),
         [
-            ({"neighborhood": 1.0}, TypeError, "neighborhood must be a Neighborhood, got a float"),
+            ({"neighborhood": 1.0}, TypeError, r"neighborhood must be a Neighborhood, got 1\.0"),
             ({"num_samples": 0}, ValueError, "num_samples must be at least 1"),
             ({"num_samples": 1.5}, TypeError, "num_samples must be an integer"),
             ({"hellinger_samples": 0}, ValueError, "hellinger_samples must be at least 1"),
