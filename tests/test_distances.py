@@ -13,13 +13,13 @@ from tensordict.nn import CompositeDistribution
 from torch import distributions as d
 from torchrl import modules as rl
 
-from torchrl_l2c2 import distances, register_hellinger, squared_error, squared_hellinger
+from torchrl_l2c2 import affinities, register_hellinger, squared_error, squared_hellinger
 
 
 @pytest.fixture(autouse=True)
 def own_registry_and_seed(monkeypatch):
     """What a test registers or draws stays in it."""
-    monkeypatch.setattr(distances, "_LOG_AFFINITIES", dict(distances._LOG_AFFINITIES))
+    monkeypatch.setattr(affinities, "_LOG_AFFINITIES", dict(affinities._LOG_AFFINITIES))
     torch.manual_seed(0)
 
 

@@ -12,7 +12,7 @@ import torch
 from scipy.integrate import quad
 
 import torchrl_l2c2
-from torchrl_l2c2 import distances
+from torchrl_l2c2 import affinities
 
 FOLDER = Path(__file__).parents[1] / "docs"
 PAGES = sorted(path.name for path in FOLDER.glob("*.md"))
@@ -26,7 +26,7 @@ def run_blocks(page: Path) -> dict[str, Any]:
     text = page.read_text()
     namespace: dict[str, Any] = {"__name__": page.name}
     # What a page registers is not to reach other tests.
-    with patch.dict(distances._LOG_AFFINITIES):
+    with patch.dict(affinities._LOG_AFFINITIES):
         for block in BLOCK.finditer(text):
             if block["skip"] is None:
                 line = text.count("\n", 0, block.start("code"))

@@ -1,7 +1,8 @@
 # The public names and where they live: for type checkers, and for __init__.py, which imports a
 # name's module when the name is first used.
 from ._version import __version__
-from .distances import register_hellinger, squared_error, squared_hellinger
+from .affinities import register_hellinger
+from .distances import squared_error, squared_hellinger
 from .metrics import action_variation, local_lipschitz
 from .modules import Squish, make_actor, make_critic
 from .neighborhood import Neighborhood

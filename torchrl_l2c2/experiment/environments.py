@@ -7,14 +7,17 @@ import ctypes
 import os
 import sys
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import gymnasium
 import torch
 from torchrl.data import Bounded, Unbounded
 from torchrl.envs import EnvBase, GymEnv, TransformedEnv
 
-from torchrl_l2c2.experiment.tasks import TaskConfig
 from torchrl_l2c2.transforms import ObservationNoise
+
+if TYPE_CHECKING:
+    from torchrl_l2c2.experiment.tasks import TaskConfig
 
 # Added to the seed of test episodes, so that they are not training episodes again.
 TEST_SEED = 1_000_003

@@ -15,9 +15,12 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from torchrl_l2c2.experiment.folder import write_atomically
+from torchrl_l2c2.experiment.folder import write_atomically, write_json
+
+if TYPE_CHECKING:
+    from torchrl_l2c2.experiment.config import ExperimentConfig
 
 # Kobayashi (2022), Table III: return and L2 norm of temporal actions, mean and (over 18 seeds)
 # standard deviation.
@@ -77,6 +80,29 @@ class FinishedRun:
             evaluation,
             metrics,
         )
+
+
+def write_results(
+    folder: Path, config: ExperimentConfig, summary: dict[str, float], episodes: dict[str, Any]
+) -> FinishedRun:
+    """Writes what a finished run's folder holds beside its policy: test episodes and picture.
+
+    Args:
+        folder (Path): of the run.
+        config (ExperimentConfig): its settings.
+        summary (dict): means and standard deviations over test episodes.
+        episodes (dict): the figures of every one.
+
+    Returns:
+        FinishedRun: the folder, read back.
+    """
+    named = {group: getattr(config, group).name for group in ("task", "algorithm", "regularizer")}
+    run = {**named, "seed": config.seed, "solved_at": config.task.solved_at}
+    written = {"run": run, "summary": summary, "episodes": episodes}
+    write_json(folder / "evaluation.json", written)
+    finished = FinishedRun.read(folder)
+    draw_learning_curves([finished], folder / "learning_curves.png")
+    return finished
 
 
 def finished_run(folder: str | Path, settings: dict[str, Any]) -> FinishedRun | None:

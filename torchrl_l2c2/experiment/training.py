@@ -9,11 +9,9 @@ import time
 import warnings
 from collections.abc import Iterator
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-from torchrl_l2c2.experiment.collection import EpisodeCollector
 from torchrl_l2c2.experiment.compilation import compiler_available
 from torchrl_l2c2.experiment.config import ExperimentConfig, check_same_settings
 from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
@@ -35,10 +33,10 @@ from torchrl_l2c2.experiment.player import Episode, Player, SimulatorError
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.progress import Progress
 from torchrl_l2c2.experiment.replay import load_replay_state, replay_state
-from torchrl_l2c2.experiment.reports import FinishedRun, draw_learning_curves
+from torchrl_l2c2.experiment.reports import FinishedRun, write_results
 from torchrl_l2c2.experiment.schedules import SCHEDULES
 from torchrl_l2c2.experiment.signals import Interrupted, stop_on_signals
-from torchrl_l2c2.experiment.workers import MultiEpisodeCollector
+from torchrl_l2c2.experiment.workers import make_collector
 
 
 class Experiment:
@@ -99,7 +97,8 @@ class Experiment:
                 compile=self._compile,
                 skip_nonfinite=config.on_nonfinite == "skip",
             )
-            self.player = Player(self._make_collector(env), self.agent, config.task.env_id)
+            collector = make_collector(config, env, self.agent, compile=self._compile)
+            self.player = Player(collector, self.agent, config.task.env_id)
         self.metrics: list[dict[str, float]] = []
         self._late_tests = LateTests(config.task, config.seed, self.agent.policy, self._compile)
         self._log = MetricsLog(self.folder, tensorboard=config.logger.name == "tensorboard")
@@ -243,43 +242,12 @@ class Experiment:
         if self.folder is None:
             raise ValueError("this experiment has no folder to write to; give it one when made.")
         save_policy(self.agent.policy, self.folder / "policy.pt")
-        config = self.config
-        written = {
-            "run": {
-                "task": config.task.name,
-                "algorithm": config.algorithm.name,
-                "regularizer": config.regularizer.name,
-                "seed": config.seed,
-                "solved_at": config.task.solved_at,
-            },
-            "summary": result.summary(),
-            "episodes": asdict(result),
-        }
-        write_json(self.folder / "evaluation.json", written)
-        run = FinishedRun.read(self.folder)
-        draw_learning_curves([run], self.folder / "learning_curves.png")
-        return run
+        return write_results(self.folder, self.config, result.summary(), asdict(result))
 
     def close(self) -> None:
         """Ends the processes of ``num_workers``; the experiment cannot train any further."""
         self.player.collector.shutdown()
         self._late_tests.close()
-
-    def _make_collector(self, env: Any) -> EpisodeCollector | MultiEpisodeCollector:
-        config, policy = self.config, self.agent.policy
-        options: dict[str, Any] = {
-            # Modules that only explore take decisions that cannot be compiled.
-            "compile_policy": self._compile and self.agent.exploration is None,
-            "random_frames": getattr(config.algorithm, "random_frames", 0),
-        }
-        if config.num_workers > 1:
-            create_env = partial(make_env, config.task, config.seed)
-            options |= {"max_steps": config.task.max_steps, "seed": config.seed}
-            return MultiEpisodeCollector(
-                create_env, policy, num_workers=config.num_workers, **options
-            )
-        frames = 1 if config.algorithm.schedule == "step" else config.task.max_steps
-        return EpisodeCollector(env, policy, frames_per_batch=frames, **options)
 
     def _resume(self, elsewhere: str | Path | None) -> None:
         # The folder's own checkpoint first: the same command again continues what it began.

@@ -17,7 +17,32 @@ from torch import Tensor
 from torchrl.collectors import MultiSyncCollector
 from torchrl.envs import EnvBase, ExplorationType
 
+from torchrl_l2c2.experiment.algorithms.agent import Agent
 from torchrl_l2c2.experiment.collection import EpisodeCollector
+from torchrl_l2c2.experiment.config import ExperimentConfig
+from torchrl_l2c2.experiment.environments import make_env
+
+
+def make_collector(
+    config: ExperimentConfig, env: EnvBase, agent: Agent, *, compile: bool
+) -> EpisodeCollector | MultiEpisodeCollector:
+    """What plays a run's episodes: this process, or as many others as the settings say."""
+    options: dict[str, Any] = {
+        # Modules that only explore take decisions that cannot be compiled.
+        "compile_policy": compile and agent.exploration is None,
+        "random_frames": getattr(config.algorithm, "random_frames", 0),
+    }
+    if config.num_workers == 1:
+        frames = 1 if config.algorithm.schedule == "step" else config.task.max_steps
+        return EpisodeCollector(env, agent.policy, frames_per_batch=frames, **options)
+    return MultiEpisodeCollector(
+        partial(make_env, config.task, config.seed),
+        agent.policy,
+        num_workers=config.num_workers,
+        max_steps=config.task.max_steps,
+        seed=config.seed,
+        **options,
+    )
 
 
 class MultiEpisodeCollector(MultiSyncCollector):

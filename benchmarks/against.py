@@ -1,0 +1,100 @@
+"""Whether a change costs time: ``python -m benchmarks.against REVISION``.
+
+A process with this checkout and one with another revision take turns at the compiled update and at
+collecting, so that a machine's other work falls on both alike; prints the ratios of the medians.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+UPDATES, FRAMES = 200, 1000
+WORK = f"""
+import logging, sys, time
+import torch
+logging.getLogger("torchrl").setLevel(logging.ERROR)
+torch.set_num_threads(1)
+from benchmarks.speed import Effort, updates
+from torchrl_l2c2 import make_actor
+from torchrl_l2c2.experiment import TaskConfig, make_env
+from torchrl_l2c2.experiment.collection import EpisodeCollector
+
+update = updates(Effort(), 32, "l2c2", True)
+env = make_env(TaskConfig(), 0)
+actor = make_actor(env.observation_spec["observation"].shape[-1], env.action_spec)
+collector = EpisodeCollector(
+    env, actor, frames_per_batch={FRAMES}, stop_at_done=False, compile_policy=True
+)
+actions = {{"update": lambda: [update() for _ in range({UPDATES})], "collect": collector.rollout}}
+for action in actions.values():
+    action()
+print("ready", flush=True)
+for line in sys.stdin:
+    start = time.perf_counter()
+    actions[line.strip()]()
+    print(time.perf_counter() - start, flush=True)
+"""
+
+
+def start(tree: Path) -> subprocess.Popen[str]:
+    """A process with the code in a folder, once it is ready."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", WORK],
+        cwd=tree,
+        env={**os.environ, "PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    assert process.stdout is not None
+    while (line := process.stdout.readline()).strip() != "ready":
+        if not line:
+            sys.exit(f"the code in {tree} could not be measured.")
+    return process
+
+
+def turn(process: subprocess.Popen[str], action: str) -> float:
+    """Seconds of one turn."""
+    assert process.stdin is not None and process.stdout is not None
+    print(action, file=process.stdin, flush=True)
+    return float(process.stdout.readline())
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.against", description=__doc__)
+    parser.add_argument("revision", help="what to compare with: a commit, a tag or a branch")
+    parser.add_argument("--rounds", type=int, default=40, help="turns of each (default: 40)")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        other = Path(folder) / "other"
+        git = ["git", "-C", str(ROOT), "worktree"]
+        subprocess.run([*git, "add", "-q", "--detach", str(other), options.revision], check=True)
+        try:
+            ours, theirs = start(ROOT), start(other)
+            for action, units in (("update", UPDATES), ("collect", FRAMES)):
+                turns = [(turn(ours, action), turn(theirs, action)) for _ in range(options.rounds)]
+                medians = [
+                    1e6 * statistics.median(times) / units for times in zip(*turns, strict=True)
+                ]
+                ratio = statistics.median(a / b for a, b in turns)
+                print(
+                    f"{action}: {medians[0]:.1f} us here, {medians[1]:.1f} us at "
+                    f"{options.revision}; median of the turns' ratios {ratio:.3f}",
+                    flush=True,
+                )
+            for process in (ours, theirs):
+                process.communicate()
+        finally:
+            subprocess.run([*git, "remove", "--force", str(other)], check=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,87 @@
+"""The layout: files that can be seen whole, and imports that point one way."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parent.parent / "torchrl_l2c2"
+MODULES = {
+    ".".join(path.relative_to(PACKAGE).with_suffix("").parts): path
+    for path in PACKAGE.rglob("*.py")
+}
+# From the bottom up: a module imports from lines above its own alone.
+LAYERS = """
+_version _checks
+neighborhood affinities
+distances transforms metrics modules updaters optim.adaterm
+optim.__init__
+objectives.specialization objectives.evaluation objectives.shared_evaluation
+objectives.transitions objectives.relative_pearson
+objectives.regularized
+objectives.l2c2 objectives.caps objectives.ppo_rpe
+objectives.__init__
+trainers __init__
+experiment.settings experiment.compilation experiment.environments experiment.folder
+experiment.process experiment.progress experiment.signals experiment.optimizers
+experiment.tasks experiment.replay experiment.collection experiment.reports
+experiment.regularizers.base
+experiment.regularizers.none experiment.regularizers.caps experiment.regularizers.l2c2
+experiment.regularizers.__init__
+experiment.algorithms.agent experiment.algorithms.networks experiment.algorithms.base
+experiment.algorithms.ppo_rpe experiment.algorithms.sac experiment.algorithms.td3
+experiment.algorithms.dqn experiment.algorithms.ppo
+experiment.algorithms.__init__
+experiment.config
+experiment.workers
+experiment.evaluate experiment.update experiment.player experiment.manual
+experiment.learner
+experiment.schedules
+experiment.training
+experiment.command
+experiment.__init__
+experiment.__main__
+""".strip().splitlines()
+RANK = {module: rank for rank, line in enumerate(LAYERS) for module in line.split()}
+
+
+def imported(path: Path) -> set[str]:
+    """What a module imports of the package, functions' own imports among it; types' not."""
+    tree = ast.parse(path.read_text())
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING":
+            node.body = []
+    names = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("torchrl_l2c2."):
+            base = node.module.removeprefix("torchrl_l2c2.")
+            names.add(base if base in MODULES else f"{base}.__init__")
+    return names
+
+
+def test_every_module_has_a_place():
+    """A new file says in the list above where it stands."""
+    assert MODULES.keys() == RANK.keys()
+
+
+@pytest.mark.parametrize("module", sorted(MODULES))
+def test_imports_point_one_way(module):
+    """No circle, no arrow upward."""
+    upward = {name for name in imported(MODULES[module]) if RANK[name] >= RANK[module]}
+    assert not upward
+
+
+@pytest.mark.parametrize("module", sorted(MODULES))
+def test_files_are_short_enough_to_read(module):
+    """At most 350 lines, docstrings included."""
+    lines = len(MODULES[module].read_text().splitlines())
+    assert lines <= 350
+
+
+def test_only_the_experiment_needs_its_extra():
+    """Nothing else imports a simulator, a plotting library or, but for trainers, Hydra."""
+    foreign = ("hydra", "omegaconf", "gymnasium", "pybullet", "matplotlib", "pydantic", "tqdm")
+    for module, path in MODULES.items():
+        if not module.startswith("experiment.") and module != "trainers":
+            found = [line for line in path.read_text().splitlines() if "import" in line.split()[:3]]
+            assert not [line for line in found if any(name in line for name in foreign)], module
