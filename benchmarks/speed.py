@@ -217,7 +217,7 @@ def run_rows(effort: Effort) -> Iterable[Row]:
         learner, row = parts.learner.update, parts.metrics[-1]
         log = MetricsLog(Path(folder) / "parts", tensorboard=False)
         draw = learner.draw()
-        priority = torch.rand(len(draw.index))
+        priority = torch.rand(len(draw.rows))
         episode = parts.player.collector.rollout()
         frames = config.task.max_steps
         summed = {
@@ -232,7 +232,7 @@ def run_rows(effort: Effort) -> Iterable[Row]:
             "draw": partial(_repeat, learner.draw, frames),
             "update": partial(_repeat, lambda: learner.update(True, *draw), frames),
             "prioritize": partial(
-                _repeat, lambda: learner.prioritize(draw.index, priority), frames
+                _repeat, lambda: learner.prioritize(draw.rows, priority), frames
             ),
         }
         times = alternate(

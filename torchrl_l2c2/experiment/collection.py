@@ -154,7 +154,7 @@ class EpisodeCollector(Collector):
         if self._observation is not None:
             raise RuntimeError("an episode is being played; a run can be saved between episodes.")
         simulator = self._gymnasium.unwrapped.np_random.bit_generator.state
-        noise = None if self._noise is None else self._noise.generator.get_state()
+        noise = None if self._noise is None else self._noise.get_extra_state()
         return {
             "simulator": json.dumps(simulator),
             "noise": noise,
@@ -166,7 +166,7 @@ class EpisodeCollector(Collector):
         simulator = json.loads(state["simulator"])
         self._gymnasium.unwrapped.np_random.bit_generator.state = simulator
         if self._noise is not None:
-            self._noise.generator.set_state(state["noise"])
+            self._noise.set_extra_state(state["noise"])
         self._random_frames_left = state["random_frames_left"]
         self._observation = None
 
@@ -200,7 +200,7 @@ class EpisodeCollector(Collector):
 
 def _parts(env: EnvBase) -> tuple[GymEnv, ObservationNoise | None]:
     """The simulator and its noise."""
-    transforms: list = []
+    transforms: list[Transform] = []
     simulator = env
     if isinstance(env, TransformedEnv):
         transforms, simulator = list(_flat(env.transform)), env.base_env

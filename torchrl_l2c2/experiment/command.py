@@ -70,7 +70,8 @@ def _main(values: DictConfig) -> None:
         OtherRunError: "outputs=FOLDER chooses another folder.",
     }
     try:
-        run(ExperimentConfig.from_dict(OmegaConf.to_container(values, resolve=True)), values.resume)
+        plain: Any = OmegaConf.to_container(values, resolve=True)
+        run(ExperimentConfig.from_dict(plain), values.resume)
     except (ValueError, OSError, RuntimeError, FloatingPointError) as error:
         print(f"error: {error} {hints.get(type(error), '')}".rstrip(), file=sys.stderr)
         if HydraConfig.get().mode == RunMode.MULTIRUN:

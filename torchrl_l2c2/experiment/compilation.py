@@ -39,7 +39,10 @@ def compiled(function: Callable[..., Any], *, constant_closure: bool = False) ->
     # Every run of a sweep compiles the same code for objects of its own: counted together, they
     # would soon meet the limit of recompilations.
     return _tracing_gradients(
-        torch.compile(function, fullgraph=True, isolate_recompiles=True, options=options)
+        # The stubs do not know of isolate_recompiles.
+        torch.compile(  # type: ignore[call-overload]
+            function, fullgraph=True, isolate_recompiles=True, options=options
+        )
     )
 
 

@@ -64,41 +64,45 @@ class ExperimentConfig:
     task: TaskConfig = dataclasses.field(default_factory=lambda: TASKS["swingup"])
     algorithm: AlgorithmConfig = dataclasses.field(default_factory=PPORPEConfig)
     regularizer: RegularizerConfig = dataclasses.field(default_factory=L2C2Config)
-    replay: ReplayConfig | None = None
-    optimizer: OptimizerConfig | None = None
+    # Made of None below.
+    replay: ReplayConfig = None  # type: ignore[assignment]
+    optimizer: OptimizerConfig = None  # type: ignore[assignment]
     logger: LoggerConfig = dataclasses.field(default_factory=LoggerConfig)
-    seed: int = Field(0, ge=0, description="of everything that is random in the run")
+    seed: int = Field(default=0, ge=0, description="of everything that is random in the run")
     threads: int = Field(
-        1, ge=1, description="of PyTorch; the networks are too small to gain from more"
+        default=1, ge=1, description="of PyTorch; the networks are too small to gain from more"
     )
     num_workers: int = Field(
-        1,
+        default=1,
         ge=1,
         description="processes that play episodes, one each in a round with one policy; more than "
         "1 needs algorithm.schedule other than step",
     )
     compile: bool = Field(
-        True, description="torch.compile the update where a C++ compiler is found; false: eager"
+        default=True,
+        description="torch.compile the update where a C++ compiler is found; false: eager",
     )
     on_nonfinite: Literal["stop", "skip"] = Field(
-        "stop",
+        default="stop",
         description="what a batch whose loss or gradient is NaN or infinite does (skipped ones are "
         "counted)",
     )
     test_episodes: int = Field(
-        100, ge=1, description="episodes played with the policy's mean after training"
+        default=100, ge=1, description="episodes played with the policy's mean after training"
     )
     late_share: float = Field(
-        0.1,
+        default=0.1,
         ge=0,
         le=1,
         description="last part of training, of 1, whose every policy plays one test episode; 0: "
         "none",
     )
     checkpoint_interval: float = Field(
-        60.0, ge=0, description="seconds between checkpoints, at the ends of episodes"
+        default=60.0, ge=0, description="seconds between checkpoints, at the ends of episodes"
     )
-    checkpoint_keep: int = Field(2, ge=1, description="newest checkpoints that stay in the folder")
+    checkpoint_keep: int = Field(
+        default=2, ge=1, description="newest checkpoints that stay in the folder"
+    )
 
     def __post_init__(self) -> None:
         # Frozen: this is how a default that depends on another field is set.
@@ -177,7 +181,7 @@ class ExperimentConfig:
 
 def _read_group(group: str, values: Mapping[str, Any]) -> Any:
     """The settings of a group that a mapping's ``name`` chooses, with its other values."""
-    choices, name = GROUPS[group], values.get("name")
+    choices, name = GROUPS[group], str(values.get("name"))
     if name in choices:
         return read(partial(dataclasses.replace, choices[name]), values, group)
     if group == "task":  # Any name will do for a task of one's own.

@@ -49,7 +49,7 @@ def make_env(task: TaskConfig, seed: int) -> EnvBase:
         ) from error
     _check_spaces(env, task)
     env.set_seed(seed)
-    if task.noise_scale == 0:
+    if not task.noise_scale:
         return env
     generator = torch.Generator().manual_seed(seed)
     return TransformedEnv(env, ObservationNoise(task.noise_scale, generator=generator))

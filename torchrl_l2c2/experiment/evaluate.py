@@ -86,7 +86,9 @@ def evaluate_policy(
     """
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}.")
-    returns, variations, lengths = [], [], []
+    returns: list[float] = []
+    variations: list[float] = []
+    lengths: list[int] = []
     collector = EpisodeCollector(
         env,
         policy,
@@ -96,10 +98,10 @@ def evaluate_policy(
     )
     bar = tqdm(range(episodes), "test", unit="episode", disable=not progress, leave=False)
     for _ in bar:
-        for values, value in zip(
-            (returns, variations, lengths), play_test_episode(collector), strict=True
-        ):
-            values.append(value)
+        total, variation, length = play_test_episode(collector)
+        returns.append(total)
+        variations.append(variation)
+        lengths.append(length)
         bar.set_postfix_str(f"return {statistics.fmean(returns):.1f}")
     collector.shutdown(close_env=False)
     return Evaluation(returns, variations, lengths)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torchrl.data import TensorDictReplayBuffer
 
 from torchrl_l2c2.experiment.algorithms.agent import Agent
-from torchrl_l2c2.experiment.update import ReplayUpdate, is_loss, make_update
+from torchrl_l2c2.experiment.update import ReplayUpdate, Step, is_loss, make_update
 
 
 class Learner:
@@ -48,16 +49,19 @@ class Learner:
         self.first_update_seconds: float | None = None
         self._reward_factor = reward_factor
         self._on_policy = on_policy
-        self._options = {"compile": compile, "skip_nonfinite": skip_nonfinite}
+        self._compile = compile
+        self._skip_nonfinite = skip_nonfinite
         self._terms: list[torch.Tensor] = []
         self.renew()
 
     def renew(self) -> None:
         """Makes the update anew: a compiled one is made for the tensors that were there."""
-        if self._on_policy:
-            self.update = make_update(self.agent, **self._options)
-        else:
-            self.update = ReplayUpdate(self.agent, self.replay, **self._options)
+        how: Any = {"compile": self._compile, "skip_nonfinite": self._skip_nonfinite}
+        self.update: Step = (
+            make_update(self.agent, **how)
+            if self._on_policy
+            else ReplayUpdate(self.agent, self.replay, **how)
+        )
 
     @torch.no_grad()
     def remember(self, transitions: TensorDictBase) -> None:

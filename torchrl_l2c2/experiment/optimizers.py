@@ -19,11 +19,11 @@ class AdaTermConfig:
     """The paper's optimizer, :class:`~torchrl_l2c2.AdaTerm`."""
 
     name: str = "adaterm"
-    lr: float = Field(1e-3, ge=0, description="learning rate [paper]")
-    beta: float = Field(0.9, gt=0, lt=1, description="decay of the moments [paper]")
-    eps: float = Field(1e-5, gt=1.1e-19, description="smallest scale of a gradient [paper]")
+    lr: float = Field(default=1e-3, ge=0, description="learning rate [paper]")
+    beta: float = Field(default=0.9, gt=0, lt=1, description="decay of the moments [paper]")
+    eps: float = Field(default=1e-5, gt=1.1e-19, description="smallest scale of a gradient [paper]")
     nu_min: float = Field(
-        1.0, gt=0, description="fewest degrees of freedom; larger is less robust [paper]"
+        default=1.0, gt=0, description="fewest degrees of freedom; larger is less robust [paper]"
     )
 
     def make(self, parameters: Iterable[Parameter]) -> Optimizer:
@@ -38,11 +38,11 @@ class AdamConfig:
     """Adam."""
 
     name: str = "adam"
-    lr: float = Field(3e-4, ge=0, description="learning rate")
+    lr: float = Field(default=3e-4, ge=0, description="learning rate")
     betas: tuple[float, float] = Field(
-        (0.9, 0.999), description="decay of the first and second moment, each in [0, 1)"
+        default=(0.9, 0.999), description="decay of the first and second moment, each in [0, 1)"
     )
-    eps: float = Field(1e-8, ge=0, description="added to the denominator")
+    eps: float = Field(default=1e-8, ge=0, description="added to the denominator")
 
     def make(self, parameters: Iterable[Parameter]) -> Optimizer:
         """The optimizer of these parameters."""

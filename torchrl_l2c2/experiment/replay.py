@@ -26,11 +26,15 @@ class PrioritizedReplayConfig:
     """Prioritized experience replay."""
 
     name: str = "prioritized"
-    capacity: int = Field(10_000, ge=1, description="transitions kept [paper]")
-    batch_size: int = Field(32, ge=1, description="transitions per update [paper]")
-    alpha: float = Field(1.0, ge=0, description="exponent of the priorities; 0 is uniform [paper]")
+    capacity: int = Field(default=10_000, ge=1, description="transitions kept [paper]")
+    batch_size: int = Field(default=32, ge=1, description="transitions per update [paper]")
+    alpha: float = Field(
+        default=1.0, ge=0, description="exponent of the priorities; 0 is uniform [paper]"
+    )
     beta: float = Field(
-        0.5, ge=0, description="exponent of the importance weights; 1 corrects fully [paper]"
+        default=0.5,
+        ge=0,
+        description="exponent of the importance weights; 1 corrects fully [paper]",
     )
 
     def __post_init__(self) -> None:
@@ -55,8 +59,8 @@ class UniformReplayConfig:
     """Uniform experience replay."""
 
     name: str = "uniform"
-    capacity: int = Field(100_000, ge=1, description="transitions kept")
-    batch_size: int = Field(256, ge=1, description="transitions per update")
+    capacity: int = Field(default=100_000, ge=1, description="transitions kept")
+    batch_size: int = Field(default=256, ge=1, description="transitions per update")
 
     def __post_init__(self) -> None:
         _check_fits(self.capacity, self.batch_size)
@@ -77,7 +81,7 @@ class RolloutReplayConfig:
     """The frames of one rollout, each used once per epoch, for on-policy learning."""
 
     name: str = "rollout"
-    batch_size: int = Field(64, ge=1, description="transitions per update")
+    batch_size: int = Field(default=64, ge=1, description="transitions per update")
 
     def make(self, generator: torch.Generator, longest_rollout: int) -> TensorDictReplayBuffer:
         """The buffer, with room for the longest rollout."""

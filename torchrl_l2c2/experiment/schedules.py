@@ -7,8 +7,10 @@ learned from. What a run does between two of them, and when it ends, is the call
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 
 from torchrl_l2c2.experiment.algorithms import PPOConfig
 from torchrl_l2c2.experiment.algorithms.base import OffPolicyConfig
@@ -19,7 +21,7 @@ from torchrl_l2c2.experiment.player import Episode, Player
 def by_step(player: Player, learner: Learner, algorithm: OffPolicyConfig) -> Iterator[Episode]:
     """Updates after every frame."""
     while True:
-        frames = []
+        frames: list[TensorDictBase] = []
         while not frames or not frames[-1]["next", "done"][-1]:
             (frame,) = player.step()
             frames.append(frame)
@@ -58,7 +60,7 @@ def _learn(learner: Learner, algorithm: OffPolicyConfig, frames: int, last_frame
         learner.learn(algorithm.updates_after(frames, last_frame, stored, batch_size))
 
 
-SCHEDULES: dict[str, Callable[[Player, Learner, object], Iterator[Episode]]] = {
+SCHEDULES: dict[str, Callable[[Player, Learner, Any], Iterator[Episode]]] = {
     "step": by_step,
     "episode": by_episode,
     "rollout": by_rollout,

@@ -41,7 +41,7 @@ def settings(cls: type[Group]) -> type[Group]:
         >>> from pydantic import Field
         >>> @settings
         ... class Pace:
-        ...     tau: float = Field(0.1, gt=0, le=1, description="how fast targets follow")
+        ...     tau: float = Field(default=0.1, gt=0, le=1, description="how fast targets follow")
         >>> Pace(tau=2.0)
         Traceback (most recent call last):
         torchrl_l2c2.experiment.settings.SettingError: Pace.tau must be less than or equal to 1, got 2.0.
@@ -59,7 +59,7 @@ def settings(cls: type[Group]) -> type[Group]:
             raise _first_problem(error, made) from None
 
     made.__init__ = __init__  # type: ignore[method-assign]
-    return made
+    return made  # type: ignore[return-value]
 
 
 def read(make: Callable[..., Group], values: Mapping[str, Any], prefix: str) -> Group:
@@ -85,9 +85,9 @@ def describe(group: type) -> dict[str, tuple[str, str]]:
     """The range or choices and the meaning of every setting of a group, as they were declared."""
     types = get_type_hints(group)
     return {
-        field.name: (_allowed(types[field.name], field.default), field.default.description)
+        field.name: (_allowed(types[field.name], field.default), meaning)
         for field in dataclasses.fields(group)
-        if getattr(field.default, "description", None)
+        if (meaning := getattr(field.default, "description", None))
     }
 
 

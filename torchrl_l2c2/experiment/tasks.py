@@ -20,20 +20,25 @@ class TaskConfig:
 
     name: str = "swingup"
     env_id: str = Field(
-        SWINGUP, description="Gymnasium id; `module:id` imports the module that registers it"
+        default=SWINGUP,
+        description="Gymnasium id; `module:id` imports the module that registers it",
     )
     noise_scale: float | None = Field(
-        None,
+        default=None,
         ge=0,
         description="standard deviation of the white noise on every observation; null: the paper's "
         ".01 for Swingup, none for other ids [paper]",
     )
-    episodes: int = Field(200, ge=1, description="to train for [inferred: the paper states none]")
+    episodes: int = Field(
+        default=200, ge=1, description="to train for [inferred: the paper states none]"
+    )
     max_steps: int = Field(
-        1000, ge=1, description="longest episode; at most so many frames are collected at once"
+        default=1000,
+        ge=1,
+        description="longest episode; at most so many frames are collected at once",
     )
     solved_at: float | None = Field(
-        None, description="return at which the task counts as solved, a line in the picture"
+        default=None, description="return at which the task counts as solved, a line in the picture"
     )
 
     def __post_init__(self) -> None:

@@ -115,13 +115,13 @@ class Draw(NamedTuple):
 
     Attributes:
         stored: the storage's tensors, ``[capacity, ...]`` each.
-        index: rows of the batch, ``[B]``.
+        rows: of the batch, ``[B]``.
         weight: importance weights, ``[B]``; ``None`` without priorities.
         uniform: random numbers of the neighbors; ``None`` without these.
     """
 
     stored: tuple[Tensor, ...]
-    index: Tensor
+    rows: Tensor
     weight: Tensor | None
     uniform: Tensor | None
 
@@ -174,7 +174,7 @@ class ReplayUpdate:
         draw = self.draw()
         result = self.update(with_policy, *draw)
         if result is not None:
-            self.prioritize(draw.index, result[1])
+            self.prioritize(draw.rows, result[1])
         return result
 
     def draw(self) -> Draw:
@@ -210,6 +210,6 @@ class ReplayUpdate:
             batch.set(name, tensor[index])
         if weight is not None:
             batch.set("priority_weight", weight)
-        if uniform is None:
+        if self._neighbors is None:
             return batch
         return self._neighbors.place(batch, TensorDict({"observation": uniform}, index.shape))

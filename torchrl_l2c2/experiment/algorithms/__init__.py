@@ -7,6 +7,16 @@ from torchrl_l2c2.experiment.algorithms.ppo_rpe import PPORPEConfig
 from torchrl_l2c2.experiment.algorithms.sac import SACConfig
 from torchrl_l2c2.experiment.algorithms.td3 import TD3Config
 
+__all__ = [
+    "ALGORITHMS",
+    "AlgorithmConfig",
+    "DQNConfig",
+    "PPOConfig",
+    "PPORPEConfig",
+    "SACConfig",
+    "TD3Config",
+]
+
 ALGORITHMS: dict[str, AlgorithmConfig] = {
     "ppo_rpe": PPORPEConfig(),
     "sac": SACConfig(),

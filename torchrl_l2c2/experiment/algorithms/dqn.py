@@ -22,26 +22,28 @@ class DQNConfig(OffPolicyConfig):
     """Double deep Q-learning, for discrete actions."""
 
     name: str = "dqn"
-    gamma: float = Field(0.99, ge=0, lt=1, description="discount")
-    tau: float = Field(0.005, gt=0, le=1, description="pace of the target network")
-    epsilon_end: float = Field(0.05, ge=0, le=1, description="last share of random actions")
-    epsilon_frames: int = Field(10_000, ge=1, description="frames until that share is reached")
-    hidden: Layers = Field((120, 84), description="neurons of the hidden layers")
+    gamma: float = Field(default=0.99, ge=0, lt=1, description="discount")
+    tau: float = Field(default=0.005, gt=0, le=1, description="pace of the target network")
+    epsilon_end: float = Field(default=0.05, ge=0, le=1, description="last share of random actions")
+    epsilon_frames: int = Field(
+        default=10_000, ge=1, description="frames until that share is reached"
+    )
+    hidden: Layers = Field(default=(120, 84), description="neurons of the hidden layers")
     random_frames: int = Field(
-        1000, ge=0, description="frames with random actions, before learning starts"
+        default=1000, ge=0, description="frames with random actions, before learning starts"
     )
     reward_scale: float | None = Field(
-        1.0, description="factor on rewards while learning; null: 1 - gamma"
+        default=1.0, description="factor on rewards while learning; null: 1 - gamma"
     )
-    schedule: Literal["step", "episode"] = Field("step", description="when updates happen")
+    schedule: Literal["step", "episode"] = Field(default="step", description="when updates happen")
     replay_ratio: float | None = Field(
-        None,
+        default=None,
         gt=0,
         description="times that a transition is drawn on average, instead of updates: "
         "ratio * frames / batch_size of them",
     )
     updates: int | None = Field(
-        1,
+        default=1,
         ge=1,
         description="per step, or per episode; null: by the replay ratio, else one, or one pass "
         "over the buffer",

@@ -24,25 +24,36 @@ class PPOConfig(AlgorithmConfig):
     usual_replay: ClassVar[str] = "rollout"
 
     name: str = "ppo"
-    gamma: float = Field(0.99, ge=0, lt=1, description="discount")
+    gamma: float = Field(default=0.99, ge=0, lt=1, description="discount")
     gae_lambda: float = Field(
-        0.95, ge=0, le=1, description="of the advantage estimate: 0 is one-step, 1 is Monte Carlo"
+        default=0.95,
+        ge=0,
+        le=1,
+        description="of the advantage estimate: 0 is one-step, 1 is Monte Carlo",
     )
     clip_epsilon: float = Field(
-        0.2, gt=0, lt=1, description="largest change of the likelihood ratio that pays"
+        default=0.2, gt=0, lt=1, description="largest change of the likelihood ratio that pays"
     )
-    entropy_coeff: float = Field(0.0, ge=0, description="bonus on the policy's entropy")
-    critic_coeff: float = Field(0.5, gt=0, description="gain of the value loss")
-    max_grad_norm: float = Field(0.5, gt=0, description="gradients are scaled down to this norm")
+    entropy_coeff: float = Field(default=0.0, ge=0, description="bonus on the policy's entropy")
+    critic_coeff: float = Field(default=0.5, gt=0, description="gain of the value loss")
+    max_grad_norm: float = Field(
+        default=0.5, gt=0, description="gradients are scaled down to this norm"
+    )
     frames: int = Field(
-        2048, ge=1, description="at least so many, in whole episodes, are learned from at once"
+        default=2048,
+        ge=1,
+        description="at least so many, in whole episodes, are learned from at once",
     )
-    epochs: int = Field(10, ge=1, description="passes over them")
-    hidden: Layers = Field((64, 64), description="neurons of the hidden layers of both networks")
+    epochs: int = Field(default=10, ge=1, description="passes over them")
+    hidden: Layers = Field(
+        default=(64, 64), description="neurons of the hidden layers of both networks"
+    )
     reward_scale: float | None = Field(
-        1.0, description="factor on rewards while learning; null: 1 - gamma"
+        default=1.0, description="factor on rewards while learning; null: 1 - gamma"
     )
-    schedule: Literal["rollout"] = Field("rollout", description="updates follow every rollout")
+    schedule: Literal["rollout"] = Field(
+        default="rollout", description="updates follow every rollout"
+    )
 
     def make_agent(
         self, env: EnvBase, regularizer: RegularizerConfig, optimizer: OptimizerConfig

@@ -25,62 +25,70 @@ class PPORPEConfig(OffPolicyConfig):
     usual_optimizer: ClassVar[str] = "adaterm"
 
     name: str = "ppo_rpe"
-    gamma: float = Field(0.99, ge=0, lt=1, description="discount")
+    gamma: float = Field(default=0.99, ge=0, lt=1, description="discount")
     kappa: float = Field(
-        0.5, gt=0, description="share of the largest ratio deviation that is allowed"
+        default=0.5, gt=0, description="share of the largest ratio deviation that is allowed"
     )
-    beta: float = Field(0.5, gt=0, lt=1, description="mixture of the relative density ratio")
-    decay: float = Field(0.999, ge=0, le=1, description="of the largest deviation, per update")
-    delta_min: float = Field(0.1, gt=0, le=1, description="lowest largest deviation")
+    beta: float = Field(
+        default=0.5, gt=0, lt=1, description="mixture of the relative density ratio"
+    )
+    decay: float = Field(
+        default=0.999, ge=0, le=1, description="of the largest deviation, per update"
+    )
+    delta_min: float = Field(default=0.1, gt=0, le=1, description="lowest largest deviation")
     threshold: Literal["max", "ema"] = Field(
-        "max", description="how the deviation is tracked [inferred: max]"
+        default="max", description="how the deviation is tracked [inferred: max]"
     )
     critic_weighting: Literal["ratio", "none"] = Field(
-        "ratio", description="weight of the value loss [inferred: ratio]"
+        default="ratio", description="weight of the value loss [inferred: ratio]"
     )
     baseline: Literal["stored", "target"] = Field(
-        "stored", description="likelihood that the ratio is taken to [inferred: stored]"
+        default="stored", description="likelihood that the ratio is taken to [inferred: stored]"
     )
     importance: Literal["max", "mean"] = Field(
-        "max",
+        default="max",
         description="what the weights of prioritized replay are divided by [inferred: max]",
     )
     acting_policy: Literal["target", "online"] = Field(
-        "target", description="which copy of the policy acts [inferred: target]"
+        default="target", description="which copy of the policy acts [inferred: target]"
     )
     reward_scale: float | None = Field(
-        None, description="factor on rewards while learning; null: 1 - gamma [inferred]"
+        default=None, description="factor on rewards while learning; null: 1 - gamma [inferred]"
     )
     squash: Literal["tanh", "none"] = Field(
-        "tanh", description="how actions are kept in their bounds [inferred: tanh]"
+        default="tanh", description="how actions are kept in their bounds [inferred: tanh]"
     )
     hidden: Layers = Field(
-        (100, 100), description="neurons of the hidden layers of both networks [paper]"
+        default=(100, 100), description="neurons of the hidden layers of both networks [paper]"
     )
     num_heads: int = Field(
-        5, ge=1, description="outputs of the value network; the value is their mean [paper]"
+        default=5, ge=1, description="outputs of the value network; the value is their mean [paper]"
     )
-    squish_b: float = Field(4.0, gt=0, description="bend of the Squish activation [inferred]")
+    squish_b: float = Field(
+        default=4.0, gt=0, description="bend of the Squish activation [inferred]"
+    )
     schedule: Literal["episode", "step"] = Field(
-        "episode", description="when updates happen [inferred: after each episode]"
+        default="episode", description="when updates happen [inferred: after each episode]"
     )
     replay_ratio: float | None = Field(
-        None,
+        default=None,
         gt=0,
         description="times that a transition is drawn on average, instead of updates: "
         "ratio * frames / batch_size of them [inferred]",
     )
     updates: int | None = Field(
-        None,
+        default=None,
         ge=1,
         description="per episode, or per step; null: by the replay ratio, else one pass over the "
         "buffer, or one [inferred]",
     )
     tau: float = Field(
-        0.1, gt=0, le=1, description="t-soft update: pace of the target networks [paper]"
+        default=0.1, gt=0, le=1, description="t-soft update: pace of the target networks [paper]"
     )
     nu: float = Field(
-        1.0, gt=0, description="t-soft update: degrees of freedom; larger is less robust [paper]"
+        default=1.0,
+        gt=0,
+        description="t-soft update: degrees of freedom; larger is less robust [paper]",
     )
 
     def make_agent(
@@ -97,12 +105,30 @@ class PPORPEConfig(OffPolicyConfig):
         from torchrl_l2c2.updaters import TSoftUpdate
 
         check_actions(env, self.name, continuous=True)
-        size, layers = observation_size(env), {"hidden": self.hidden, "squish_b": self.squish_b}
-        actor = make_actor(size, env.action_spec, squash=self.squash, **layers)
-        critic = make_critic(size, num_heads=self.num_heads, **layers)
-        passed = ("gamma", "kappa", "beta", "decay", "delta_min")
-        passed += ("threshold", "critic_weighting", "baseline", "importance")
-        loss = PPORPELoss(actor, critic, **{name: getattr(self, name) for name in passed})
+        size = observation_size(env)
+        actor = make_actor(
+            size,
+            env.action_spec,
+            hidden=self.hidden,
+            squash=self.squash,
+            squish_b=self.squish_b,
+        )
+        critic = make_critic(
+            size, num_heads=self.num_heads, hidden=self.hidden, squish_b=self.squish_b
+        )
+        loss = PPORPELoss(
+            actor,
+            critic,
+            gamma=self.gamma,
+            kappa=self.kappa,
+            beta=self.beta,
+            decay=self.decay,
+            delta_min=self.delta_min,
+            threshold=self.threshold,
+            critic_weighting=self.critic_weighting,
+            baseline=self.baseline,
+            importance=self.importance,
+        )
         loss = regularizer.wrap(loss)
         acting = "target_actor_network" if self.acting_policy == "target" else "actor_network"
         return Agent(

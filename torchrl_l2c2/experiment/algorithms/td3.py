@@ -22,32 +22,38 @@ class TD3Config(OffPolicyConfig):
     """Twin delayed DDPG: a deterministic policy."""
 
     name: str = "td3"
-    gamma: float = Field(0.99, ge=0, lt=1, description="discount")
-    tau: float = Field(0.005, gt=0, le=1, description="pace of the target networks")
+    gamma: float = Field(default=0.99, ge=0, lt=1, description="discount")
+    tau: float = Field(default=0.005, gt=0, le=1, description="pace of the target networks")
     exploration_noise: float = Field(
-        0.1, ge=0, description="standard deviation of the noise on actions, of half their range"
+        default=0.1,
+        ge=0,
+        description="standard deviation of the noise on actions, of half their range",
     )
     policy_noise: float = Field(
-        0.2, ge=0, description="of the noise on the target's actions, likewise"
+        default=0.2, ge=0, description="of the noise on the target's actions, likewise"
     )
-    noise_clip: float = Field(0.5, ge=0, description="largest such noise, likewise")
-    policy_delay: int = Field(2, ge=1, description="updates of the value per update of the policy")
-    hidden: Layers = Field((256, 256), description="neurons of the hidden layers of all networks")
+    noise_clip: float = Field(default=0.5, ge=0, description="largest such noise, likewise")
+    policy_delay: int = Field(
+        default=2, ge=1, description="updates of the value per update of the policy"
+    )
+    hidden: Layers = Field(
+        default=(256, 256), description="neurons of the hidden layers of all networks"
+    )
     random_frames: int = Field(
-        1000, ge=0, description="frames with random actions, before learning starts"
+        default=1000, ge=0, description="frames with random actions, before learning starts"
     )
     reward_scale: float | None = Field(
-        1.0, description="factor on rewards while learning; null: 1 - gamma"
+        default=1.0, description="factor on rewards while learning; null: 1 - gamma"
     )
-    schedule: Literal["step", "episode"] = Field("step", description="when updates happen")
+    schedule: Literal["step", "episode"] = Field(default="step", description="when updates happen")
     replay_ratio: float | None = Field(
-        None,
+        default=None,
         gt=0,
         description="times that a transition is drawn on average, instead of updates: "
         "ratio * frames / batch_size of them",
     )
     updates: int | None = Field(
-        1,
+        default=1,
         ge=1,
         description="per step, or per episode; null: by the replay ratio, else one, or one pass "
         "over the buffer",

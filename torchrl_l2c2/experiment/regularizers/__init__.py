@@ -5,6 +5,8 @@ from torchrl_l2c2.experiment.regularizers.caps import CAPSConfig
 from torchrl_l2c2.experiment.regularizers.l2c2 import L2C2Config
 from torchrl_l2c2.experiment.regularizers.none import NoRegularizerConfig
 
+__all__ = ["REGULARIZERS", "CAPSConfig", "L2C2Config", "NoRegularizerConfig", "RegularizerConfig"]
+
 REGULARIZERS: dict[str, RegularizerConfig] = {
     "none": NoRegularizerConfig(),
     "caps": CAPSConfig(),

@@ -19,16 +19,16 @@ class CAPSConfig(RegularizerConfig):
 
     name: str = "caps"
     sigma: float = Field(
-        0.2, gt=0, description="standard deviation of the states compared with s [paper]"
+        default=0.2, gt=0, description="standard deviation of the states compared with s [paper]"
     )
     lambda_temporal: float = Field(
-        0.01, ge=0, description="gain of the distance between s and s' [paper]"
+        default=0.01, ge=0, description="gain of the distance between s and s' [paper]"
     )
     lambda_spatial: float = Field(
-        0.05, ge=0, description="gain of the distance between s and its noisy copy [paper]"
+        default=0.05, ge=0, description="gain of the distance between s and its noisy copy [paper]"
     )
     mean: Literal["loc", "action"] = Field(
-        "loc", description="means compared before or after the squashing [inferred: loc]"
+        default="loc", description="means compared before or after the squashing [inferred: loc]"
     )
 
     def wrap(self, loss: LossModule) -> LossModule:

@@ -23,20 +23,20 @@ class L2C2Config(RegularizerConfig):
 
     name: str = "l2c2"
     sigma: float = Field(
-        1.0,
+        default=1.0,
         gt=0,
         description="size of the neighborhood relative to the step from s to s' [paper]",
     )
     lambda_min: float = Field(
-        0.01, gt=0, description="gain at the edge of the neighborhood [paper]"
+        default=0.01, gt=0, description="gain at the edge of the neighborhood [paper]"
     )
-    lambda_max: float = Field(1.0, gt=0, description="gain at its center [paper]")
+    lambda_max: float = Field(default=1.0, gt=0, description="gain at its center [paper]")
     beta: float = Field(
-        0.1,
+        default=0.1,
         ge=0,
         description="gain of the value's regularization relative to the policy's [paper]",
     )
-    num_samples: int = Field(1, ge=1, description="neighbors per transition [inferred: 1]")
+    num_samples: int = Field(default=1, ge=1, description="neighbors per transition [inferred: 1]")
 
     @property
     def neighborhood(self) -> Neighborhood:
