@@ -231,9 +231,7 @@ def run_rows(effort: Effort) -> Iterable[Row]:
         detail = {
             "draw": partial(_repeat, learner.draw, frames),
             "update": partial(_repeat, lambda: learner.update(True, *draw), frames),
-            "prioritize": partial(
-                _repeat, lambda: learner.prioritize(draw.rows, priority), frames
-            ),
+            "prioritize": partial(_repeat, lambda: learner.prioritize(draw.rows, priority), frames),
         }
         times = alternate(
             {"run": play_episode(run), **summed, **detail}, repeats=max(1, effort.rounds // 3)
@@ -536,7 +534,9 @@ def main(arguments: list[str] | None = None) -> None:
     if options.json:
         options.json.write_text(json.dumps(result, indent=2) + "\n")
     if options.markdown:
-        options.markdown.write_text(to_markdown(rows, where))
+        given = sys.argv[1:] if arguments is None else arguments
+        command = " ".join(("python -m benchmarks.speed", *given))
+        options.markdown.write_text(to_markdown(rows, where, command))
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -140,7 +141,7 @@ def _finite_log_affinity(p: Tensor, q: Tensor) -> Tensor:
 
 
 @register_hellinger(Independent)
-def _independent(p: Independent, q: Independent) -> Tensor:
+def _independent(p: Independent[Any], q: Independent[Any]) -> Tensor:
     base = log_affinity(p.base_dist, q.base_dist)
     if base is NotImplemented:
         return NotImplemented
@@ -168,10 +169,10 @@ def _tanh_normal(p: TanhNormal, q: TanhNormal) -> Tensor:
 
 @register_hellinger(CompositeDistribution)
 def _composite(p: CompositeDistribution, q: CompositeDistribution) -> Tensor:
-    total = 0.0
+    parts = []
     for name, entry in p.dists.items():
         part = log_affinity(entry, q.dists[name])
         if part is NotImplemented:
             return NotImplemented
-        total = total + sum_to(part, len(p.batch_shape))
-    return total
+        parts.append(sum_to(part, len(p.batch_shape)))
+    return functools.reduce(torch.add, parts)

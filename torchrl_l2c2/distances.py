@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any
 
@@ -90,9 +91,9 @@ def squared_hellinger(
         tensor([0.0000, 0.0797])
     """
     _check_pair(p, q)
-    if (sample is None) != (sample_log_prob is None):
-        raise ValueError("sample and sample_log_prob belong together: give both or neither.")
-    if sample is not None:
+    if sample is not None or sample_log_prob is not None:
+        if sample is None or sample_log_prob is None:
+            raise ValueError("sample and sample_log_prob belong together: give both or neither.")
         if num_samples is not None:
             raise ValueError("give either num_samples or a replayed sample, not both.")
         return _weighted_difference(p, q, sample, sample_log_prob)
@@ -198,7 +199,6 @@ def _log_prob(distribution: Distribution, sample: Any) -> Tensor:
     if not isinstance(distribution, CompositeDistribution):
         return distribution.log_prob(sample)
     # Its own log_prob returns a tensor or a TensorDict, as a global switch says.
-    return sum(
-        sum_to(_log_prob(entry, sample.get(name)), sample.ndim)
-        for name, entry in distribution.dists.items()
-    )
+    heads = distribution.dists.items()
+    parts = (sum_to(_log_prob(head, sample.get(name)), sample.ndim) for name, head in heads)
+    return functools.reduce(torch.add, parts)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal
+import functools
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -154,14 +155,16 @@ def caps_terms(
     return temporal, spatial
 
 
-def _terms(here: Policy, there: Policy, squashed: bool) -> tuple[Tensor, Tensor]:
+def _terms(here: Any, there: Any, squashed: bool) -> tuple[Tensor, Tensor]:
     """Those of policies ``[2, *B]``; the heads of a composite one add up."""
     if not isinstance(here, CompositeDistribution):
         return caps_terms(_mean(here, squashed), _mean(there, squashed))
     ndim = len(here.batch_shape) - 1
     heads = [_terms(here.dists[name], there.dists[name], squashed) for name in here.dists]
-    heads = [[_sum_rightmost(term, term.ndim - ndim) for term in head] for head in heads]
-    temporal, spatial = map(sum, zip(*heads, strict=True))
+    temporal, spatial = (
+        functools.reduce(torch.add, (_sum_rightmost(term, term.ndim - ndim) for term in terms))
+        for terms in zip(*heads, strict=True)
+    )
     return temporal, spatial
 
 

@@ -160,7 +160,7 @@ class Evaluation:
         wiring, known = self.wiring[network], shared.at_batch.get(network)
         dim, num = int(is_ensemble(loss, network)), len(states)
         evaluated, there = shared.at_others.get(network, (None, None))
-        if evaluated is states:
+        if evaluated is states and known is not None and there is not None:
             return known.select(*keys).unsqueeze(dim), there.select(*keys)
         rows = self._rows(network, tensordict, states, with_batch=known is None)
         if wiring.trunk:
@@ -248,7 +248,7 @@ def _wiring(loss: LossModule, network: str) -> Wiring:
         elif not made & set(actions):
             actions = actor.out_keys[-1:]
     trunk = [key for key in net.in_keys if key in made - set(actions)]
-    inputs = dict.fromkeys([*net.in_keys, *(actor.in_keys if trunk else ())])
+    inputs = dict.fromkeys([*net.in_keys, *(actor.in_keys if trunk and actor else ())])
     if network == POLICY_NETWORK:
         output = next((key for key in actions if key in made), None)
     else:
@@ -308,7 +308,7 @@ def _check_declares_keys(net: nn.Module, name: str) -> None:
         )
 
 
-def _check_not_recurrent(net: nn.Module, name: str) -> None:
+def _check_not_recurrent(net: Any, name: str) -> None:
     recurrent = any(isinstance(module, LSTMModule | GRUModule) for module in net.modules())
     if recurrent or "is_init" in net.in_keys:
         raise TypeError(

@@ -6,7 +6,7 @@ import warnings
 
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
-from torch.distributions import Categorical
+from torch.distributions import Categorical, Distribution
 from torchrl.objectives import DistributionalDQNLoss, LossModule
 
 from torchrl_l2c2._checks import check_positive_int
@@ -167,9 +167,10 @@ class L2C2Loss(RegularizedLoss):
             return terms
         states, distance = self._neighbors(tensordict)
         here, there = self.policies_at(tensordict, states)
-        if isinstance(here, Tensor):
+        if isinstance(here, Tensor) and isinstance(there, Tensor):
             difference = squared_error(here, there)
         else:
+            assert isinstance(here, Distribution) and isinstance(there, Distribution)
             difference = squared_hellinger(here, there, num_samples=self.l2c2_hellinger_samples)
         terms.set("loss_l2c2_actor", self._penalty(difference, distance, tensordict))
         terms.set(self._policy_diagnostic(), self.reduce_diagnostic(difference.mean(0), tensordict))

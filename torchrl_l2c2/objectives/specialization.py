@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import functools
 import types
-from typing import Any
+from typing import Any, SupportsIndex
 
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
@@ -61,7 +61,8 @@ class SpecializedLoss(LossModule):
         """The subclass of this class and of ``base_class``."""
         if not (isinstance(base_class, type) and issubclass(base_class, LossModule)):
             raise TypeError(f"{cls.__name__}[...] takes a class of losses, got {base_class!r}.")
-        return _specialize(cls, base_class)
+        # Classes are hashable; their instances' __hash__ is what confuses the checker.
+        return _specialize(cls, base_class)  # type: ignore[arg-type]
 
     def __new__(cls, base_loss: LossModule, *args: Any, **kwargs: Any) -> SpecializedLoss:
         if not isinstance(base_loss, LossModule):
@@ -69,7 +70,7 @@ class SpecializedLoss(LossModule):
                 f"{cls.__name__} wraps a torchrl.objectives.LossModule, got a "
                 f"{type(base_loss).__name__}."
             )
-        specialized = cls if cls._parts else cls[type(base_loss)]
+        specialized = cls if cls._parts else cls.__class_getitem__(type(base_loss))
         if type(base_loss) not in specialized.__mro__:
             raise TypeError(f"{cls.__name__} cannot wrap a {type(base_loss).__name__}.")
         self = object.__new__(specialized)
@@ -81,7 +82,7 @@ class SpecializedLoss(LossModule):
         super().set_keys(**kwargs)
         self.in_keys = super().in_keys
 
-    def __reduce_ex__(self, protocol: int) -> tuple[Any, ...]:
+    def __reduce_ex__(self, protocol: SupportsIndex) -> tuple[Any, ...]:
         # A class made here has no name that can be imported; the classes that it is made of have.
         parts = vars(type(self)).get("_parts", (type(self),))
         return (_make_empty, parts, *super().__reduce_ex__(protocol)[2:])
@@ -144,6 +145,8 @@ def _adopt(self: SpecializedLoss, base_loss: LossModule) -> None:
     self.out_keys = getattr(base_loss, "out_keys", [])
 
 
-def _make_empty(*parts: type) -> SpecializedLoss:
-    cls = functools.reduce(lambda base, extension: extension[base], reversed(parts))
+def _make_empty(*parts: Any) -> SpecializedLoss:
+    cls = functools.reduce(
+        lambda base, extension: extension.__class_getitem__(base), reversed(parts)
+    )
     return object.__new__(cls)
