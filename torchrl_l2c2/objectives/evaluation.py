@@ -248,7 +248,7 @@ def _wiring(loss: LossModule, network: str) -> Wiring:
         elif not made & set(actions):
             actions = actor.out_keys[-1:]
     trunk = [key for key in net.in_keys if key in made - set(actions)]
-    inputs = dict.fromkeys([*net.in_keys, *(actor.in_keys if trunk and actor else ())])
+    inputs = dict.fromkeys([*net.in_keys, *(actor.in_keys if trunk and actor is not None else ())])
     if network == POLICY_NETWORK:
         output = next((key for key in actions if key in made), None)
     else:
