@@ -1,0 +1,77 @@
+"""SAC with L2C2 in a plain loop, on the pendulum.
+
+``python examples/sac_loop.py`` shows in seconds that it runs; ``python examples/sac_loop.py 10000``
+swings the pendulum up.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import torch
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, TensorDictPrioritizedReplayBuffer
+from torchrl.envs import ExplorationType, GymEnv, set_exploration_type
+from torchrl.modules import MLP, ValueOperator
+from torchrl.objectives import SACLoss, SoftUpdate
+
+from torchrl_l2c2 import L2C2Loss, Neighborhood, NeighborTransform, action_variation, make_actor
+
+FRAMES = 400
+FRAMES_PER_BATCH = 50
+RANDOM_FRAMES = 200
+UPDATES_PER_BATCH = 50
+
+
+def main(frames: int) -> None:
+    torch.manual_seed(0)
+    env = GymEnv("Pendulum-v1")
+    env.set_seed(0)
+    actor = make_actor(3, env.action_spec, hidden=(64, 64))
+    qvalue = ValueOperator(
+        MLP(in_features=4, out_features=1, num_cells=[64, 64]), in_keys=["observation", "action"]
+    )
+
+    near = Neighborhood(sigma=1.0, lambda_min=0.1, lambda_max=10.0)
+    base = SACLoss(actor, qvalue, target_entropy=-1.0)
+    base.make_value_estimator(gamma=0.95)
+    loss = L2C2Loss(base, near, beta=0.1)
+    updater = SoftUpdate(loss, tau=0.005)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
+    replay = TensorDictPrioritizedReplayBuffer(
+        alpha=0.6,
+        beta=0.5,
+        storage=LazyTensorStorage(100_000),
+        batch_size=64,
+        transform=NeighborTransform(near),
+    )
+    collector = Collector(
+        env,
+        actor,
+        frames_per_batch=FRAMES_PER_BATCH,
+        total_frames=frames,
+        init_random_frames=RANDOM_FRAMES,
+    )
+
+    for collected in collector:
+        replay.extend(collected)
+        if len(replay) < RANDOM_FRAMES:
+            continue
+        for _ in range(UPDATES_PER_BATCH):
+            batch = replay.sample()
+            terms = loss(batch)
+            sum(term for key, term in terms.items() if key.startswith("loss_")).backward()
+            optimizer.step()
+            optimizer.zero_grad()
+            updater.step()
+            replay.update_tensordict_priority(batch)
+
+    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+        episode = GymEnv("Pendulum-v1").rollout(200, actor)
+    print(f"return {episode['next', 'reward'].sum().item():.1f}")
+    print(f"action variation {action_variation(episode['action']).item():.3f}")
+    print(f"gain applied {terms['l2c2_gain'].item():.3f}")
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else FRAMES)
