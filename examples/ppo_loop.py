@@ -1,7 +1,7 @@
 """PPO with generalized advantages and L2C2 in a plain loop, on the pendulum.
 
-``python examples/ppo_loop.py`` shows in seconds that it runs; ``python examples/ppo_loop.py 200000``
-swings the pendulum up.
+``python examples/ppo_loop.py`` shows in seconds that it runs;
+``python examples/ppo_loop.py 200000`` swings the pendulum up.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from torchrl.objectives.value import GAE
 
 from torchrl_l2c2 import L2C2Loss, Neighborhood, action_variation, make_actor, make_critic
 
-FRAMES = 4000
-FRAMES_PER_BATCH = 2000
+FRAMES = 2000
+FRAMES_PER_BATCH = 1000
 EPOCHS = 5
 REWARD_SCALE = 0.1
 

@@ -1,4 +1,4 @@
-"""The pages of docs/ are true: their code runs, their names and numbers are the package's."""
+"""README and docs/ are true: their code runs, their names and numbers are the package's."""
 
 from __future__ import annotations
 
@@ -10,15 +10,21 @@ from unittest.mock import patch
 import pytest
 import torch
 from scipy.integrate import quad
+from torchrl.objectives import SACLoss
 
 import torchrl_l2c2
 from torchrl_l2c2 import distances
 
-FOLDER = Path(__file__).parents[1] / "docs"
-PAGES = sorted(path.name for path in FOLDER.glob("*.md"))
+ROOT = Path(__file__).parents[1]
+FOLDER = ROOT / "docs"
 COMPONENTS = FOLDER / "components.md"
 # An HTML comment right before a block keeps it from being run.
 BLOCK = re.compile(r"(?P<skip><!-- no-test -->\s*)?^```python\n(?P<code>.*?)^```", re.M | re.S)
+PAGES = [
+    path
+    for path in (ROOT / "README.md", *sorted(FOLDER.glob("*.md")))
+    if BLOCK.search(path.read_text())
+]
 
 
 def run_blocks(page: Path) -> dict[str, Any]:
@@ -41,12 +47,21 @@ def components() -> dict[str, Any]:
     return run_blocks(COMPONENTS)
 
 
-@pytest.mark.parametrize("page", PAGES)
-def test_blocks_run(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_blocks_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The code of every page runs from top to bottom."""
     # For what a page writes.
     monkeypatch.chdir(tmp_path)
-    run_blocks(FOLDER / page)
+    run_blocks(page)
+
+
+def test_the_readmes_code_does_what_it_says() -> None:
+    """Nothing of it is left out, and the loss has the promised terms."""
+    page = ROOT / "README.md"
+    assert "<!-- no-test -->" not in page.read_text()
+    defined = run_blocks(page)
+    assert isinstance(defined["loss"], SACLoss)
+    assert {"loss_l2c2_actor", "loss_l2c2_qvalue"} <= set(defined["terms"].keys())
 
 
 def test_a_marked_block_is_left_out_and_the_others_share_a_namespace(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -101,9 +102,9 @@ def squared_hellinger(
         tensor([0.0000, 0.0797])
     """
     _check_pair(p, q)
-    if (sample is None) != (sample_log_prob is None):
-        raise ValueError("sample and sample_log_prob belong together: give both or neither.")
-    if sample is not None:
+    if sample is not None or sample_log_prob is not None:
+        if sample is None or sample_log_prob is None:
+            raise ValueError("sample and sample_log_prob belong together: give both or neither.")
         if num_samples is not None:
             raise ValueError("give either num_samples or a replayed sample, not both.")
         return _weighted_difference(p, q, sample, sample_log_prob)
@@ -264,10 +265,11 @@ def _log_prob(distribution: Distribution, sample: Any) -> Tensor:
     if not isinstance(distribution, CompositeDistribution):
         return distribution.log_prob(sample)
     # Its own log_prob returns a tensor or a TensorDict, as a global switch says.
-    return sum(
+    entries = (
         _sum_to(_log_prob(entry, sample.get(name)), sample.ndim)
         for name, entry in distribution.dists.items()
     )
+    return functools.reduce(torch.add, entries)
 
 
 def _sum_to(x: Tensor, ndim: int) -> Tensor:
@@ -327,7 +329,7 @@ def _finite_log_affinity(p: Tensor, q: Tensor) -> Tensor:
 
 
 @register_hellinger(Independent)
-def _independent(p: Independent, q: Independent) -> Tensor:
+def _independent(p: Independent[Any], q: Independent[Any]) -> Tensor:
     log_affinity = _log_affinity(p.base_dist, q.base_dist)
     if log_affinity is NotImplemented:
         return NotImplemented
@@ -355,10 +357,10 @@ def _tanh_normal(p: TanhNormal, q: TanhNormal) -> Tensor:
 
 @register_hellinger(CompositeDistribution)
 def _composite(p: CompositeDistribution, q: CompositeDistribution) -> Tensor:
-    total = 0.0
+    parts = []
     for name, entry in p.dists.items():
         log_affinity = _log_affinity(entry, q.dists[name])
         if log_affinity is NotImplemented:
             return NotImplemented
-        total = total + _sum_to(log_affinity, len(p.batch_shape))
-    return total
+        parts.append(_sum_to(log_affinity, len(p.batch_shape)))
+    return functools.reduce(torch.add, parts)

@@ -47,7 +47,7 @@ class _RandomTransform(Transform):
                 f"{type(self).__name__} was saved {with_or_without[saved]} a generator and built "
                 f"{with_or_without[present]} one: build it as it was built then."
             )
-        if present:
+        if self.generator is not None:
             self.generator.set_state(state)
 
 

@@ -137,7 +137,7 @@ class AdaTerm(Optimizer):
             }
 
     @torch.no_grad()
-    def step(self, closure: Callable[[], Tensor] | None = None) -> Tensor | None:
+    def step(self, closure: Callable[[], Any] | None = None) -> Any:
         """Performs one step; parameters without a gradient keep their value and their state.
 
         Args:
@@ -154,11 +154,11 @@ class AdaTerm(Optimizer):
             with torch.enable_grad():
                 loss = closure()
         for group in self.param_groups:
-            for params in _alike([p for p in group["params"] if p.grad is not None]):
+            for params, grads in _alike(group["params"]):
                 states = [self.state[p] for p in params]
                 adaterm(
                     params,
-                    [p.grad for p in params],
+                    grads,
                     [state["exp_avg"] for state in states],
                     [state["exp_avg_var"] for state in states],
                     [state["nu"] for state in states],
@@ -241,13 +241,17 @@ def _next_nu(nu: Tensor, mean_distance: Tensor, beta: float, eps: float, nu_min:
     return torch.lerp(nu, target, (1.0 - beta) * w_log / w_log_max)
 
 
-def _alike(params: list[Tensor]) -> Iterable[list[Tensor]]:
-    """Splits parameters by device and dtype: only alike ones can be worked on together."""
-    groups: dict[tuple[torch.device, torch.dtype], list[Tensor]] = {}
+def _alike(params: list[Tensor]) -> Iterable[tuple[list[Tensor], list[Tensor]]]:
+    """Parameters with their gradients, by device and dtype: alike ones are worked on together."""
+    groups: dict[tuple[torch.device, torch.dtype], tuple[list[Tensor], list[Tensor]]] = {}
     for p in params:
+        if p.grad is None:
+            continue
         if p.grad.is_sparse:
             raise RuntimeError("AdaTerm: sparse gradients are not supported, only dense ones.")
-        groups.setdefault((p.device, p.dtype), []).append(p)
+        alike, grads = groups.setdefault((p.device, p.dtype), ([], []))
+        alike.append(p)
+        grads.append(p.grad)
     return groups.values()
 
 

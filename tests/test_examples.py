@@ -1,0 +1,50 @@
+"""The examples run as they stand, and stay short."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+
+
+@pytest.fixture(params=EXAMPLES, ids=lambda path: path.stem)
+def example(request: pytest.FixtureRequest) -> Path:
+    """Each script of the folder."""
+    return request.param
+
+
+def test_all_four_are_there() -> None:
+    """Without them the tests below would have nothing to run."""
+    names = {path.stem for path in EXAMPLES}
+    assert names >= {"sac_loop", "ppo_loop", "own_regularizer", "torchrl_trainer"}
+
+
+def test_it_trains_and_says_what_it_learned(example: Path, tmp_path: Path) -> None:
+    """It ends well, with a return and an action variation that are numbers."""
+    done = subprocess.run(
+        [sys.executable, str(example)],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    told = dict(re.findall(r"^([a-z_ ]+) (\S+)$", done.stdout, re.M))
+    assert {"return", "action variation"} <= told.keys()
+    assert all(math.isfinite(float(number)) for number in told.values())
+    assert -2000 < float(told["return"]) < 0  # what 200 steps of the pendulum can give
+    assert 0 < float(told["action variation"]) <= 4  # its actions lie in [-2, 2]
+
+
+def test_it_is_short(example: Path) -> None:
+    """Under 80 lines, to be read in one go."""
+    assert len(example.read_text().splitlines()) < 80
