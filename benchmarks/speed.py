@@ -545,7 +545,9 @@ def main(arguments: list[str] | None = None) -> None:
     if options.json:
         options.json.write_text(json.dumps(result, indent=2) + "\n")
     if options.markdown:
-        options.markdown.write_text(to_markdown(rows, where))
+        given = sys.argv[1:] if arguments is None else arguments
+        command = " ".join(("python -m benchmarks.speed", *given))
+        options.markdown.write_text(to_markdown(rows, where, command))
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import statistics
+import subprocess
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
@@ -100,13 +101,18 @@ def machine() -> dict[str, Any]:
         "system": platform.platform(),
         "python": platform.python_version(),
         "threads": torch.get_num_threads(),
+        "commit": _commit(),
         "versions": {name: found for name in PACKAGES if (found := _version(name))},
     }
 
 
-def to_markdown(rows: list[Row], where: Mapping[str, Any]) -> str:
-    """The table and the machine, for the documentation."""
+def to_markdown(rows: list[Row], where: Mapping[str, Any], command: str) -> str:
+    """The table with its command, its commit and the machine, for ``results/``."""
     lines = [
+        "# Speed",
+        "",
+        f"`{command}`, commit {where['commit']}",
+        "",
         "| row | value | limit | met | from |",
         "| --- | --- | --- | --- | --- |",
         *(
@@ -153,6 +159,17 @@ def _cpu_model() -> str:
         lines = []
     names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
     return names[0] if names else platform.processor() or platform.machine()
+
+
+def _commit() -> str:
+    describe = ["git", "describe", "--always", "--dirty", "--exclude=*"]
+    try:
+        told = subprocess.run(
+            describe, cwd=Path(__file__).parent, capture_output=True, text=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return told.stdout.strip()
 
 
 def _version(name: str) -> str | None:

@@ -1,16 +1,19 @@
 """The documentation's site: ``python -m sphinx -W docs build/site``.
 
 Nothing is fetched, neither to build the site nor to read it: equations become MathML, which
-browsers draw themselves, and references to other projects are not linked.
+browsers draw themselves with a font that comes along, and other projects are not linked.
 """
 
 from __future__ import annotations
 
+import inspect
+from importlib.resources import files
 from typing import Any
 
 from docutils import nodes
 from math_core import LatexToMathML
 from sphinx.application import Sphinx
+from sphinx.util.inspect import stringify_signature
 
 from torchrl_l2c2 import __version__
 
@@ -32,7 +35,7 @@ nitpick_ignore_regex = [("py:.*", r"(?!torchrl_l2c2).*")]
 
 html_theme = "furo"
 html_title = f"torchrl_l2c2 {__version__}"
-html_static_path = ["site.css"]
+html_static_path = ["site.css", str(files("ziamath") / "fonts" / "STIXTwoMath-Regular.ttf")]
 html_css_files = ["site.css"]
 html_copy_source = False
 html_math_renderer = "mathml"
@@ -55,5 +58,18 @@ def draw_block(writer: Any, node: nodes.math_block) -> None:
     raise nodes.SkipNode
 
 
+def show_constructor(
+    app: Sphinx, what: str, name: str, obj: Any, options: Any, signature: str, returns: str
+) -> tuple[str, str] | None:
+    """A class's own arguments, also where a ``__new__`` that takes anything comes before."""
+    if what == "class" and "__init__" in vars(obj):
+        arguments = inspect.signature(obj.__init__)
+        without_self = list(arguments.parameters.values())[1:]
+        shown = arguments.replace(parameters=without_self, return_annotation=arguments.empty)
+        return stringify_signature(shown, unqualified_typehints=True), returns
+    return None
+
+
 def setup(app: Sphinx) -> None:
     app.add_html_math_renderer("mathml", (draw_inline, None), (draw_block, None))
+    app.connect("autodoc-process-signature", show_constructor)

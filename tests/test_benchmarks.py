@@ -14,6 +14,15 @@ from benchmarks.speed import matrix_products
 from benchmarks.timing import Row, alternate, to_markdown
 
 REPOSITORY = Path(__file__).parent.parent
+WHERE = {
+    "cpu": "c",
+    "cores": 2,
+    "load": 0.0,
+    "threads": 1,
+    "commit": "abc1234",
+    "versions": {},
+    "python": "3",
+}
 
 
 def test_the_command_writes_rows_as_json_and_as_a_table(tmp_path):
@@ -37,6 +46,7 @@ def test_the_command_writes_rows_as_json_and_as_a_table(tmp_path):
     assert written["quick"] and written["machine"]["name"] and written["machine"]["cpu"]
     assert torch.__version__.startswith(written["machine"]["versions"]["torch"])
     assert all(f"| {row['name']} |" in table.read_text() for row in rows)
+    assert f"commit {written['machine']['commit']}" in table.read_text()
 
 
 def test_alternate_takes_turns_and_gives_the_median_per_unit():
@@ -78,5 +88,10 @@ def test_matrix_products_are_those_of_forward_and_backward():
 def test_a_row_meets_its_limit_or_not(row, met):
     """Limits count as met; nothing is met without a value or a limit."""
     assert row.met is met
-    where = {"cpu": "c", "cores": 2, "load": 0.0, "threads": 1, "versions": {}, "python": "3"}
-    assert {True: "| yes |", False: "| no |", None: "| - |"}[met] in to_markdown([row], where)
+    assert {True: "| yes |", False: "| no |", None: "| - |"}[met] in to_markdown([row], WHERE, "")
+
+
+def test_a_table_has_its_command_and_its_commit():
+    """So that it can be made again, and with the same code."""
+    head = to_markdown([], WHERE, "python -m benchmarks.speed").splitlines()[2]
+    assert head == "`python -m benchmarks.speed`, commit abc1234"
