@@ -62,7 +62,7 @@ def show_constructor(
     app: Sphinx, what: str, name: str, obj: Any, options: Any, signature: str, returns: str
 ) -> tuple[str, str] | None:
     """A class's own arguments, also where a ``__new__`` that takes anything comes before."""
-    if what == "class" and "__init__" in vars(obj):
+    if what == "class" and obj.__module__.startswith("torchrl_l2c2") and "__init__" in vars(obj):
         arguments = inspect.signature(obj.__init__)
         without_self = list(arguments.parameters.values())[1:]
         shown = arguments.replace(parameters=without_self, return_annotation=arguments.empty)
