@@ -51,8 +51,9 @@ from torchrl.objectives import (
     SACLoss,
     TD3BCLoss,
     TD3Loss,
+    TQCLoss,
 )
-from torchrl.objectives.multiagent import MAPPOLoss
+from torchrl.objectives.multiagent import IPPOLoss, MAPPOLoss
 
 from torchrl_l2c2 import PPORPELoss
 
@@ -161,6 +162,11 @@ def qvalue() -> ValueOperator:
     return ValueOperator(mlp(OBSERVATION + ACTION, 1), in_keys=["observation", "action"])
 
 
+def quantiles() -> ValueOperator:
+    """A critic of three quantiles of the return."""
+    return ValueOperator(mlp(OBSERVATION + ACTION, 3), in_keys=["observation", "action"])
+
+
 def action_values(key: str = "action_value") -> TensorDictModule:
     return TensorDictModule(mlp(OBSERVATION, ACTIONS), ["observation"], [key])
 
@@ -265,11 +271,12 @@ def make_composite_ppo(**kwargs: Any) -> PPOLoss:
     return loss
 
 
-def make_mappo(**kwargs: Any) -> MAPPOLoss:
+def make_mappo(loss_class: type[MAPPOLoss] = MAPPOLoss, **kwargs: Any) -> MAPPOLoss:
+    """With agents that all have the same networks, in the centralized or independent class."""
     value = TensorDictModule(
         mlp(OBSERVATION, 1), [("agents", "observation")], [("agents", "state_value")]
     )
-    loss = MAPPOLoss(gaussian_actor(prefix=("agents",)), value, **kwargs)
+    loss = loss_class(gaussian_actor(prefix=("agents",)), value, **kwargs)
     loss.set_keys(
         action=("agents", "action"),
         value=("agents", "state_value"),
@@ -363,6 +370,16 @@ CASES = [
         keywords=False,
     ),
     Case(
+        "IPPO",
+        lambda **kw: make_mappo(IPPOLoss, **kw),
+        agents_batch,
+        HELLINGER,
+        ("critic",),
+        has_targets=False,
+        fullgraph=False,
+        keywords=False,
+    ),
+    Case(
         "A2C",
         lambda **kw: A2CLoss(gaussian_actor(), critic(), **kw),
         on_policy,
@@ -404,6 +421,16 @@ CASES = [
         transitions,
         HELLINGER,
         ("qvalue", "value"),
+        weighted=True,
+    ),
+    Case(
+        "TQC",
+        lambda **kw: TQCLoss(
+            gaussian_actor(), quantiles(), num_qvalue_nets=2, action_spec=BOUNDS, **kw
+        ),
+        transitions,
+        HELLINGER,
+        ("qvalue",),
         weighted=True,
     ),
     Case(

@@ -366,7 +366,7 @@ def test_wrong_loss_settings_give_the_loss_errors(overrides, message):
 @pytest.mark.parametrize(
     "overrides,message",
     [
-        (["+node=neighbor", "node.num_samples=0"], "num_samples must be an integer"),
+        (["+node=neighbor", "node.num_samples=0"], "num_samples must be at least 1"),
         (["+node=observation_noise", "node.scale=-0.1"], "scale must be finite and at least 0"),
     ],
 )

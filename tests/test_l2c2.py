@@ -374,11 +374,11 @@ class TestNeighbors:
         """One draw serves the policy and the value function; alone, each draws its own."""
         draws = []
 
-        def sample(self, *args, original=Neighborhood.sample, **kwargs):
+        def draw(self, *args, original=Neighborhood.draw, **kwargs):
             draws.append(args)
             return original(self, *args, **kwargs)
 
-        monkeypatch.setattr(Neighborhood, "sample", sample)
+        monkeypatch.setattr(Neighborhood, "draw", draw)
         loss = L2C2Loss(DDPGLoss(deterministic_actor(), qvalue()))
         loss(transitions(4))
         assert len(draws) == 1
@@ -408,7 +408,7 @@ class TestConstruction:
     @pytest.mark.parametrize(
         ("settings", "error", "message"),
         [
-            ({"neighborhood": 1.0}, TypeError, "neighborhood must be a Neighborhood, got a float"),
+            ({"neighborhood": 1.0}, TypeError, r"neighborhood must be a Neighborhood, got 1\.0"),
             ({"num_samples": 0}, ValueError, "num_samples must be at least 1"),
             ({"num_samples": 1.5}, TypeError, "num_samples must be an integer"),
             ({"hellinger_samples": 0}, ValueError, "hellinger_samples must be at least 1"),

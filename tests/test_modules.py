@@ -211,9 +211,13 @@ def test_compiled_they_give_the_same_numbers():
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
-        (lambda: make_actor(0, 1), ValueError, "observation_size must be a whole number"),
-        (lambda: make_actor(3, 0), ValueError, "number of actions must be a whole number"),
-        (lambda: make_actor(3, 1, hidden=(10, 0)), ValueError, "every entry of hidden"),
+        (lambda: make_actor(0, 1), ValueError, "observation_size must be "),
+        (lambda: make_actor(3, 0), ValueError, "number of actions must be at least 1"),
+        (
+            lambda: make_actor(3, 1, hidden=(10, 0)),
+            ValueError,
+            "every entry of hidden must be at least 1",
+        ),
         (lambda: make_actor(3, 1, squash="clip"), ValueError, "squash must be 'tanh' or 'none'"),
         (lambda: make_actor(3, 1, squish_b=0.0), ValueError, "b must be finite"),
         (lambda: make_actor(3, Unbounded(shape=(2,))), ValueError, "needs finite bounds"),
@@ -221,8 +225,8 @@ def test_compiled_they_give_the_same_numbers():
         (lambda: make_actor(3, Bounded(-1.0, 1.0, (4, 2))), ValueError, "action_spec_unbatched"),
         (lambda: make_actor(3, Categorical(4)), TypeError, "must be continuous"),
         (lambda: make_actor(3, Composite(a=Unbounded((2,)))), TypeError, "single tensor"),
-        (lambda: make_critic(3, num_heads=0), ValueError, "num_heads must be a whole number"),
-        (lambda: make_critic(2.5), ValueError, "observation_size must be a whole number"),
+        (lambda: make_critic(3, num_heads=0), ValueError, "num_heads must be at least 1, got 0"),
+        (lambda: make_critic(2.5), TypeError, "observation_size must be "),
     ],
 )
 def test_wrong_settings_are_refused(make, error, message):

@@ -50,6 +50,8 @@ from torchrl.objectives import (
     CrossQLoss,
     DDPGLoss,
     DQNLoss,
+    DreamerActorLoss,
+    DreamerValueLoss,
     DTLoss,
     IQLLoss,
     LossModule,
@@ -57,7 +59,9 @@ from torchrl.objectives import (
     PPOLoss,
     ReinforceLoss,
     SACLoss,
+    TD3Loss,
 )
+from torchrl.objectives.llm import DAPO, DistillationLoss, GRPOLoss, SFTLoss
 
 from torchrl_l2c2 import (
     CAPSLoss,
@@ -69,7 +73,8 @@ from torchrl_l2c2 import (
     make_actor,
     make_critic,
 )
-from torchrl_l2c2.objectives import regularized
+from torchrl_l2c2.objectives import evaluation
+from torchrl_l2c2.objectives.shared_evaluation import SharedEvaluation
 
 NEAR = Neighborhood(sigma=1.0, lambda_min=0.1, lambda_max=1.0)
 
@@ -87,18 +92,23 @@ def with_neighbors(batch: TensorDict, **kwargs) -> TensorDict:
 class Stillness(RegularizedLoss):
     """The shortest regularizer: mean squared actions."""
 
-    _schedulable_buffers = frozenset({"stillness_coeff"})
-
     def __init__(self, base_loss: LossModule, coeff: float = 1.0) -> None:
-        self._register_coefficient("stillness_coeff", coeff)
-        self._regularize(["actor_network"])
-        self.out_keys = [*self.out_keys, "loss_stillness"]
+        self.register_coefficient("stillness_coeff", coeff)
+        self.declare_networks(["actor_network"])
+        self.declare_terms(policy=["loss_stillness"])
 
     def policy_regularizer(self, tensordict):
         terms = super().policy_regularizer(tensordict)
-        _, action = self._policies_at(tensordict, tensordict.select("observation")[None])
-        cost = self._reduce_term(action[0].square().sum(-1), tensordict)
+        _, action = self.policies_at(tensordict, tensordict.select("observation")[None])
+        cost = self.reduce_term(action[0].square().sum(-1), tensordict)
         return terms.set("loss_stillness", self.stillness_coeff * cost)
+
+
+class Declaring(RegularizedLoss):
+    """Declares terms, and has none."""
+
+    def __init__(self, base_loss: LossModule, **kinds: list[str]) -> None:
+        self.declare_terms(**kinds)
 
 
 class TestTheClass:
@@ -151,20 +161,54 @@ class TestTheClass:
 
     def test_the_same_regularizer_is_not_applied_twice(self):
         """Neither directly nor with another one in between."""
-        with pytest.raises(TypeError, match="already regularized by L2C2Loss"):
+        with pytest.raises(TypeError, match="already wrapped by L2C2Loss"):
             L2C2Loss(L2C2Loss(ddpg()))
-        with pytest.raises(TypeError, match="already regularized by L2C2Loss"):
+        with pytest.raises(TypeError, match="already wrapped by L2C2Loss"):
             L2C2Loss(CAPSLoss(L2C2Loss(ddpg())))
+
+    def test_terms_are_declared_with_what_they_train(self):
+        """They follow the loss's own in out_keys; those of all regularizers are policy_terms."""
+        base = ddpg()
+        loss = Declaring(base, diagnostics=["size"], value=["loss_b"], policy=["loss_c", "loss_a"])
+        assert loss.out_keys == [*base.out_keys, "loss_c", "loss_a", "loss_b", "size"]
+        assert loss.policy_terms == {"loss_c", "loss_a"}
+        chain = Stillness(L2C2Loss(loss))
+        expected = {"loss_c", "loss_a", "loss_l2c2_actor", "loss_stillness"}
+        assert chain.policy_terms == pickle.loads(pickle.dumps(chain)).policy_terms == expected
+        assert loss.policy_terms == {"loss_c", "loss_a"}
+
+    def test_names_tell_terms_from_diagnostics(self):
+        """A term that is not summed, and a diagnostic that is, are refused where declared."""
+        for kind in ("policy", "value"):
+            with pytest.raises(ValueError, match="a term must start with 'loss_', got 'size'"):
+                Declaring(ddpg(), **{kind: ["size"]})
+        with pytest.raises(ValueError, match="a diagnostic must not start with 'loss_'"):
+            Declaring(ddpg(), diagnostics=["loss_size"])
 
     def test_methods_are_not_hidden_by_chance(self):
         """A loss whose own method has the name of one of ours would break: it is refused."""
 
         class Clashing(DDPGLoss):
-            def _policies_at(self):
+            def policies_at(self):
                 return None
 
-        with pytest.raises(TypeError, match=r"both define \['_policies_at'\]"):
+        with pytest.raises(TypeError, match=r"both define \['policies_at'\]"):
             L2C2Loss(Clashing(deterministic_actor(), qvalue()))
+
+    def test_a_hook_is_overridden_only_where_it_was_declared(self):
+        """A loss that calls a method as the hook of SharedEvaluation is called, by chance."""
+
+        class Unaware(DDPGLoss):
+            def evaluate_at_batch(self):
+                return None
+
+        with pytest.raises(TypeError, match=r"both define \['evaluate_at_batch'\]"):
+            L2C2Loss(Unaware(deterministic_actor(), qvalue()))
+
+        class Aware(SharedEvaluation, Unaware):
+            pass
+
+        assert L2C2Loss(Aware(deterministic_actor(), qvalue()))
 
 
 class TestAttributes:
@@ -246,8 +290,56 @@ class TestWhatIsRefused:
         loss = L2C2Loss(ddpg())
         batch = transitions(4)
         batch["observation"] = batch["observation"].long()
-        with pytest.raises(TypeError, match=r"floating-point observation.*'observation'.*int64"):
+        message = r"actor_network needs a floating-point.*'observation'.*int64"
+        with pytest.raises(TypeError, match=message):
             loss.policy_regularizer(batch)
+
+    @pytest.mark.parametrize("pixels", ["actor_network", "qvalue_network"])
+    def test_each_network_needs_a_state_of_its_own(self, pixels):
+        """The one that reads integers alone is named, where the other's states would do."""
+        keys = {"actor_network": "observation", "qvalue_network": "observation", pixels: "pixels"}
+        actor = Actor(mlp(OBSERVATION, ACTION), in_keys=[keys["actor_network"]])
+        value = ValueOperator(
+            mlp(OBSERVATION + ACTION, 1), in_keys=[keys["qvalue_network"], "action"]
+        )
+        spec = Bounded(-1, 1, (ACTION,))
+        loss = L2C2Loss(TD3Loss(actor, value, action_spec=spec))
+        batch = transitions(4)
+        batch["pixels"] = torch.zeros(4, OBSERVATION, dtype=torch.uint8)
+        batch["next", "pixels"] = batch["pixels"]
+        message = rf"^{pixels} needs a floating-point observation.*'pixels'.*uint8"
+        with pytest.raises(TypeError, match=message):
+            loss.value_regularizer(batch)
+        batch["pixels"] = batch["pixels"].float()
+        del batch["next", "pixels"]
+        with pytest.raises(KeyError, match=rf"{pixels} needs the next observation.*'pixels'"):
+            loss.value_regularizer(batch)
+
+    @pytest.mark.parametrize("regularizer", [L2C2Loss, CAPSLoss])
+    def test_losses_of_language_models(self, regularizer):
+        """Known when they are made: between two texts there is nothing."""
+        actor = TensorDictModule(nn.Identity(), ["tokens"], ["logits"])
+        tokenizer = object()
+        losses = [
+            GRPOLoss(actor),
+            DAPO(actor),
+            SFTLoss(actor, tokenizer=tokenizer, kl_to_ref_coeff=0.1),
+            DistillationLoss(actor, tokenizer=tokenizer),
+        ]
+        for loss in losses:
+            name = type(loss).__name__
+            with pytest.raises(TypeError, match=f"^{name} trains a language model"):
+                regularizer(loss)
+
+    @pytest.mark.parametrize("regularizer", [L2C2Loss, CAPSLoss])
+    def test_losses_in_imagination(self, regularizer):
+        """Dreamer has a policy, and a value function, but evaluates them on no single state."""
+        actor, value = gaussian_actor(), critic()
+        losses = DreamerActorLoss(actor, value, None), DreamerValueLoss(value)
+        for loss in losses:
+            message = f"{type(loss).__name__} evaluates its networks along trajectories that a"
+            with pytest.raises(TypeError, match=message):
+                regularizer(loss)
 
     def test_neighbors_of_other_entries(self):
         """A network none of whose inputs was moved is named with what was."""
@@ -305,11 +397,11 @@ class TestNetworks:
 
         class SmallValues(RegularizedLoss):
             def __init__(self, base_loss):
-                self._regularize(self._value_networks())
+                self.declare_networks(self.value_networks())
 
             def value_regularizer(self, tensordict):
                 states = tensordict.select("observation")[None]
-                value, _ = self._values_at("critic_network", tensordict, states)
+                value, _ = self.values_at("critic_network", tensordict, states)
                 return TensorDict(loss_small=value.square().mean())
 
         trunk = TensorDictModule(mlp(OBSERVATION, 2 * ACTION), ["observation"], ["hidden"])
@@ -519,17 +611,15 @@ class TestNetworks:
         torch.testing.assert_close(loss.policy_regularizer(batch)["loss_l2c2_actor"], expected)
 
 
-class Cooperating(DDPGLoss):
+class Cooperating(DDPGLoss, SharedEvaluation):
     """Evaluates its value network through the method that regularizers listen to."""
 
-    rows = 0
-
-    def _evaluate_batch(self, network, tensordict):
+    def evaluate_at_batch(self, network, tensordict):
         with self.value_network_params.to_module(self.value_network):
             return self.value_network(tensordict.select(*self.value_network.in_keys))
 
     def loss_value(self, tensordict):
-        value = self._evaluate_batch("value_network", tensordict)["state_action_value"]
+        value = self.evaluate_at_batch("value_network", tensordict)["state_action_value"]
         return value.square().mean(), {}
 
 
@@ -596,7 +686,7 @@ class TestOnePass:
         found = []
         for compiling in (False, True):
             rows.clear()
-            monkeypatch.setattr(regularized, "is_compiling", lambda c=compiling: c)
+            monkeypatch.setattr(evaluation, "is_compiling", lambda c=compiling: c)
             torch.manual_seed(0)
             # The adaptive threshold is a state that every forward pass moves.
             loss.delta.fill_(0.5)
@@ -657,7 +747,7 @@ class TestOnePass:
     def test_not_where_it_would_cut_a_gradient(self, monkeypatch):
         """The action that a value is of may be the policy's own."""
         torch.manual_seed(0)
-        monkeypatch.setattr(regularized, "is_compiling", lambda: True)
+        monkeypatch.setattr(evaluation, "is_compiling", lambda: True)
         loss = L2C2Loss(Cooperating(deterministic_actor(), qvalue()), NEAR)
         batch = with_neighbors(transitions(6))
         batch["action"].requires_grad_()

@@ -248,7 +248,7 @@ def test_what_it_cannot_update_is_refused():
         ({"tau": 0.0}, r"tau must be in \(0, 1\], got 0.0"),
         ({"tau": 1.5}, r"tau must be in \(0, 1\], got 1.5"),
         ({"tau": math.nan}, r"tau must be in \(0, 1\]"),
-        ({"nu": 0.0}, "nu must be greater than 0, got 0.0"),
+        ({"nu": 0.0}, "nu must be greater than 0, got 0.0. math.inf gives"),
         ({"nu": math.nan}, "nu must be greater than 0"),
     ],
 )

@@ -22,7 +22,7 @@ from torch.distributions import (
 from torch.distributions.utils import _sum_rightmost
 from torchrl.modules import Delta, MaskedCategorical, TanhDelta, TanhNormal
 
-from torchrl_l2c2.neighborhood import check_num_samples
+from torchrl_l2c2._checks import check_positive_int
 
 LogAffinity = Callable[[Any, Any], Tensor]
 
@@ -86,8 +86,10 @@ def squared_hellinger(
         The distances, shape ``[*B]``.
 
     Raises:
-        TypeError: if a policy is deterministic or can neither be sampled nor scored.
-        ValueError: if the event shapes differ, or the arguments contradict each other.
+        TypeError: if a policy is deterministic or can neither be sampled nor scored, or
+            ``num_samples`` is no integer.
+        ValueError: if the event shapes differ, ``num_samples`` is below 1, or the arguments
+            contradict each other.
 
     Examples:
         >>> import torch
@@ -225,7 +227,7 @@ def _log_affinity(p: Distribution, q: Distribution) -> Tensor:
 
 
 def _monte_carlo(p: Distribution, q: Distribution, num_samples: int) -> Tensor:
-    check_num_samples(num_samples)
+    check_positive_int("num_samples", num_samples)
     shape = torch.Size([num_samples])
     try:
         # Half of the draws from either policy: the mixture, without the noise of a coin.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Literal
 
@@ -13,6 +12,8 @@ from torch import Tensor, nn
 from torchrl.data import Bounded, Composite, TensorSpec
 from torchrl.envs import ExplorationType
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, TanhNormal
+
+from torchrl_l2c2._checks import check_choice, check_positive_int, check_real
 
 
 class Squish(nn.Module):
@@ -30,6 +31,7 @@ class Squish(nn.Module):
             and Squish so follows swish there to second order.
 
     Raises:
+        TypeError: ``b`` is not a real number.
         ValueError: ``b`` is not finite or not greater than 0.
 
     Examples:
@@ -41,8 +43,7 @@ class Squish(nn.Module):
 
     def __init__(self, b: float = 4.0) -> None:
         super().__init__()
-        if not (math.isfinite(b) and b > 0.0):
-            raise ValueError(f"Squish: b must be finite and greater than 0, got {b!r}.")
+        check_real("Squish: b", b, above=0)
         self.b = b
 
     def forward(self, x: Tensor) -> Tensor:
@@ -118,7 +119,7 @@ def make_actor(
         ProbabilisticActor: the policy, for any leading batch dimensions.
 
     Raises:
-        TypeError: the action is not a single continuous tensor.
+        TypeError: the action is not a single continuous tensor, or a setting of another type.
         ValueError: a size or a choice that is not allowed, or bounds that cannot be squashed into.
 
     Examples:
@@ -131,11 +132,10 @@ def make_actor(
         >>> batch["action"].shape, batch["action_log_prob"].shape
         (torch.Size([8, 1]), torch.Size([8]))
     """
-    if squash not in ("tanh", "none"):
-        raise ValueError(f"make_actor: squash must be 'tanh' or 'none', got {squash!r}.")
+    check_choice("make_actor: squash", squash, ("tanh", "none"))
     spec = action
     if not isinstance(spec, TensorSpec):
-        _check_whole("make_actor: the number of actions", action)
+        check_positive_int("make_actor: the number of actions", action)
         spec = Bounded(low=-1.0, high=1.0, shape=(action,))
     size = _action_size(spec)
     network = NormalNetwork(
@@ -182,6 +182,7 @@ def make_critic(
         TensorDictModule: the critic, for any leading batch dimensions.
 
     Raises:
+        TypeError: a size that is no integer.
         ValueError: a size that is not allowed.
 
     Examples:
@@ -193,7 +194,7 @@ def make_critic(
         >>> batch["state_value"].shape, batch["state_value_heads"].shape
         (torch.Size([8, 1]), torch.Size([8, 5]))
     """
-    _check_whole("make_critic: num_heads", num_heads)
+    check_positive_int("make_critic: num_heads", num_heads)
     return TensorDictModule(
         EnsembleNetwork(_body(observation_size, hidden, num_heads, squish_b)),
         in_keys=list(in_keys),
@@ -202,9 +203,9 @@ def make_critic(
 
 
 def _body(in_features: int, hidden: Sequence[int], out_features: int, squish_b: float) -> MLP:
-    _check_whole("observation_size", in_features)
+    check_positive_int("observation_size", in_features)
     for cells in hidden:
-        _check_whole("every entry of hidden", cells)
+        check_positive_int("every entry of hidden", cells)
     return MLP(
         in_features=in_features,
         out_features=out_features,
@@ -240,8 +241,3 @@ def _bounds(spec: TensorSpec) -> dict[str, Tensor]:
             "use squash='none'."
         )
     return {"low": low, "high": high}
-
-
-def _check_whole(name: str, value: int) -> None:
-    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-        raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}.")

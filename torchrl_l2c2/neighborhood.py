@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields
-from numbers import Real
 
 import torch
 from torch import Tensor
+
+from torchrl_l2c2._checks import check_positive_int, check_real
 
 
 @dataclass(frozen=True)
@@ -69,17 +69,9 @@ class Neighborhood:
     lambda_max: float = 1.0
 
     def __post_init__(self) -> None:
+        hint = "To switch the regularization off, leave it out instead of setting its gain to 0."
         for field in fields(self):
-            value = getattr(self, field.name)
-            if not isinstance(value, Real) or isinstance(value, bool):
-                raise TypeError(
-                    f"{field.name} must be a real number, got {value!r} ({type(value).__name__})."
-                )
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(
-                    f"{field.name} must be finite and greater than 0, got {value!r}. To switch "
-                    "the regularization off, leave it out instead of setting its gain to 0."
-                )
+            check_real(field.name, getattr(self, field.name), above=0, hint=hint)
         if self.lambda_max <= self.sigma * self.lambda_min:
             raise ValueError(
                 f"lambda_max must be greater than sigma * lambda_min, got lambda_max="
@@ -151,7 +143,7 @@ class Neighborhood:
             shape ``[*B, K]``.
 
         Raises:
-            TypeError: if the states are not floating point.
+            TypeError: if the states are not floating point, or ``num_samples`` is no integer.
             ValueError: if the shapes differ, or ``num_samples`` or ``batch_dims`` is out of range.
         """
         uniform = self.draw(state, num_samples, generator, batch_dims=batch_dims)
@@ -179,10 +171,10 @@ class Neighborhood:
             Numbers in ``[0, 1)``, shape ``[*B, K, *F]``, in the dtype of ``state``.
 
         Raises:
-            TypeError: if the states are not floating point.
+            TypeError: if the states are not floating point, or ``num_samples`` is no integer.
             ValueError: if ``num_samples`` or ``batch_dims`` is out of range.
         """
-        check_num_samples(num_samples)
+        check_positive_int("num_samples", num_samples)
         _check_states(state, state, batch_dims)
         shape = (*state.shape[:batch_dims], num_samples, *state.shape[batch_dims:])
         return torch.rand(shape, generator=generator, dtype=state.dtype, device=state.device)
@@ -229,12 +221,6 @@ class Neighborhood:
         # An explicit size: -1 is ambiguous for empty batches.
         extent = u.abs().reshape(*uniform.shape[: batch_dims + 1], features.numel()).amax(-1)
         return neighbor, extent + self.epsilon
-
-
-def check_num_samples(num_samples: int) -> None:
-    """Raises a ``ValueError`` unless the number of samples is a positive integer."""
-    if not isinstance(num_samples, int) or num_samples < 1:
-        raise ValueError(f"num_samples must be an integer of at least 1, got {num_samples!r}.")
 
 
 def _check_states(state: Tensor, next_state: Tensor, batch_dims: int) -> None:

@@ -11,7 +11,84 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import Transform
 
-from torchrl_l2c2.neighborhood import Neighborhood, check_num_samples
+from torchrl_l2c2._checks import check_positive_int, check_real
+from torchrl_l2c2.neighborhood import Neighborhood
+
+Transitions = dict[NestedKey, tuple[Tensor, Tensor]]  # states and successors, by the states' keys
+
+
+def draw_neighbors(
+    tensordict: TensorDictBase,
+    neighborhood: Neighborhood,
+    in_keys: Sequence[NestedKey],
+    num_samples: int = 1,
+    generator: torch.Generator | None = None,
+) -> TensorDictBase:
+    """Draws neighbors for a batch ``[*B]``: what the transform writes and the loss reads.
+
+    Arguments and errors are those of :class:`NeighborTransform`.
+
+    Returns:
+        The neighbors, ``[*B, K, *F]`` under each key, and their ``"distance"``, ``[*B, K]``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_l2c2 import Neighborhood
+        >>> from torchrl_l2c2.transforms import draw_neighbors
+        >>> batch = {"observation": torch.zeros(4, 3), "next": {"observation": torch.ones(4, 3)}}
+        >>> near = draw_neighbors(TensorDict(batch, [4]), Neighborhood(), ["observation"], 2)
+        >>> near["observation"].shape, near["distance"].shape
+        (torch.Size([4, 2, 3]), torch.Size([4, 2]))
+    """
+    transitions = _transitions(tensordict, in_keys)
+    uniform = _draw(tensordict, transitions, neighborhood, num_samples, generator)
+    return _place(tensordict, transitions, neighborhood, uniform)
+
+
+def _draw(
+    tensordict: TensorDictBase,
+    transitions: Transitions,
+    neighborhood: Neighborhood,
+    num_samples: int,
+    generator: torch.Generator | None,
+) -> TensorDictBase:
+    uniform = TensorDict(batch_size=tensordict.batch_size, device=tensordict.device)
+    for key, (state, _) in transitions.items():
+        numbers = neighborhood.draw(state, num_samples, generator, batch_dims=tensordict.batch_dims)
+        uniform.set(key, numbers)
+    return uniform
+
+
+def _place(
+    tensordict: TensorDictBase,
+    transitions: Transitions,
+    neighborhood: Neighborhood,
+    uniform: TensorDictBase,
+) -> TensorDictBase:
+    neighbors = TensorDict(batch_size=tensordict.batch_size, device=tensordict.device)
+    distances = []
+    for key, transition in transitions.items():
+        neighbor, distance = neighborhood.place(
+            *transition, uniform.get(key), batch_dims=tensordict.batch_dims
+        )
+        neighbors.set(key, neighbor)
+        distances.append(distance)
+    return neighbors.set("distance", torch.stack(distances).amax(0))
+
+
+def _transitions(tensordict: TensorDictBase, in_keys: Sequence[NestedKey]) -> Transitions:
+    transitions = {}
+    for key in in_keys:
+        names = (key, unravel_key(("next", key)))
+        transitions[key] = tuple(tensordict.get(name, None) for name in names)
+        for name, entry in zip(names, transitions[key], strict=True):
+            if entry is None:
+                raise KeyError(
+                    f"a neighborhood needs {name!r}, which the tensordict lacks; it has "
+                    f"{_listed(tensordict)}. Store it, or name the state's entries in in_keys."
+                )
+    return transitions
 
 
 def _listed(entries: TensorDictBase | Composite) -> str:
@@ -21,12 +98,7 @@ def _listed(entries: TensorDictBase | Composite) -> str:
 class _RandomTransform(Transform):
     """A transform whose own generator, if it has one, is part of its ``state_dict``."""
 
-    def __init__(
-        self,
-        in_keys: Sequence[NestedKey] | None,
-        out_keys: Sequence[NestedKey] | None,
-        generator: torch.Generator | None,
-    ) -> None:
+    def __init__(self, in_keys: Any, out_keys: Any, generator: torch.Generator | None) -> None:
         if generator is not None and not isinstance(generator, torch.Generator):
             raise TypeError(
                 f"generator must be a torch.Generator or None, got {generator!r}: pass "
@@ -79,15 +151,14 @@ class NeighborTransform(_RandomTransform):
         out_key: the entry to write. Defaults to ``"neighbor"``.
         num_samples: neighbors ``K`` per state, at least 1. More give a less noisy regularization
             at ``K`` times its network evaluations. Defaults to ``1``.
-        generator: source of the randomness, on the device of the batches. It is saved and
-            restored with the ``state_dict`` of the transform, hence of the buffer. Defaults to
-            PyTorch's global generator. A buffer's own generator does not reach its transforms, so
-            a buffer that prefetches needs one here to be reproducible, and a ``prefetch`` of 1:
-            several threads draw in any order.
+        generator: source of the randomness, on the device of the batches, saved and restored with
+            the ``state_dict`` of the buffer. Defaults to PyTorch's global generator. A buffer's own
+            does not reach its transforms: one that prefetches needs a generator here to be
+            reproducible, and a ``prefetch`` of 1, as several threads draw in any order.
 
     Raises:
-        TypeError: if ``neighborhood`` or ``generator`` is of another type, or, in use, if an
-            entry is not floating point.
+        TypeError: if ``neighborhood``, ``num_samples`` or ``generator`` is of another type, or, in
+            use, if an entry is not floating point.
         ValueError: if ``num_samples`` is not positive, a key is reserved, or the transform is
             appended to an environment, which does not know :math:`s'` when it shows :math:`s`.
         KeyError: in use, if an entry or its successor is missing.
@@ -118,7 +189,7 @@ class NeighborTransform(_RandomTransform):
     ) -> None:
         if not isinstance(neighborhood, Neighborhood):
             raise TypeError(f"neighborhood must be a Neighborhood, got {neighborhood!r}.")
-        check_num_samples(num_samples)
+        check_positive_int("num_samples", num_samples)
         super().__init__(
             in_keys=["observation"] if in_keys is None else in_keys,
             out_keys=[out_key],
@@ -139,69 +210,25 @@ class NeighborTransform(_RandomTransform):
         return self.out_keys[0]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the neighbors and their distances into the tensordict.
-
-        Args:
-            tensordict: states and successors, with any number of batch dimensions.
-
-        Returns:
-            The same tensordict.
-        """
-        return self.place(tensordict, self.draw(tensordict))
-
-    def draw(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The random numbers that :meth:`forward` uses, for use in :meth:`place`.
-
-        A compiled function cannot draw from a generator: draw first and give it the numbers.
-
-        Args:
-            tensordict: states and successors; only their shapes matter.
-
-        Returns:
-            Numbers in ``[0, 1)``, an entry ``[*B, K, *F]`` per key of ``in_keys``.
-        """
-        uniform = TensorDict(batch_size=tensordict.batch_size, device=tensordict.device)
-        for key in self.in_keys:
-            state, _ = self._transition(tensordict, key)
-            numbers = self.neighborhood.draw(
-                state, self.num_samples, self.generator, batch_dims=tensordict.batch_dims
-            )
-            uniform.set(key, numbers)
-        return uniform
-
-    def place(self, tensordict: TensorDictBase, uniform: TensorDictBase) -> TensorDictBase:
-        """Writes the neighbors that belong to given random numbers.
-
-        Args:
-            tensordict: states and successors.
-            uniform: what :meth:`draw` returned.
-
-        Returns:
-            The same tensordict.
-        """
-        neighbors = TensorDict(batch_size=tensordict.batch_size, device=tensordict.device)
-        distances = []
-        for key in self.in_keys:
-            neighbor, distance = self.neighborhood.place(
-                *self._transition(tensordict, key),
-                uniform.get(key),
-                batch_dims=tensordict.batch_dims,
-            )
-            neighbors.set(key, neighbor)
-            distances.append(distance)
-        neighbors.set("distance", torch.stack(distances).amax(0))
+        """Writes neighbors and distances into the tensordict, of any batch size; returns it."""
+        neighbors = draw_neighbors(
+            tensordict, self.neighborhood, self.in_keys, self.num_samples, self.generator
+        )
         return tensordict.set(self.out_key, neighbors)
 
-    def _transition(self, tensordict: TensorDictBase, key: NestedKey) -> tuple[Tensor, Tensor]:
-        next_key = unravel_key(("next", key))
-        state, next_state = tensordict.get(key, None), tensordict.get(next_key, None)
-        for name, entry in ((key, state), (next_key, next_state)):
-            if entry is None:
-                raise KeyError(
-                    f"NeighborTransform needs {name!r}, which the tensordict lacks; it has "
-                    f"{_listed(tensordict)}. Store it, or name the state's entries in in_keys."
-                )
-        return state, next_state
+    def draw(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The random numbers that :meth:`forward` uses, for :meth:`place`: ``[*B, K, *F]`` per key.
+
+        A compiled function cannot draw from a generator: draw first and give it the numbers.
+        """
+        transitions = _transitions(tensordict, self.in_keys)
+        return _draw(tensordict, transitions, self.neighborhood, self.num_samples, self.generator)
+
+    def place(self, tensordict: TensorDictBase, uniform: TensorDictBase) -> TensorDictBase:
+        """Writes the neighbors that belong to the numbers of :meth:`draw`; returns the batch."""
+        transitions = _transitions(tensordict, self.in_keys)
+        neighbors = _place(tensordict, transitions, self.neighborhood, uniform)
+        return tensordict.set(self.out_key, neighbors)
 
     def set_container(self, container: Any) -> None:
         super().set_container(container)
@@ -226,9 +253,8 @@ class ObservationNoise(_RandomTransform):
     Environments of a batch that are not reset keep theirs.
 
     The paper states a "scale" of its white noise (Kobayashi, L2C2, 2022, "Setup"), read here as the
-    standard deviation of a Gaussian [inferred].
-
-    The noise leaves the bounds of the observations, so their spec becomes unbounded.
+    standard deviation of a Gaussian [inferred]. The noise leaves the bounds of the observations, so
+    their spec becomes unbounded.
 
     Args:
         scale: standard deviation of the noise, in units of the observation, finite and at least 0;
@@ -236,17 +262,16 @@ class ObservationNoise(_RandomTransform):
             harder; the paper uses 0.01 and 0.001.
         in_keys: the observations to perturb. Defaults to ``["observation"]``; others, also
             floating-point ones such as the episode's reward sum, stay exact unless named.
-        generator: source of the randomness, on the device of the observations. It is saved and
-            restored with the ``state_dict`` of the environment. Defaults to PyTorch's global
-            generator. TorchRL gives the seed of ``env.set_seed`` to the simulator and not to
-            transforms: seed a generator of its own, or call :func:`torch.manual_seed`. In the
-            workers of a :class:`~torchrl.envs.ParallelEnv` ``set_seed`` does seed the global
-            generator, each worker's with another seed, which a generator made in the environment's
-            constructor would share between the workers.
+        generator: source of the randomness, on the device of the observations, saved and restored
+            with the ``state_dict`` of the environment. Defaults to PyTorch's global generator.
+            TorchRL gives the seed of ``env.set_seed`` to the simulator and not to transforms: seed
+            a generator, or call :func:`torch.manual_seed`. In the workers of a
+            :class:`~torchrl.envs.ParallelEnv` ``set_seed`` seeds each worker's global generator
+            differently, while one made in the environment's constructor would be the same in all.
 
     Raises:
-        TypeError: if ``generator`` is not a generator, or, when an environment takes the
-            transform, if an observation is not floating point.
+        TypeError: if ``scale`` or ``generator`` is of another type, or, when an environment takes
+            the transform, if an observation is not floating point.
         ValueError: if ``scale`` is negative or not finite, or, likewise, does not broadcast to an
             observation.
         KeyError: likewise, if the environment has no such observation.
@@ -270,9 +295,10 @@ class ObservationNoise(_RandomTransform):
     ) -> None:
         in_keys = ["observation"] if in_keys is None else in_keys
         super().__init__(in_keys=in_keys, out_keys=in_keys, generator=generator)
+        several = hasattr(scale, "__len__") and not isinstance(scale, str)
+        for entry in torch.as_tensor(scale).flatten().tolist() if several else [scale]:
+            check_real("scale", entry, at_least=0)
         scale = torch.as_tensor(scale, dtype=torch.get_default_dtype())
-        if not (scale.isfinite() & (scale >= 0)).all():
-            raise ValueError(f"scale must be finite and at least 0, got {scale.tolist()!r}.")
         # A setting, not a state: a checkpoint must not overrule it.
         self.register_buffer("scale", scale, persistent=False)
 

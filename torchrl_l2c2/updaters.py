@@ -11,6 +11,8 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
 
+from torchrl_l2c2._checks import check_real
+
 INITIAL_SCALE = 1e-8
 # Squared distances below this are under the resolution of float32 weights. The floor is met only
 # where source and target stay equal: there the scale would decay to 0, and 0 / 0 is NaN.
@@ -49,6 +51,7 @@ class TSoftUpdate(TargetNetUpdater):
             ``math.inf`` gives the ordinary soft update. Default 1.0.
 
     Raises:
+        TypeError: a setting that is not a real number.
         ValueError: a setting outside its range, or ``loss_module`` is not a loss module.
         RuntimeError: the loss has no target parameters of its own.
 
@@ -76,13 +79,9 @@ class TSoftUpdate(TargetNetUpdater):
     """
 
     def __init__(self, loss_module: LossModule, tau: float = 0.1, nu: float = 1.0) -> None:
-        if not 0.0 < tau <= 1.0:
-            raise ValueError(f"TSoftUpdate: tau must be in (0, 1], got {tau!r}.")
-        if not nu > 0.0:
-            raise ValueError(
-                f"TSoftUpdate: nu must be greater than 0, got {nu!r} (math.inf gives the ordinary "
-                "soft update)."
-            )
+        check_real("TSoftUpdate: tau", tau, above=0, at_most=1)
+        hint = "math.inf gives the ordinary soft update."
+        check_real("TSoftUpdate: nu", nu, above=0, finite=False, hint=hint)
         self.tau = tau
         self.nu = nu
         super().__init__(loss_module)

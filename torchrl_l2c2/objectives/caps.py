@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from numbers import Real
 from typing import Literal
 
 import torch
@@ -19,8 +17,10 @@ from torch.distributions import (
 from torch.distributions.utils import _sum_rightmost
 from torchrl.objectives import LossModule
 
+from torchrl_l2c2._checks import check_choice, check_real
 from torchrl_l2c2.distances import squared_error
-from torchrl_l2c2.objectives.regularized import Policy, RegularizedLoss
+from torchrl_l2c2.objectives.evaluation import Policy
+from torchrl_l2c2.objectives.regularized import RegularizedLoss
 
 
 class CAPSLoss(RegularizedLoss):
@@ -84,8 +84,6 @@ class CAPSLoss(RegularizedLoss):
         0.0
     """
 
-    _schedulable_buffers = frozenset({"caps_lambda_temporal", "caps_lambda_spatial"})
-
     def __init__(
         self,
         base_loss: LossModule,
@@ -95,26 +93,22 @@ class CAPSLoss(RegularizedLoss):
         *,
         mean: Literal["loc", "action"] = "loc",
     ) -> None:
-        if mean not in ("loc", "action"):
-            raise ValueError(f"mean must be 'loc' or 'action', got {mean!r}.")
-        if not isinstance(sigma, Real) or isinstance(sigma, bool):
-            raise TypeError(f"sigma must be a real number, got {sigma!r}.")
-        if not (math.isfinite(sigma) and sigma > 0):
-            raise ValueError(f"sigma must be finite and greater than 0, got {sigma!r}.")
-        if not self._policy_networks():
+        check_choice("mean", mean, ("loc", "action"))
+        check_real("sigma", sigma, above=0)
+        if not self.policy_networks():
             raise TypeError(f"CAPSLoss needs a policy: {type(base_loss).__name__} has none.")
         self.caps_sigma = float(sigma)
         self.caps_mean = mean
-        self._register_coefficient("caps_lambda_temporal", lambda_temporal)
-        self._register_coefficient("caps_lambda_spatial", lambda_spatial)
-        self._regularize(self._policy_networks())
-        self.out_keys = [*self.out_keys, "loss_caps_temporal", "loss_caps_spatial"]
+        self.register_coefficient("caps_lambda_temporal", lambda_temporal)
+        self.register_coefficient("caps_lambda_spatial", lambda_spatial)
+        self.declare_networks(self.policy_networks())
+        self.declare_terms(policy=["loss_caps_temporal", "loss_caps_spatial"])
 
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
         terms = super().policy_regularizer(tensordict)
-        policies = self._policies_at(tensordict, self._states(tensordict))
-        difference = _mean_difference(*policies, squashed=self.caps_mean == "action")
-        temporal, spatial = (self._reduce_term(term, tensordict) for term in difference)
+        here, there = self.policies_at(tensordict, self._states(tensordict))
+        temporal, spatial = _terms(here, there, squashed=self.caps_mean == "action")
+        temporal, spatial = (self.reduce_term(term, tensordict) for term in (temporal, spatial))
         terms.set("loss_caps_temporal", self.caps_lambda_temporal * temporal)
         terms.set("loss_caps_spatial", self.caps_lambda_spatial * spatial)
         return terms
@@ -122,7 +116,7 @@ class CAPSLoss(RegularizedLoss):
     def _states(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The next state and a noisy one, ``[2, *B]``."""
         states = TensorDict(batch_size=[2, *tensordict.batch_size])
-        transitions = self._transitions(tensordict, self._policy_networks())
+        transitions = self.transitions(tensordict, self.policy_networks())
         for key, (state, successor) in transitions.items():
             later = torch.where(successor.isfinite(), successor, state)
             noisy = state + self.caps_sigma * torch.randn_like(state)
@@ -130,13 +124,45 @@ class CAPSLoss(RegularizedLoss):
         return states
 
 
-def _mean_difference(here: Policy, there: Policy, squashed: bool) -> Tensor:
-    if isinstance(here, CompositeDistribution):
-        parts = [
-            _mean_difference(here.dists[name], there.dists[name], squashed) for name in here.dists
-        ]
-        return sum(_sum_rightmost(part, part.ndim - len(here.batch_shape)) for part in parts)
-    return squared_error(_mean(here, squashed), _mean(there, squashed))
+def caps_terms(
+    mean: Tensor,  # shape: [1, *B, A] or [2, *B, A]
+    moved: Tensor,  # shape: [2, *B, A]
+) -> tuple[Tensor, Tensor]:  # shape: [*B], [*B]
+    r"""The temporal and the spatial term of CAPS, before their gains and their reduction.
+
+    .. math::
+        \tfrac12 \lVert\mu(s) - \mu(s')\rVert_2^2, \qquad
+        \tfrac12 \lVert\mu(s) - \mu(\bar s)\rVert_2^2
+
+    (Mysore et al., 2021, in the form of Kobayashi, L2C2, 2022).
+
+    Args:
+        mean: the policy's means at the states.
+        moved: those at the next states, then those at noisy copies of the states.
+
+    Raises:
+        ValueError: their last dimensions differ.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_l2c2.objectives.caps import caps_terms
+        >>> moved = torch.tensor([[[1.0, 0.0]], [[1.0, 2.0]]])
+        >>> caps_terms(torch.zeros(1, 1, 2), moved)
+        (tensor([0.5000]), tensor([2.5000]))
+    """
+    temporal, spatial = squared_error(mean, moved)
+    return temporal, spatial
+
+
+def _terms(here: Policy, there: Policy, squashed: bool) -> tuple[Tensor, Tensor]:
+    """Those of policies ``[2, *B]``; the heads of a composite one add up."""
+    if not isinstance(here, CompositeDistribution):
+        return caps_terms(_mean(here, squashed), _mean(there, squashed))
+    ndim = len(here.batch_shape) - 1
+    heads = [_terms(here.dists[name], there.dists[name], squashed) for name in here.dists]
+    heads = [[_sum_rightmost(term, term.ndim - ndim) for term in head] for head in heads]
+    temporal, spatial = map(sum, zip(*heads, strict=True))
+    return temporal, spatial
 
 
 def _mean(policy: Policy, squashed: bool) -> Tensor:

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import warnings
 
-import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torch.distributions import Categorical
 from torchrl.objectives import DistributionalDQNLoss, LossModule
 
+from torchrl_l2c2._checks import check_positive_int
 from torchrl_l2c2.distances import squared_error, squared_hellinger
 from torchrl_l2c2.neighborhood import Neighborhood
-from torchrl_l2c2.objectives.regularized import VALUE_NETWORKS, RegularizedLoss
+from torchrl_l2c2.objectives.evaluation import VALUE_NETWORKS
+from torchrl_l2c2.objectives.regularized import RegularizedLoss
+from torchrl_l2c2.objectives.transitions import next_key
+from torchrl_l2c2.transforms import draw_neighbors
 
 
 class L2C2Loss(RegularizedLoss):
@@ -120,8 +123,6 @@ class L2C2Loss(RegularizedLoss):
         ['loss_actor', 'loss_value', 'loss_l2c2_actor', 'loss_l2c2_value']
     """
 
-    _schedulable_buffers = frozenset({"l2c2_beta", "l2c2_coeff"})
-
     def __init__(
         self,
         base_loss: LossModule,
@@ -135,36 +136,43 @@ class L2C2Loss(RegularizedLoss):
     ) -> None:
         neighborhood = Neighborhood() if neighborhood is None else neighborhood
         if not isinstance(neighborhood, Neighborhood):
-            raise TypeError(
-                f"neighborhood must be a Neighborhood, got a {type(neighborhood).__name__}."
-            )
-        _check_count("num_samples", num_samples)
+            raise TypeError(f"neighborhood must be a Neighborhood, got {neighborhood!r}.")
+        check_positive_int("num_samples", num_samples)
         if hellinger_samples is not None:
-            _check_count("hellinger_samples", hellinger_samples)
+            check_positive_int("hellinger_samples", hellinger_samples)
         self.l2c2_neighborhood = neighborhood
         self.l2c2_num_samples = num_samples
         self.l2c2_hellinger_samples = hellinger_samples
         self.l2c2_neighbor_key = neighbor_key
-        self._l2c2_policies = self._policy_networks()
-        self._l2c2_values = self._value_networks() if beta else []
-        self._register_coefficient("l2c2_coeff", coeff)
-        self._register_coefficient("l2c2_beta", beta, used=bool(self._l2c2_values))
+        self._l2c2_policies = self.policy_networks()
+        self._l2c2_values = self.value_networks() if beta else []
+        self.register_coefficient("l2c2_coeff", coeff)
+        self.register_coefficient("l2c2_beta", beta, used=bool(self._l2c2_values))
         _check_terms(type(base_loss).__name__, self._l2c2_policies, self._l2c2_values, beta)
-        self._regularize([*self._l2c2_policies, *self._l2c2_values])
-        self.out_keys = [*self.out_keys, *self._l2c2_out_keys()]
+        self.declare_networks([*self._l2c2_policies, *self._l2c2_values])
+        policies, values = self._l2c2_policies, self._l2c2_values
+        self.declare_terms(
+            policy=["loss_l2c2_actor" for _ in policies],
+            value=[_value_term(network) for network in values],
+            diagnostics=[
+                *("l2c2_distance", "l2c2_gain"),
+                *(self._policy_diagnostic() for _ in policies),
+                *(["l2c2_value_distance"] if values else []),
+            ],
+        )
 
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
         terms = super().policy_regularizer(tensordict)
         if not self._l2c2_policies:
             return terms
         states, distance = self._neighbors(tensordict)
-        here, there = self._policies_at(tensordict, states)
+        here, there = self.policies_at(tensordict, states)
         if isinstance(here, Tensor):
             difference = squared_error(here, there)
         else:
             difference = squared_hellinger(here, there, num_samples=self.l2c2_hellinger_samples)
         terms.set("loss_l2c2_actor", self._penalty(difference, distance, tensordict))
-        terms.set(self._policy_diagnostic(), self._diagnostic(difference.mean(0), tensordict))
+        terms.set(self._policy_diagnostic(), self.reduce_diagnostic(difference.mean(0), tensordict))
         return terms.update(self._gain_diagnostics(distance, tensordict))
 
     def value_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -177,59 +185,35 @@ class L2C2Loss(RegularizedLoss):
             difference = self._value_difference(network, tensordict, states)
             penalty = self._penalty(difference, distance, tensordict)
             terms.set(_value_term(network), self.l2c2_beta * penalty)
-            diagnostics.append(self._diagnostic(difference.mean(0), tensordict))
+            diagnostics.append(self.reduce_diagnostic(difference.mean(0), tensordict))
         terms.set("l2c2_value_distance", sum(diagnostics))
         return terms.update(self._gain_diagnostics(distance, tensordict))
+
+    def known_states(self, tensordict: TensorDictBase) -> TensorDictBase | None:
+        if tensordict.get(self.l2c2_neighbor_key, None) is None:
+            return super().known_states(tensordict)
+        return self._neighbors(tensordict)[0]
 
     def _value_difference(
         self, network: str, tensordict: TensorDictBase, states: TensorDictBase
     ) -> Tensor:
-        here, there = self._values_at(network, tensordict, states)
+        here, there = self.values_at(network, tensordict, states)
         if isinstance(self, DistributionalDQNLoss):
             # Logarithms of the atoms' probabilities, [K, *B, atoms, actions].
             policies = (Categorical(logits=value.transpose(-1, -2)) for value in (here, there))
             return squared_hellinger(*policies).sum(-1)
         difference = squared_error(here, there)
-        return difference.sum(0) if self._is_ensemble(network) else difference
+        return difference.sum(0) if self.is_ensemble(network) else difference
 
     def _penalty(self, difference: Tensor, distance: Tensor, tensordict: TensorDictBase) -> Tensor:
-        gain = self.l2c2_neighborhood.gain(_match(distance, difference))
-        return self.l2c2_coeff * self._reduce_term((gain * difference).mean(0), tensordict)
-
-    def _prepare(self, tensordict: TensorDictBase) -> TensorDictBase:
-        tensordict = super()._prepare(tensordict)
-        if tensordict.get(self.l2c2_neighbor_key, None) is None:
-            tensordict = tensordict.copy().set(self.l2c2_neighbor_key, self._draw(tensordict))
-        return tensordict
-
-    def _draw(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """What NeighborTransform would have written."""
-        neighbor = TensorDict(batch_size=tensordict.batch_size)
-        distances = []
-        networks = [*self._l2c2_policies, *self._l2c2_values]
-        for key, (state, successor) in self._transitions(tensordict, networks).items():
-            drawn, distance = self.l2c2_neighborhood.sample(
-                state, successor, self.l2c2_num_samples, batch_dims=tensordict.batch_dims
-            )
-            neighbor.set(key, drawn)
-            distances.append(distance)
-        return neighbor.set("distance", torch.stack(distances).amax(0))
-
-    def _known_states(self, tensordict: TensorDictBase) -> TensorDictBase | None:
-        if tensordict.get(self.l2c2_neighbor_key, None) is None:
-            return super()._known_states(tensordict)
-        return self._neighbors(tensordict)[0]
+        penalty = l2c2_penalty(difference, self.l2c2_neighborhood.gain(distance))
+        return self.l2c2_coeff * self.reduce_term(penalty, tensordict)
 
     def _neighbors(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
-        """The neighbors and their distances, both ``[K, *B]``; made once in a forward pass."""
-        if "neighbors" not in self._evaluated:
-            neighbors = self._read_neighbors(tensordict)
-            if "batch" not in self._evaluated:
-                return neighbors
-            self._evaluated["neighbors"] = neighbors
-        return self._evaluated["neighbors"]
+        """The neighbors and their distances, both ``[K, *B]``."""
+        return self.made_once("l2c2_neighbors", lambda: self._make_neighbors(tensordict))
 
-    def _read_neighbors(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
+    def _make_neighbors(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
         neighbor = tensordict.get(self.l2c2_neighbor_key, None)
         if neighbor is None:
             neighbor = self._draw(tensordict)
@@ -245,31 +229,51 @@ class L2C2Loss(RegularizedLoss):
         distance = entries.pop("distance")
         return TensorDict(entries, batch_size=distance.shape), distance
 
+    def _draw(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """What NeighborTransform would have written."""
+        keys = list(self.transitions(tensordict, [*self._l2c2_policies, *self._l2c2_values]))
+        states = tensordict.select(*keys, *map(next_key, keys)).detach()
+        return draw_neighbors(states, self.l2c2_neighborhood, keys, self.l2c2_num_samples)
+
     def _gain_diagnostics(self, distance: Tensor, tensordict: TensorDictBase) -> dict[str, Tensor]:
         gain = self.l2c2_coeff * self.l2c2_neighborhood.gain(distance)
         return {
-            "l2c2_distance": self._diagnostic(distance.mean(0), tensordict),
-            "l2c2_gain": self._diagnostic(gain.mean(0), tensordict),
+            "l2c2_distance": self.reduce_diagnostic(distance.mean(0), tensordict),
+            "l2c2_gain": self.reduce_diagnostic(gain.mean(0), tensordict),
         }
 
     def _policy_diagnostic(self) -> str:
-        return "l2c2_hellinger" if self._has_stochastic_policy() else "l2c2_action_distance"
+        return "l2c2_hellinger" if self.has_stochastic_policy() else "l2c2_action_distance"
 
-    def _l2c2_out_keys(self) -> list[str]:
-        keys = ["loss_l2c2_actor"] if self._l2c2_policies else []
-        keys += [_value_term(network) for network in self._l2c2_values]
-        keys += ["l2c2_distance", "l2c2_gain"]
-        keys += [self._policy_diagnostic()] if self._l2c2_policies else []
-        return keys + (["l2c2_value_distance"] if self._l2c2_values else [])
+
+def l2c2_penalty(
+    difference: Tensor,  # shape: [K, *B, ...]
+    gain: Tensor,  # shape: [K, *B]
+) -> Tensor:  # shape: [*B, ...]
+    r"""The mean over ``K`` neighbors of the gain times the difference, before the reduction.
+
+    .. math::
+        \frac1K \sum_k \frac{\lambda}{d(s, \tilde s_k; s')}\, d_f(f(s), f(\tilde s_k))
+
+    of a policy or a value function :math:`f` (Kobayashi, L2C2, 2022).
+
+    Args:
+        difference: :math:`d_f`, at least 0; it may have more dimensions, those of agents.
+        gain: :math:`\lambda / d`, as :meth:`Neighborhood.gain <torchrl_l2c2.Neighborhood.gain>`
+            gives it.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_l2c2.objectives.l2c2 import l2c2_penalty
+        >>> l2c2_penalty(torch.tensor([[1.0, 2.0], [3.0, 4.0]]), torch.tensor([[1.0], [0.5]]))
+        tensor([1.2500, 2.0000])
+    """
+    gain = gain[(...,) + (None,) * (difference.ndim - gain.ndim)]
+    return (gain * difference).mean(0)
 
 
 def _value_term(network: str) -> str:
     return "loss_l2c2_" + network.removesuffix("_network")
-
-
-def _match(distance: Tensor, difference: Tensor) -> Tensor:
-    """Distances ``[K, *B]`` for differences that may have more dimensions, those of agents."""
-    return distance[(...,) + (None,) * (difference.ndim - distance.ndim)]
 
 
 def _check_terms(loss: str, policies: list[str], values: list[str], beta: float) -> None:
@@ -291,10 +295,3 @@ def _check_terms(loss: str, policies: list[str], values: list[str], beta: float)
             "the policy alone. Pass beta=0 to say so.",
             stacklevel=3,
         )
-
-
-def _check_count(name: str, value: int) -> None:
-    if not isinstance(value, int) or isinstance(value, bool):
-        raise TypeError(f"{name} must be an integer, got {value!r} ({type(value).__name__}).")
-    if value < 1:
-        raise ValueError(f"{name} must be at least 1, got {value!r}.")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -15,15 +14,24 @@ from tensordict.nn import (
     dispatch,
 )
 from torch import Tensor
-from torchrl.objectives import LossModule, ValueEstimators
+from torchrl.objectives import ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator
+
+from torchrl_l2c2._checks import check_choice, check_real
+from torchrl_l2c2.objectives.relative_pearson import (
+    actor_loss,
+    critic_loss,
+    relative_density_ratio,
+    update_deviation,
+)
+from torchrl_l2c2.objectives.shared_evaluation import SharedEvaluation
 
 # exp(20) is far beyond any ratio that the loss treats differently (the relative ratio is within
 # 1e-8 of its end there) and far below what overflows when it is squared in float32.
 MAX_LOG_RATIO = 20.0
 
 
-class PPORPELoss(LossModule):
+class PPORPELoss(SharedEvaluation):
     r"""Proximal policy optimization with relative Pearson divergence, one-step actor-critic.
 
     The divergence between the learned policy :math:`\pi` and the one that acted, :math:`b`, is
@@ -76,6 +84,7 @@ class PPORPELoss(LossModule):
         reduction (str): ``"mean"``, ``"sum"`` or ``"none"``. Default ``"mean"``.
 
     Raises:
+        TypeError: a setting of another type.
         ValueError: a setting outside its range, or a threshold so wide that :math:`C` could
             change its sign.
 
@@ -153,23 +162,19 @@ class PPORPELoss(LossModule):
         reduction: str = "mean",
     ) -> None:
         super().__init__()
-        _check_range("gamma", gamma, 0.0 <= gamma < 1.0, "in [0, 1)")
-        _check_range("beta", beta, 0.0 < beta < 1.0, "in (0, 1)")
-        _check_range("decay", decay, 0.0 <= decay <= 1.0, "in [0, 1]")
-        _check_range("delta_min", delta_min, 0.0 < delta_min <= 1.0, "in (0, 1]")
+        check_real("PPORPELoss: gamma", gamma, at_least=0, below=1)
+        check_real("PPORPELoss: beta", beta, above=0, below=1)
+        check_real("PPORPELoss: decay", decay, at_least=0, at_most=1)
+        check_real("PPORPELoss: delta_min", delta_min, above=0, at_most=1)
         # |rho_R - 1| is at most max(1, 1/beta - 1); at that threshold C must still be positive.
         widest = 2.0 * (1.0 - beta) / (beta * max(1.0, 1.0 / beta - 1.0))
-        _check_range(
-            "kappa",
-            kappa,
-            0.0 < kappa < widest,
-            f"in (0, {widest:.4g}) with beta={beta}: beyond it the penalty's gain changes sign",
-        )
-        _check_choice("threshold", threshold, ("max", "ema"))
-        _check_choice("critic_weighting", critic_weighting, ("ratio", "none"))
-        _check_choice("baseline", baseline, ("stored", "target"))
-        _check_choice("importance", importance, ("max", "mean"))
-        _check_choice("reduction", reduction, ("mean", "sum", "none"))
+        hint = f"Beyond it, with beta={beta}, the penalty's gain changes its sign."
+        check_real("PPORPELoss: kappa", kappa, above=0, below=widest, hint=hint)
+        check_choice("PPORPELoss: threshold", threshold, ("max", "ema"))
+        check_choice("PPORPELoss: critic_weighting", critic_weighting, ("ratio", "none"))
+        check_choice("PPORPELoss: baseline", baseline, ("stored", "target"))
+        check_choice("PPORPELoss: importance", importance, ("max", "mean"))
+        check_choice("PPORPELoss: reduction", reduction, ("mean", "sum", "none"))
 
         self.convert_to_functional(actor_network, "actor_network", create_target_params=True)
         self.convert_to_functional(critic_network, "critic_network", create_target_params=True)
@@ -260,13 +265,13 @@ class PPORPELoss(LossModule):
         tensordict.set(self.tensor_keys.priority, advantage.abs())
 
         ratio = self._log_ratio(tensordict).clamp(-MAX_LOG_RATIO, MAX_LOG_RATIO).exp()
-        relative_ratio = ratio / (1.0 - self.beta + self.beta * ratio)
-        deviation, epsilon = self._update_threshold(relative_ratio.detach())
+        relative_ratio = relative_density_ratio(ratio.detach(), self.beta)
+        deviation, threshold = self._update_threshold(relative_ratio)
 
-        loss_actor = self._actor_loss(advantage, ratio, relative_ratio, epsilon)
-        loss_critic = 0.5 * (target - heads).square().sum(-1)
+        loss_actor = actor_loss(advantage, ratio, threshold, self.beta)
+        loss_critic = critic_loss(target, heads)
         if self.critic_weighting == "ratio":
-            loss_critic = loss_critic * relative_ratio.detach()
+            loss_critic = loss_critic * relative_ratio
 
         weight = self._importance_weight(tensordict)
         return TensorDict(
@@ -274,7 +279,7 @@ class PPORPELoss(LossModule):
                 "loss_actor": self._reduce_loss(weight * loss_actor, tensordict),
                 "loss_critic": self._reduce_loss(weight * loss_critic, tensordict),
                 "ratio_deviation": deviation,
-                "ratio_threshold": epsilon,
+                "ratio_threshold": threshold,
             }
         )
 
@@ -284,7 +289,7 @@ class PPORPELoss(LossModule):
             return 1.0
         return weight / (weight.max() if self.importance == "max" else weight.mean())
 
-    def _evaluate_batch(self, network: str, tensordict: TensorDictBase) -> TensorDictBase:
+    def evaluate_at_batch(self, network: str, tensordict: TensorDictBase) -> TensorDictBase:
         """What a network writes at the batch's own states; a regularizer reads it here as well."""
         net = getattr(self, network)
         run = net.get_dist_params if network == "actor_network" else net
@@ -293,7 +298,7 @@ class PPORPELoss(LossModule):
 
     def _values(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """The heads ``[*B, K]`` and their mean ``[*B, 1]``; one head where there is no ensemble."""
-        written = self._evaluate_batch("critic_network", tensordict)
+        written = self.evaluate_at_batch("critic_network", tensordict)
         value = written.get(self.tensor_keys.value)
         heads = written.get(self.tensor_keys.value_heads, None)
         return (value if heads is None else heads), value
@@ -306,7 +311,7 @@ class PPORPELoss(LossModule):
 
     def _log_ratio(self, tensordict: TensorDictBase) -> Tensor:
         action = tensordict.get(self.tensor_keys.action)
-        parameters = self._evaluate_batch("actor_network", tensordict)
+        parameters = self.evaluate_at_batch("actor_network", tensordict)
         log_prob = self.actor_network.build_dist_from_params(parameters).log_prob(action)
         if self.baseline == "stored":
             return log_prob - tensordict.get(self.tensor_keys.sample_log_prob)
@@ -316,36 +321,16 @@ class PPORPELoss(LossModule):
 
     @torch.no_grad()
     def _update_threshold(self, relative_ratio: Tensor) -> tuple[Tensor, Tensor]:
-        # One NaN shows in the losses; it must not stay in the running maximum as well.
-        deviation = (relative_ratio - 1.0).abs().nan_to_num(0.0)
-        if self.threshold == "max":
-            deviation = deviation.max()
-            delta = torch.maximum(self.decay * self.delta, deviation)
-        else:
-            deviation = deviation.mean()
-            delta = self.decay * self.delta + (1.0 - self.decay) * deviation
-        self.delta.copy_(delta.clamp_min(self.delta_min))
+        deviation, delta = update_deviation(
+            self.delta,
+            relative_ratio,
+            decay=self.decay,
+            floor=self.delta_min,
+            reading=self.threshold,
+        )
+        self.delta.copy_(delta)
         return deviation, self.kappa * self.delta
-
-    def _actor_loss(
-        self, advantage: Tensor, ratio: Tensor, relative_ratio: Tensor, epsilon: Tensor
-    ) -> Tensor:
-        stationary = (1.0 - self.beta) - advantage.sign() * self.beta * epsilon / 2.0
-        gain = advantage.abs() / (epsilon * stationary)
-        mixture = 1.0 - self.beta + self.beta * ratio
-        divergence = 0.5 * mixture * (relative_ratio - 1.0).square()
-        return gain * divergence - advantage * ratio
 
 
 def _next(key: NestedKey) -> NestedKey:
     return ("next", key) if isinstance(key, str) else ("next", *key)
-
-
-def _check_range(name: str, value: float, inside: bool, allowed: str) -> None:
-    if not (math.isfinite(value) and inside):
-        raise ValueError(f"PPORPELoss: {name} must be {allowed}, got {value}.")
-
-
-def _check_choice(name: str, value: str, allowed: tuple[str, ...]) -> None:
-    if value not in allowed:
-        raise ValueError(f"PPORPELoss: {name} must be one of {allowed}, got {value!r}.")

@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
+from torchrl_l2c2._checks import check_real
+
 TINY = torch.finfo(torch.float32).tiny
 SUPPORTED_DTYPES = (torch.float32, torch.float64)
 
@@ -58,7 +60,7 @@ class AdaTerm(Optimizer):
 
     Raises:
         TypeError: a parameter is neither float32 nor float64: squared scales as small as ``eps**2``
-            do not fit into half precision.
+            do not fit into half precision; or a setting is not a real number.
         ValueError: a setting outside its range.
 
     .. note:: **Warm-up.** Scales start at ``eps``, so the first gradients of usual size look like
@@ -112,7 +114,7 @@ class AdaTerm(Optimizer):
                 ``nu_min``.
 
         Raises:
-            TypeError: a parameter is neither float32 nor float64.
+            TypeError: a parameter is neither float32 nor float64, or a setting is no real number.
             ValueError: a setting outside its range.
         """
         _check_settings({**self.defaults, **param_group})
@@ -256,13 +258,12 @@ def _alike(params: list[Tensor]) -> Iterable[tuple[list[Tensor], list[Tensor]]]:
 
 
 def _check_settings(group: dict[str, Any]) -> None:
-    if isinstance(group["lr"], Tensor) and group["lr"].numel() != 1:
-        raise ValueError(f"AdaTerm: lr must be a single number, got shape {group['lr'].shape}.")
-    for name, inside, allowed in (
-        ("lr", group["lr"] >= 0.0, "at least 0"),
-        ("beta", 0.0 < group["beta"] < 1.0, "in (0, 1)"),
-        ("eps", group["eps"] > TINY**0.5, f"greater than {TINY**0.5:.2g}, to have a square"),
-        ("nu_min", group["nu_min"] > 0.0, "greater than 0"),
-    ):
-        if not (inside and math.isfinite(group[name])):
-            raise ValueError(f"AdaTerm: {name} must be finite and {allowed}, got {group[name]!r}.")
+    lr = group["lr"]
+    if isinstance(lr, Tensor):
+        if lr.numel() != 1:
+            raise ValueError(f"AdaTerm: lr must be a single number, got shape {tuple(lr.shape)}.")
+        lr = lr.item()
+    check_real("AdaTerm: lr", lr, at_least=0)
+    check_real("AdaTerm: beta", group["beta"], above=0, below=1)
+    check_real("AdaTerm: eps", group["eps"], above=TINY**0.5, hint="Its square must not be 0.")
+    check_real("AdaTerm: nu_min", group["nu_min"], above=0)

@@ -1,0 +1,92 @@
+"""What a setting may be: a positive integer, a real number in a range, one of some choices."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from numbers import Real
+from typing import Any
+
+
+def check_positive_int(name: str, value: Any) -> None:
+    """Refuses all but integers of at least 1; ``True`` is not one.
+
+    Raises:
+        TypeError: it is not an integer.
+        ValueError: it is below 1.
+    """
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise TypeError(f"{name} must be an integer, got {value!r} ({type(value).__name__}).")
+    if value < 1:
+        raise ValueError(f"{name} must be at least 1, got {value!r}.")
+
+
+def check_real(
+    name: str,
+    value: Any,
+    *,
+    above: float | None = None,
+    at_least: float | None = None,
+    below: float | None = None,
+    at_most: float | None = None,
+    finite: bool = True,
+    hint: str = "",
+) -> None:
+    """Refuses all but real numbers within bounds; ``True`` is not one, and NaN never is within.
+
+    Args:
+        name: what the message calls it.
+        value: what was given.
+        above: lower bound, itself outside.
+        at_least: lower bound, itself inside.
+        below: upper bound, itself outside.
+        at_most: upper bound, itself inside.
+        finite: whether infinity is refused.
+        hint: what to do instead, a sentence that ends the message.
+
+    Raises:
+        TypeError: it is not a real number.
+        ValueError: it is not finite or not within the bounds.
+    """
+    if not isinstance(value, Real) or isinstance(value, bool):
+        raise TypeError(f"{name} must be a real number, got {value!r} ({type(value).__name__}).")
+    inside = (
+        (above is None or value > above)
+        and (at_least is None or value >= at_least)
+        and (below is None or value < below)
+        and (at_most is None or value <= at_most)
+        and not math.isnan(value)
+        and (not finite or math.isfinite(value))
+    )
+    if not inside:
+        allowed = _range(above, at_least, below, at_most, finite)
+        raise ValueError(f"{name} must be {allowed}, got {value!r}.{hint and ' ' + hint}")
+
+
+def check_choice(name: str, value: Any, allowed: Sequence[str]) -> None:
+    """Refuses all but the strings that are allowed.
+
+    Raises:
+        TypeError: it is not a string.
+        ValueError: it is another one.
+    """
+    listed = " or ".join(map(repr, allowed))
+    if not isinstance(value, str):
+        raise TypeError(f"{name} must be {listed}, got {value!r} ({type(value).__name__}).")
+    if value not in allowed:
+        raise ValueError(f"{name} must be {listed}, got {value!r}.")
+
+
+def _range(
+    above: float | None,
+    at_least: float | None,
+    below: float | None,
+    at_most: float | None,
+    finite: bool,
+) -> str:
+    low, high = (above if at_least is None else at_least), (below if at_most is None else at_most)
+    if high is not None:
+        brackets = "(" if at_least is None else "[", ")" if at_most is None else "]"
+        return f"in {brackets[0]}{low:.4g}, {high:.4g}{brackets[1]}"
+    bound = f"greater than {low:.4g}" if at_least is None else f"at least {low:.4g}"
+    return f"finite and {bound}" if finite else bound

@@ -1,0 +1,149 @@
+"""A class for a class: ``Extension[Loss]``, whose objects are made of a loss's very state."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import types
+from typing import Any
+
+from tensordict import NestedKey
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+from torchrl.objectives import LossModule
+
+# What nn.Module itself keeps: dictionaries that two losses must not share.
+_REGISTRIES = frozenset(vars(nn.Module()))
+
+
+class SpecializedLoss(LossModule):
+    """A loss made of another loss, as an object of a subclass of its class.
+
+    ``Extension(loss, ...)``, with ``Extension`` a subclass of this one, returns an instance of
+    ``Extension[type(loss)]``, a subclass of both classes that is made once for each pair. The
+    object holds the networks, parameters and buffers of ``loss`` themselves, not copies, and
+    ``loss`` stays as it was. When the ``__init__`` of ``Extension`` runs, the object already is the
+    loss: no other constructor is to be called. ``Extension`` defines a ``forward``.
+
+    Args:
+        base_loss (LossModule): the loss.
+
+    Raises:
+        TypeError: it is no loss, has been wrapped by this class before, or has methods of its own
+            that this class would hide.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl.modules import Actor, ValueOperator
+        >>> from torchrl.objectives import DDPGLoss
+        >>> from torchrl_l2c2.objectives.specialization import SpecializedLoss
+        >>> class CountingLoss(SpecializedLoss):
+        ...     def __init__(self, base_loss):
+        ...         self.calls = 0
+        ...
+        ...     def forward(self, tensordict):
+        ...         self.calls += 1
+        ...         return super().forward(tensordict)
+        >>> value = ValueOperator(torch.nn.Bilinear(3, 1, 1), in_keys=["observation", "action"])
+        >>> loss = CountingLoss(DDPGLoss(Actor(torch.nn.Linear(3, 1)), value))
+        >>> type(loss).__name__, isinstance(loss, DDPGLoss)
+        ('CountingLoss[DDPGLoss]', True)
+    """
+
+    # Many losses compute these lists whenever they are read, which Dynamo cannot trace through
+    # super(); here they are stored.
+    in_keys = TensorDictModuleBase.in_keys
+    out_keys = TensorDictModuleBase.out_keys
+
+    _parts: tuple[type, ...] = ()
+
+    def __class_getitem__(cls, base_class: type[LossModule]) -> type[SpecializedLoss]:
+        """The subclass of this class and of ``base_class``."""
+        if not (isinstance(base_class, type) and issubclass(base_class, LossModule)):
+            raise TypeError(f"{cls.__name__}[...] takes a class of losses, got {base_class!r}.")
+        return _specialize(cls, base_class)
+
+    def __new__(cls, base_loss: LossModule, *args: Any, **kwargs: Any) -> SpecializedLoss:
+        if not isinstance(base_loss, LossModule):
+            raise TypeError(
+                f"{cls.__name__} wraps a torchrl.objectives.LossModule, got a "
+                f"{type(base_loss).__name__}."
+            )
+        specialized = cls if cls._parts else cls[type(base_loss)]
+        if type(base_loss) not in specialized.__mro__:
+            raise TypeError(f"{cls.__name__} cannot wrap a {type(base_loss).__name__}.")
+        self = object.__new__(specialized)
+        _adopt(self, base_loss)
+        return self
+
+    def set_keys(self, **kwargs: NestedKey | None) -> None:
+        """As for the loss itself."""
+        super().set_keys(**kwargs)
+        self.in_keys = super().in_keys
+
+    def __reduce_ex__(self, protocol: int) -> tuple[Any, ...]:
+        # A class made here has no name that can be imported; the classes that it is made of have.
+        parts = vars(type(self)).get("_parts", (type(self),))
+        return (_make_empty, parts, *super().__reduce_ex__(protocol)[2:])
+
+
+# TorchRL's metaclass gives every class a forward of its own; here it would hide the loss's.
+del SpecializedLoss.forward
+
+
+@functools.cache
+def _specialize(extension: type[SpecializedLoss], base: type[LossModule]) -> type:
+    if extension._parts:
+        raise TypeError(f"{extension.__name__} is made for one class of losses already.")
+    for part in getattr(base, "_parts", ()):
+        if issubclass(extension, part) or issubclass(part, extension):
+            raise TypeError(f"a {base.__name__} is already wrapped by {part.__name__}.")
+    _check_no_clash(extension, base)
+    namespace = {
+        "__module__": extension.__module__,
+        "__doc__": extension.__doc__,
+        "_parts": (extension, *getattr(base, "_parts", (base,))),
+    }
+    name = f"{extension.__name__}[{base.__name__}]"
+    return types.new_class(name, (extension, base), exec_body=lambda ns: ns.update(namespace))
+
+
+def _check_no_clash(extension: type[SpecializedLoss], base: type[LossModule]) -> None:
+    """Refuses to hide, by chance, a method of the loss that it needs itself.
+
+    What a class that both inherit from declares, is there to be overridden.
+    """
+    common = set(extension.__mro__) & set(base.__mro__)
+    ours = _names(set(extension.__mro__) - common)
+    theirs = _names(set(base.__mro__) - common)
+    clash = sorted(name for name in ours & theirs - _names(common) if not name.startswith("__"))
+    if clash:
+        raise TypeError(
+            f"{extension.__name__} and {base.__name__} both define {clash}: rename one of them."
+        )
+
+
+def _names(classes: set[type]) -> set[str]:
+    return {name for cls in classes for name in vars(cls)}
+
+
+def _adopt(self: SpecializedLoss, base_loss: LossModule) -> None:
+    """Makes the base's state this object's own, down to where the two have to differ."""
+    state = self.__dict__
+    for name, value in vars(base_loss).items():
+        state[name] = copy.copy(value) if name in _REGISTRIES else value
+    # Renaming keys here must not rename them there.
+    state["_tensor_keys"] = copy.copy(base_loss.tensor_keys)
+    if "_value_estimator" in self._modules:
+        self._modules["_value_estimator"] = copy.copy(base_loss._value_estimator)
+    # These hooks refer to the module that they were registered on, and weakly.
+    for key, hook in self._load_state_dict_pre_hooks.items():
+        if hook.with_module:
+            self._load_state_dict_pre_hooks[key] = type(hook)(hook.hook, self)
+    self.in_keys = getattr(base_loss, "in_keys", [])
+    self.out_keys = getattr(base_loss, "out_keys", [])
+
+
+def _make_empty(*parts: type) -> SpecializedLoss:
+    cls = functools.reduce(lambda base, extension: extension[base], reversed(parts))
+    return object.__new__(cls)

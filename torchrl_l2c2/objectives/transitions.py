@@ -1,0 +1,107 @@
+"""The transitions that a loss is trained on: which losses are, and what lies in their batches."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from torch import Tensor
+from torchrl.objectives import (
+    DreamerActorLoss,
+    DreamerV3ActorLoss,
+    DreamerV3Loss,
+    DreamerV3ValueLoss,
+    DreamerValueLoss,
+    LossModule,
+)
+
+IMAGINING = (
+    DreamerActorLoss,
+    DreamerValueLoss,
+    DreamerV3ActorLoss,
+    DreamerV3ValueLoss,
+    DreamerV3Loss,
+)
+"""Losses that evaluate their networks along trajectories of a learned model."""
+
+
+def check_is_trained_on_transitions(loss: LossModule) -> None:
+    """Refuses losses whose networks are not evaluated at observed states with a successor.
+
+    Args:
+        loss (LossModule): the loss.
+
+    Raises:
+        TypeError: it is of another kind; the message says which.
+    """
+    # Here, as it takes a while to import and few have a use for it.
+    from torchrl.objectives.llm import DistillationLoss, GRPOLoss, SFTLoss
+
+    name, in_keys = type(loss).__name__, getattr(loss, "in_keys", [])
+    if isinstance(loss, DistillationLoss | GRPOLoss | SFTLoss):
+        raise TypeError(
+            f"{name} trains a language model: its states are texts, made of tokens, and between "
+            "two of them there is nothing to regularize."
+        )
+    if isinstance(loss, IMAGINING):
+        raise TypeError(
+            f"{name} evaluates its networks along trajectories that a learned model imagines, not "
+            "at single observed states, so that there is no neighborhood to regularize them in."
+        )
+    if in_keys and not any(isinstance(key, tuple) and key[0] == "next" for key in in_keys):
+        raise TypeError(
+            f"{name} is not trained on transitions (it reads {sorted(in_keys, key=str)}): "
+            "without a next observation there is nothing to regularize between."
+        )
+
+
+def find_transitions(
+    tensordict: TensorDictBase, states: Mapping[str, Iterable[NestedKey]]
+) -> dict[NestedKey, tuple[Tensor, Tensor]]:
+    """The states that networks read, with their successors; both without a gradient.
+
+    Inputs that are not floating point (masks, labels) or have no successor (goals) are not
+    among them.
+
+    Args:
+        tensordict (TensorDictBase): the batch, ``[*B]``.
+        states (Mapping): the keys of the states that each network reads, by its name.
+
+    Returns:
+        dict: by their keys, states and successors, each ``[*B, *F]``.
+
+    Raises:
+        TypeError: a network reads no floating-point state.
+        KeyError: no state that a network reads has a successor.
+    """
+    keys = dict.fromkeys(key for read in states.values() for key in read)
+    tensordict = tensordict.select(*keys, *map(next_key, keys), strict=False).detach()
+    found = {key: tensordict.get(key, None) for key in keys}
+    pairs: dict[NestedKey, tuple[Tensor, Tensor]] = {}
+    for network, read in states.items():
+        floating = [key for key in read if _is_floating_point(found[key])]
+        if not floating:
+            kinds = {key: getattr(found[key], "dtype", type(found[key]).__name__) for key in read}
+            raise TypeError(
+                f"{network} needs a floating-point observation among its inputs to be regularized, "
+                f"got {kinds}: cast it in the environment, the collector or the replay buffer. A "
+                "network that reads no observation has nothing to regularize."
+            )
+        successors = {key: tensordict.get(next_key(key), None) for key in floating}
+        present = {key: (found[key], s) for key, s in successors.items() if s is not None}
+        if not present:
+            raise KeyError(
+                f"{network} needs the next observation to be regularized, and the batch has no "
+                f"{list(map(next_key, floating))}: keep what the collector wrote there."
+            )
+        pairs.update(present)
+    return {key: pairs[key] for key in keys if key in pairs}
+
+
+def next_key(key: NestedKey) -> NestedKey:
+    """Where the successor of an entry lies."""
+    return unravel_key(("next", key))
+
+
+def _is_floating_point(value: object) -> bool:
+    return isinstance(value, Tensor) and value.is_floating_point()
