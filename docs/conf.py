@@ -29,9 +29,10 @@ autodoc_member_order = "bysource"
 napoleon_use_ivar = True
 python_use_unqualified_type_names = True
 
-# A reference to this package that leads nowhere is an error; others have no page here.
+# A reference to this package that leads nowhere is an error; other packages and type variables
+# have no entry here.
 nitpicky = True
-nitpick_ignore_regex = [("py:.*", r"(?!torchrl_l2c2).*")]
+nitpick_ignore_regex = [("py:.*", r"(?!torchrl_l2c2).*|.*\.Made")]
 
 html_theme = "furo"
 html_title = f"torchrl_l2c2 {__version__}"

@@ -27,18 +27,18 @@ class ActionStepLoss(RegularizedLoss):
 
     def __init__(self, base_loss: LossModule, tolerance: float) -> None:
         self.step_tolerance = tolerance
-        self._regularize(["actor_network"])
-        self.out_keys = [*self.out_keys, "loss_action_step"]
+        self.declare_networks(["actor_network"])
+        self.declare_terms(policy=["loss_action_step"])
 
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
         terms = super().policy_regularizer(tensordict)
         # States to compare with the batch's have one more dimension in front: [1, *B].
         later = tensordict["next"].select("observation").unsqueeze(0)
-        here, there = self._policies_at(tensordict, later)
+        here, there = self.policies_at(tensordict, later)
         step = here.deterministic_sample - there.deterministic_sample
         excess = (step.abs() - self.step_tolerance).clamp_min(0.0)
         cost = 0.5 * excess.square().sum(-1).mean(0)
-        return terms.set("loss_action_step", self._reduce_term(cost, tensordict))
+        return terms.set("loss_action_step", self.reduce_term(cost, tensordict))
 
 
 def main(frames: int) -> None:

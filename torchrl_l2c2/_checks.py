@@ -50,13 +50,14 @@ def check_real(
     """
     if not isinstance(value, Real) or isinstance(value, bool):
         raise TypeError(f"{name} must be a real number, got {value!r} ({type(value).__name__}).")
+    number = float(value)
     inside = (
-        (above is None or value > above)
-        and (at_least is None or value >= at_least)
-        and (below is None or value < below)
-        and (at_most is None or value <= at_most)
-        and not math.isnan(value)
-        and (not finite or math.isfinite(value))
+        (above is None or number > above)
+        and (at_least is None or number >= at_least)
+        and (below is None or number < below)
+        and (at_most is None or number <= at_most)
+        and not math.isnan(number)
+        and (not finite or math.isfinite(number))
     )
     if not inside:
         allowed = _range(above, at_least, below, at_most, finite)
