@@ -19,6 +19,13 @@ def test_ruff_is_content(arguments):
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+def test_the_types_fit():
+    """With the rules of pyproject.toml, over the whole package."""
+    command = [sys.executable, "-m", "mypy"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
 def test_importing_the_components_needs_nothing_of_the_experiment():
     """No Hydra, Gymnasium, PyBullet or drawing library beyond what torchrl itself imports."""
     code = (
