@@ -65,8 +65,10 @@ def main(frames: int) -> None:
             optimizer.zero_grad()
             updater.step()
 
+    test_env = GymEnv("Pendulum-v1")
+    test_env.set_seed(1)
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
-        episode = GymEnv("Pendulum-v1").rollout(200, actor)
+        episode = test_env.rollout(200, actor)
     print(f"return {episode['next', 'reward'].sum().item():.1f}")
     print(f"action variation {action_variation(episode['action']).item():.3f}")
     print(f"loss_action_step {terms['loss_action_step'].item():.5f}")

@@ -57,8 +57,10 @@ def main(frames: int) -> None:
                 optimizer.step()
                 optimizer.zero_grad()
 
+    test_env = GymEnv("Pendulum-v1")
+    test_env.set_seed(1)
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
-        episode = GymEnv("Pendulum-v1").rollout(200, actor)
+        episode = test_env.rollout(200, actor)
     print(f"return {episode['next', 'reward'].sum().item():.1f}")
     print(f"action variation {action_variation(episode['action']).item():.3f}")
     print(f"gain applied {terms['l2c2_gain'].item():.3f}")

@@ -63,8 +63,10 @@ def main(frames: int) -> None:
     )
     trainer.train()
 
+    test_env = GymEnv("Pendulum-v1")
+    test_env.set_seed(1)
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
-        episode = GymEnv("Pendulum-v1").rollout(200, actor)
+        episode = test_env.rollout(200, actor)
     print(f"return {episode['next', 'reward'].sum().item():.1f}")
     print(f"action variation {action_variation(episode['action']).item():.3f}")
 
