@@ -28,6 +28,7 @@ from torchrl.modules import (
 from torchrl.objectives import DDPGLoss, DQNLoss, PPOLoss, SACLoss
 
 from torchrl_l2c2 import CAPSLoss
+from torchrl_l2c2.objectives.caps import caps_terms
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:torchrl")
 
@@ -47,6 +48,16 @@ def linear_batch() -> TensorDict:
     batch["observation"] = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
     batch["next", "observation"] = torch.tensor([[1.0, 0.0, 0.0], [1.0, 2.0, 2.0]])
     return batch
+
+
+def test_both_terms_are_half_squared_distances_of_means():
+    """Of two means at 0 and (1, 1): to the next ones, then to the noisy ones."""
+    mean = torch.tensor([[[0.0, 0.0], [1.0, 1.0]]])
+    later = torch.tensor([[3.0, 4.0], [1.0, 1.0]])
+    noisy = torch.tensor([[0.0, 1.0], [-1.0, 2.0]])
+    temporal, spatial = caps_terms(mean, torch.stack((later, noisy)))
+    assert temporal.tolist() == [12.5, 0.0]
+    assert spatial.tolist() == [0.5, 2.5]
 
 
 class TestTemporalTerm:

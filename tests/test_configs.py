@@ -32,20 +32,20 @@ from torchrl_l2c2 import (
     ObservationNoise,
     PPORPELoss,
     TSoftUpdate,
-    configs,
     make_actor,
     make_critic,
+    trainers,
 )
 
 OURS = {
-    ("loss", "l2c2"): configs.L2C2LossConfig,
-    ("loss", "caps"): configs.CAPSLossConfig,
-    ("loss", "ppo_rpe"): configs.PPORPELossConfig,
-    ("transform", "neighbor"): configs.NeighborTransformConfig,
-    ("transform", "observation_noise"): configs.ObservationNoiseConfig,
-    ("optimizer", "adaterm"): configs.AdaTermConfig,
-    ("target_net_updater", "tsoft"): configs.TSoftUpdateConfig,
-    ("neighborhood", "l2c2"): configs.NeighborhoodConfig,
+    ("loss", "l2c2"): trainers.L2C2LossConfig,
+    ("loss", "caps"): trainers.CAPSLossConfig,
+    ("loss", "ppo_rpe"): trainers.PPORPELossConfig,
+    ("transform", "neighbor"): trainers.NeighborTransformConfig,
+    ("transform", "observation_noise"): trainers.ObservationNoiseConfig,
+    ("optimizer", "adaterm"): trainers.AdaTermConfig,
+    ("target_net_updater", "tsoft"): trainers.TSoftUpdateConfig,
+    ("neighborhood", "l2c2"): trainers.NeighborhoodConfig,
 }
 
 # Written as a user of TorchRL's trainers would write it.
@@ -80,7 +80,7 @@ SAC = ["+loss@loss.base_loss=sac", "++loss.base_loss.target_entropy=-1.0"]
 @pytest.fixture(autouse=True)
 def registered():
     """The package's configurations are in Hydra's store."""
-    configs.register()
+    trainers.register()
 
 
 def composed(*overrides: str) -> DictConfig:
@@ -402,7 +402,7 @@ def test_unknown_settings_are_refused(node):
 def test_values_of_another_type_are_refused(node):
     """Numbers are checked where they are composed, before anything is built."""
     group, name = node
-    numbers = [f.name for f in fields(OURS[node]) if f.type in ("float", "int", "int | None")]
+    numbers = [f.name for f in fields(OURS[node]) if f.type in (float, int, int | None)]
     for number in numbers:
         with pytest.raises(ConfigCompositionException, match="many"):
             composed(f"+{group}@node={name}", f"node.{number}=many")
@@ -424,7 +424,7 @@ def test_registering_twice_changes_nothing():
         return {(group, name): node.node for group in groups for name, node in repo[group].items()}
 
     before = stored()
-    configs.register()
+    trainers.register()
     assert stored() == before
     assert {(group, f"{name}.yaml") for group, name in OURS} <= set(before)
     assert ("loss", "sac.yaml") in before
@@ -445,11 +445,11 @@ def test_hydra_is_optional_and_registration_explicit():
 import sys
 import torchrl_l2c2
 assert not {"hydra", "omegaconf"} & set(sys.modules), "the components import Hydra"
-import torchrl_l2c2.configs
+import torchrl_l2c2.trainers
 from hydra.core.config_store import ConfigStore
 repo = ConfigStore.instance().repo
 assert "sac.yaml" in repo["loss"] and "l2c2.yaml" not in repo["loss"]
-torchrl_l2c2.configs.register()
+torchrl_l2c2.trainers.register()
 assert "l2c2.yaml" in repo["loss"]
 """
     subprocess.run([sys.executable, "-c", program], check=True)

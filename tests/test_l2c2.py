@@ -28,6 +28,7 @@ from torchrl.modules import Actor, IndependentNormal, ProbabilisticActor, ValueO
 from torchrl.objectives import DDPGLoss, DiscreteSACLoss, DQNLoss, PPOLoss, SACLoss, TD3Loss
 
 from torchrl_l2c2 import L2C2Loss, Neighborhood, NeighborTransform, PPORPELoss
+from torchrl_l2c2.objectives.l2c2 import l2c2_penalty
 
 # epsilon = 1/4, lambda_pi = 1/4: the gain is 1 at distance 1/4 and 1/5 at distance 5/4.
 NEAR = Neighborhood(sigma=1.0, lambda_min=0.2, lambda_max=1.0)
@@ -176,6 +177,21 @@ class TestHandComputedNumbers:
         assert loss.l2c2_neighborhood.scale == pytest.approx(0.010101, rel=1e-4)
         assert loss.l2c2_beta.item() == pytest.approx(0.1)
         assert loss.l2c2_coeff.item() == 1.0
+
+
+class TestThePenalty:
+    """The equation, as a function of tensors."""
+
+    def test_it_is_the_mean_over_neighbors_of_gain_times_difference(self):
+        """K = 2 neighbors of two transitions: (1 * 2 + .5 * 4) / 2 and (.2 * 5 + 0) / 2."""
+        difference = torch.tensor([[2.0, 5.0], [4.0, 7.0]])
+        gain = torch.tensor([[1.0, 0.2], [0.5, 0.0]])
+        torch.testing.assert_close(l2c2_penalty(difference, gain), torch.tensor([2.0, 0.5]))
+
+    def test_agents_share_the_gain_of_their_team(self):
+        """Differences [K, B, agents] for gains [K, B]."""
+        found = l2c2_penalty(torch.tensor([[[1.0, 3.0]]]), torch.tensor([[0.5]]))
+        torch.testing.assert_close(found, torch.tensor([[0.5, 1.5]]))
 
 
 class TestAgainstALoop:

@@ -378,3 +378,22 @@ def test_cql_trainer_with_the_default_stepper():
 
     assert torch.equal(trained(0.0), trained(0.0))
     assert not torch.equal(trained(0.0), trained(1.0))
+
+
+@pytest.mark.parametrize("damage", [lambda content: content[:-7], None], ids=["cut", "changed"])
+def test_a_damaged_archive_is_refused(damage, tmp_path):
+    """The format that the page recommends notices what the default does not."""
+    network, path = nn.Linear(3, 2), tmp_path / "checkpoint"
+    Checkpoint(format="archive", network=network).save(path)
+    content = path.read_bytes()
+    if damage is None:
+        at = content.index(network.weight.detach().numpy().tobytes())
+        content = content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :]
+    else:
+        content = damage(content)
+    path.write_bytes(content)
+    other = nn.Linear(3, 2)
+    before = snapshot(other)
+    with pytest.raises(Exception, match=r"CRC-32|not a TorchRL checkpoint"):
+        Checkpoint(network=other).load(path)
+    assert all(torch.equal(value, before[name]) for name, value in snapshot(other).items())

@@ -118,6 +118,7 @@ def make_update(
     """
     parameters = [p for group in agent.optimizer.param_groups for p in group["params"]]
     keys = agent.loss.out_keys
+    policy_terms = {"loss_actor", *getattr(agent.loss, "policy_terms", ())}
 
     def differentiate(
         with_policy: bool, *drawn: Any
@@ -126,7 +127,8 @@ def make_update(
         batch = drawn[0].copy() if read is None else read(*drawn)
         terms = agent.loss(batch)
         priority = batch.get("td_error", None)
-        total = sum(terms[key] for key in keys if is_loss(key) and (with_policy or on_values(key)))
+        summed = keys if with_policy else [key for key in keys if key not in policy_terms]
+        total = sum(terms[key] for key in summed if is_loss(key))
         gradients = torch.autograd.grad(total, parameters, allow_unused=True)
         values = torch.stack([terms[key].detach().float().mean() for key in keys])
         return values, None if priority is None else priority.detach(), gradients
@@ -173,8 +175,3 @@ def make_update(
 def is_loss(key: str) -> bool:
     """Whether an entry of a loss's output is one of the terms that are summed."""
     return key == "loss" or key.startswith("loss_")
-
-
-def on_values(key: str) -> bool:
-    """Whether a term trains value functions alone."""
-    return not (key.endswith("_actor") or key.startswith("loss_caps_"))

@@ -1,0 +1,193 @@
+"""The components as nodes of TorchRL's own configuration, made from their signatures.
+
+Needs ``hydra-core``, as TorchRL's own configurations do; nothing else in the package imports this
+module.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import field, fields, make_dataclass
+from typing import Any, Literal, Optional, get_args, get_origin, get_type_hints
+
+import torch
+from hydra.core.config_store import ConfigStore
+from omegaconf import MISSING, ListConfig
+from torchrl.objectives import LossModule
+from torchrl.trainers.algorithms.configs.common import (
+    ConfigBase,
+    _normalize_hydra_key,
+    _normalize_hydra_keys,
+)
+from torchrl.trainers.algorithms.configs.objectives import LossConfig, TargetNetUpdaterConfig
+from torchrl.trainers.algorithms.configs.transforms import TransformConfig
+
+from torchrl_l2c2.neighborhood import Neighborhood
+from torchrl_l2c2.objectives import CAPSLoss, L2C2Loss, PPORPELoss
+from torchrl_l2c2.optim import AdaTerm
+from torchrl_l2c2.transforms import NeighborTransform, ObservationNoise
+from torchrl_l2c2.updaters import TSoftUpdate
+
+
+def _make_l2c2_loss(base_loss: LossModule, neighbor_key: Any, **settings: Any) -> L2C2Loss:
+    return L2C2Loss(base_loss, neighbor_key=_normalize_hydra_key(neighbor_key), **settings)
+
+
+def _make_neighbor_transform(
+    in_keys: list[Any] | None,
+    out_key: Any,
+    neighborhood: Any = None,
+    seed: int | None = None,
+    **settings: Any,
+) -> NeighborTransform:
+    return NeighborTransform(
+        Neighborhood() if neighborhood is None else neighborhood,
+        in_keys=_normalize_hydra_keys(in_keys),
+        out_key=_normalize_hydra_key(out_key),
+        generator=_generator(seed),
+        **settings,
+    )
+
+
+def _make_observation_noise(
+    scale: Any, in_keys: list[Any] | None, seed: int | None = None
+) -> ObservationNoise:
+    # A list arrives as OmegaConf's own, which torch does not take.
+    scale = list(scale) if isinstance(scale, ListConfig) else scale
+    return ObservationNoise(
+        scale, in_keys=_normalize_hydra_keys(in_keys), generator=_generator(seed)
+    )
+
+
+def _generator(seed: int | None) -> torch.Generator | None:
+    return None if seed is None else torch.Generator().manual_seed(seed)
+
+
+def _node(
+    component: type,
+    base: type,
+    *,
+    builder: Callable[..., Any] | None = None,
+    without: tuple[str, ...] = (),
+    partial: bool = False,
+) -> type:
+    """The dataclass of a component's parameters, with their types and defaults.
+
+    Args:
+        component: the class that is configured.
+        base: the class of TorchRL's that its configuration belongs to.
+        builder: what is called in its place; where it says something of a parameter, it is right.
+        without: parameters that are not configured.
+        partial: whether the rest is given in the program, as the parameters to an optimizer.
+    """
+    target = component if builder is None else builder
+    module = "torchrl_l2c2" if builder is None else __name__
+    parameters = _parameters(component.__init__)
+    for name, (kind, default) in _parameters(builder).items() if builder else ():
+        known = parameters.get(name, (kind, MISSING))
+        parameters[name] = (kind, known[1] if default is MISSING else default)
+    inherited = {f.name for f in fields(base)} | {"self", *without}
+    made = [
+        (name, kind, field(default=default))
+        for name, (kind, default) in parameters.items()
+        if name not in inherited
+    ]
+    made.append(("_target_", str, field(default=f"{module}.{target.__name__}")))
+    if partial:
+        made.append(("_partial_", bool, field(default=True)))
+    name = f"{component.__name__}Config"
+    namespace = {
+        "__doc__": f"Hydra configuration of :class:`~torchrl_l2c2.{component.__name__}`.",
+        "__module__": __name__,
+        "__post_init__": lambda self: None,
+    }
+    return make_dataclass(name, made, bases=(base,), namespace=namespace)
+
+
+def _parameters(function: Callable[..., Any]) -> dict[str, tuple[Any, Any]]:
+    """A function's named parameters: what OmegaConf can check of their types, and defaults."""
+    hints = get_type_hints(function)
+    return {
+        name: (
+            _checkable(hints.get(name, Any)),
+            MISSING if parameter.default is parameter.empty else parameter.default,
+        )
+        for name, parameter in inspect.signature(function).parameters.items()
+        if parameter.kind is not parameter.VAR_KEYWORD
+    }
+
+
+def _checkable(hint: Any) -> Any:
+    """Numbers, strings and lists are checked where they are composed; objects are built later."""
+    members = get_args(hint) if get_origin(hint) is not Literal else ()
+    simple = [kind for kind in (bool, int, float, list[Any]) if kind in (hint, *members)]
+    if get_origin(hint) is Literal or hint is str:
+        simple = [str]
+    if not simple:
+        return Any
+    return Optional[simple[0]] if type(None) in members else simple[0]  # noqa: UP045
+
+
+NeighborhoodConfig = _node(Neighborhood, ConfigBase)
+L2C2LossConfig = _node(L2C2Loss, LossConfig, builder=_make_l2c2_loss)
+CAPSLossConfig = _node(CAPSLoss, LossConfig)
+PPORPELossConfig = _node(PPORPELoss, LossConfig)
+NeighborTransformConfig = _node(
+    NeighborTransform, TransformConfig, builder=_make_neighbor_transform, without=("generator",)
+)
+ObservationNoiseConfig = _node(
+    ObservationNoise, TransformConfig, builder=_make_observation_noise, without=("generator",)
+)
+AdaTermConfig = _node(AdaTerm, ConfigBase, without=("params",), partial=True)
+TSoftUpdateConfig = _node(TSoftUpdate, TargetNetUpdaterConfig)
+
+
+def register() -> None:
+    """Adds the package's configurations to Hydra's store, in the groups of TorchRL's.
+
+    TorchRL stores its own when ``torchrl.trainers.algorithms.configs`` is imported; importing this
+    module imports that one too, and so brings TorchRL's configurations with it. The package's own
+    are stored by this call alone, so that looking at a class changes nothing for others in the
+    process. Calling it again changes nothing. Every name is new in its group:
+
+    ====================== ===================================
+    group                  names
+    ====================== ===================================
+    ``loss``               ``l2c2``, ``caps``, ``ppo_rpe``
+    ``transform``          ``neighbor``, ``observation_noise``
+    ``optimizer``          ``adaterm``
+    ``target_net_updater`` ``tsoft``
+    ``neighborhood``       ``l2c2``
+    ====================== ===================================
+
+    A node has the parameters of its component, with their defaults. Beside them, ``base_loss`` is
+    the configuration of another loss, such as TorchRL's ``loss: sac``; ``neighborhood`` one of the
+    group of that name, or nothing for the paper's; and a transform's ``seed`` gives it a generator
+    of its own.
+
+    Examples:
+        >>> from hydra import compose, initialize
+        >>> from torchrl_l2c2 import trainers
+        >>> trainers.register()
+        >>> with initialize(version_base=None, config_path=None):
+        ...     cfg = compose(
+        ...         overrides=[
+        ...             "+loss=l2c2",
+        ...             "+loss@loss.base_loss=sac",
+        ...             "+neighborhood@loss.neighborhood=l2c2",
+        ...             "loss.neighborhood.lambda_max=0.5",
+        ...         ]
+        ...     )
+        >>> cfg.loss.beta, cfg.loss.neighborhood.lambda_max, cfg.loss.base_loss.num_qvalue_nets
+        (0.1, 0.5, 2)
+    """
+    store = ConfigStore.instance()
+    store.store(group="loss", name="l2c2", node=L2C2LossConfig)
+    store.store(group="loss", name="caps", node=CAPSLossConfig)
+    store.store(group="loss", name="ppo_rpe", node=PPORPELossConfig)
+    store.store(group="transform", name="neighbor", node=NeighborTransformConfig)
+    store.store(group="transform", name="observation_noise", node=ObservationNoiseConfig)
+    store.store(group="optimizer", name="adaterm", node=AdaTermConfig)
+    store.store(group="target_net_updater", name="tsoft", node=TSoftUpdateConfig)
+    store.store(group="neighborhood", name="l2c2", node=NeighborhoodConfig)
