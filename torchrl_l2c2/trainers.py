@@ -65,7 +65,7 @@ def _generator(seed: int | None) -> torch.Generator | None:
 
 
 def _node(
-    component: type,
+    component: type[Any],
     base: type,
     *,
     builder: Callable[..., Any] | None = None,
@@ -121,7 +121,7 @@ def _parameters(function: Callable[..., Any]) -> dict[str, tuple[Any, Any]]:
 def _checkable(hint: Any) -> Any:
     """Numbers, strings and lists are checked where they are composed; objects are built later."""
     members = get_args(hint) if get_origin(hint) is not Literal else ()
-    simple = [kind for kind in (bool, int, float, list[Any]) if kind in (hint, *members)]
+    simple: list[Any] = [kind for kind in (bool, int, float, list[Any]) if kind in (hint, *members)]
     if get_origin(hint) is Literal or hint is str:
         simple = [str]
     if not simple:
