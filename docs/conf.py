@@ -11,8 +11,9 @@ from importlib.resources import files
 from typing import Any
 
 from docutils import nodes
-from math_core import LatexToMathML
+from math_core import LatexError, LatexToMathML
 from sphinx.application import Sphinx
+from sphinx.util import logging
 from sphinx.util.inspect import stringify_signature
 
 from torchrl_l2c2 import __version__
@@ -41,12 +42,20 @@ html_css_files = ["site.css"]
 html_copy_source = False
 html_math_renderer = "mathml"
 
+logger = logging.getLogger(__name__)
 to_mathml = LatexToMathML()
 
 
+def mathml(node: nodes.Element, equation: str, *, display: bool) -> str:
+    try:
+        return to_mathml.convert_with_local_state(equation, displaystyle=display)
+    except LatexError as error:
+        logger.warning("cannot draw %r: %s", equation, error, location=node)
+        return ""
+
+
 def draw_inline(writer: Any, node: nodes.math) -> None:
-    mathml = to_mathml.convert_with_local_state(node.astext(), displaystyle=False)
-    writer.body.append(mathml)
+    writer.body.append(mathml(node, node.astext(), display=False))
     raise nodes.SkipNode
 
 
@@ -54,8 +63,7 @@ def draw_block(writer: Any, node: nodes.math_block) -> None:
     equation = node.astext()
     if "\\\\" in equation:
         equation = rf"\begin{{aligned}}{equation}\end{{aligned}}"
-    mathml = to_mathml.convert_with_local_state(equation, displaystyle=True)
-    writer.body.append(f'<div class="math">{mathml}</div>')
+    writer.body.append(f'<div class="math">{mathml(node, equation, display=True)}</div>')
     raise nodes.SkipNode
 
 
