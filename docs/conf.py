@@ -43,7 +43,7 @@ html_copy_source = False
 html_math_renderer = "mathml"
 
 logger = logging.getLogger(__name__)
-to_mathml = LatexToMathML()
+to_mathml = LatexToMathML(fancy_error=False)
 
 
 def mathml(node: nodes.Element, equation: str, *, display: bool) -> str:
