@@ -46,14 +46,12 @@ def squared_hellinger(
         H^2(p, q) = \frac 1 2 \int \left(\sqrt{p(a)} - \sqrt{q(a)}\right)^2 da
                   = 1 - \int \sqrt{p(a)\, q(a)}\, da
 
-    is the distance of policies of Kobayashi, L2C2, 2022 (:math:`d_\pi`). It lies in ``[0, 1]``,
-    is symmetric, and a bijection of the action does not change it. Its gradient flows into both
-    policies.
+    is the distance of policies of Kobayashi, L2C2, 2022 (:math:`d_\pi`). It lies in ``[0, 1]``, is
+    symmetric, and no bijection of the action changes it. Its gradient flows into both policies.
 
     By default it is exact, in closed form, for normal, categorical and Bernoulli policies, masked,
     independent, squashed or composed of several (see :func:`register_hellinger` for others).
     A pair without a closed form is estimated from :data:`MONTE_CARLO_SAMPLES` actions each.
-
     With ``num_samples`` it is estimated by importance sampling, as in the paper, the mixture
     :math:`b = (p + q) / 2` being the sampler:
 
@@ -62,15 +60,12 @@ def squared_hellinger(
             \frac 1 2 \left(\sqrt{\frac{p(a)}{b(a)}} - \sqrt{\frac{q(a)}{b(a)}}\right)^2\right].
 
     The estimate and its gradient are unbiased, and each term lies in ``[0, 1]``.
+    With ``sample`` and ``sample_log_prob`` one replayed action takes the place of the expectation,
+    its stored likelihood that of :math:`b`: unbiased if it was drawn from :math:`b`, but unbounded.
 
-    With ``sample`` and ``sample_log_prob`` the one replayed action takes the place of the
-    expectation, its stored likelihood that of :math:`b`. That is unbiased too where the action was
-    drawn from :math:`b`, but unbounded.
-
-    .. note::
-        Under ``torch.compile``, or while a CUDA graph is captured, the bounds of two
-        :class:`~torchrl.modules.TanhNormal` cannot be compared before the computation: different
-        bounds then give NaN, where eager code falls back to sampling.
+    .. note:: Under ``torch.compile``, or while a CUDA graph is captured, two
+        :class:`~torchrl.modules.TanhNormal` of different bounds give NaN, where eager code falls
+        back to sampling: the bounds cannot be compared before the computation.
 
     Args:
         p: one policy, batch shape ``[*B]``.
@@ -79,8 +74,7 @@ def squared_hellinger(
             deviation falls with its square root. TorchRL's masked policies score no batch of
             draws, so they have the closed form only. Defaults to ``None``, the closed form.
         sample: replayed actions, shape ``[*B, *event]``.
-        sample_log_prob: their log-likelihood when they were taken, shape ``[*B]``; carries no
-            gradient.
+        sample_log_prob: their log-likelihood when they were taken, ``[*B]``, without a gradient.
 
     Returns:
         The distances, shape ``[*B]``.
@@ -88,8 +82,7 @@ def squared_hellinger(
     Raises:
         TypeError: if a policy is deterministic or can neither be sampled nor scored, or
             ``num_samples`` is no integer.
-        ValueError: if the event shapes differ, ``num_samples`` is below 1, or the arguments
-            contradict each other.
+        ValueError: if the event shapes differ, or arguments are out of range or contradictory.
 
     Examples:
         >>> import torch
@@ -132,9 +125,6 @@ def register_hellinger(
         type_p: the class of one distribution.
         type_q: the class of the other. Defaults to ``type_p``.
 
-    Returns:
-        The decorator, which returns the function as it is.
-
     Raises:
         TypeError: if a type is not a subclass of :class:`torch.distributions.Distribution`.
 
@@ -151,10 +141,8 @@ def register_hellinger(
     type_q = type_p if type_q is None else type_q
     for kind in (type_p, type_q):
         if not (isinstance(kind, type) and issubclass(kind, Distribution)):
-            raise TypeError(
-                f"register_hellinger takes subclasses of torch.distributions.Distribution, "
-                f"got {kind!r}."
-            )
+            expected = "subclasses of torch.distributions.Distribution"
+            raise TypeError(f"register_hellinger takes {expected}, got {kind!r}.")
 
     def decorator(function: LogAffinity) -> LogAffinity:
         _LOG_AFFINITIES[type_p, type_q] = function
@@ -169,7 +157,7 @@ def squared_error(a: Tensor, b: Tensor) -> Tensor:
     r"""Half the squared error over the last dimension.
 
     :math:`\frac 1 2 \lVert a - b \rVert_2^2`, the distance of values of Kobayashi, L2C2, 2022
-    (:math:`d_V`, over the heads of an ensemble) and the distance of mean actions of CAPS.
+    (:math:`d_V`, over the heads of an ensemble), and of mean actions of CAPS.
 
     Args:
         a: values, shape ``[*B, N]``.
@@ -204,9 +192,9 @@ def _check_pair(p: Distribution, q: Distribution) -> None:
             )
     if isinstance(p, CompositeDistribution) and isinstance(q, CompositeDistribution):
         if p.dists.keys() != q.dists.keys():
+            entries = [sorted(map(str, composite.dists)) for composite in (p, q)]
             raise ValueError(
-                "p and q must be composed of the same entries, got "
-                f"{sorted(map(str, p.dists))} and {sorted(map(str, q.dists))}."
+                f"p and q must be composed of the same entries, got {entries[0]} and {entries[1]}."
             )
         for name, entry in p.dists.items():
             _check_pair(entry, q.dists[name])
@@ -267,11 +255,9 @@ def _log_prob(distribution: Distribution, sample: Any) -> Tensor:
     if not isinstance(distribution, CompositeDistribution):
         return distribution.log_prob(sample)
     # Its own log_prob returns a tensor or a TensorDict, as a global switch says.
-    entries = (
-        _sum_to(_log_prob(entry, sample.get(name)), sample.ndim)
-        for name, entry in distribution.dists.items()
-    )
-    return functools.reduce(torch.add, entries)
+    heads = distribution.dists.items()
+    parts = (_sum_to(_log_prob(head, sample.get(name)), sample.ndim) for name, head in heads)
+    return functools.reduce(torch.add, parts)
 
 
 def _sum_to(x: Tensor, ndim: int) -> Tensor:
@@ -290,17 +276,13 @@ def _normal(p: Normal, q: Normal) -> Tensor:
 
 @register_hellinger(Categorical)
 @register_hellinger(OneHotCategorical)
-def _categorical(p: Categorical, q: Categorical) -> Tensor:
-    return _finite_log_affinity(p.probs, q.probs)
-
-
 @register_hellinger(MaskedCategorical)
-def _masked_categorical(p: MaskedCategorical, q: MaskedCategorical) -> Tensor:
+def _categorical(p: Categorical, q: Categorical) -> Tensor:
     return _finite_log_affinity(_all_probs(p), _all_probs(q))
 
 
-def _all_probs(distribution: MaskedCategorical) -> Tensor:
-    if not distribution._sparse_mask:
+def _all_probs(distribution: Any) -> Tensor:
+    if not getattr(distribution, "_sparse_mask", False):
         return distribution.probs
     # A sparse mask keeps the probabilities of the listed actions only. Padding has none, and may
     # be listed under any number.

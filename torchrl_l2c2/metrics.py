@@ -7,6 +7,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from torchrl_l2c2._checks import check_choice
+
 
 def action_variation(actions: Tensor, mask: Tensor | None = None) -> Tensor:
     r"""Mean change of the action from step to step, the paper's measure of smoothness.
@@ -98,8 +100,7 @@ def local_lipschitz(
         >>> local_lipschitz(state, neighbor, state.square(), neighbor.square())
         tensor(2.)
     """
-    if reduction not in ("max", "mean"):
-        raise ValueError(f"local_lipschitz: reduction must be 'max' or 'mean', got {reduction!r}.")
+    check_choice("local_lipschitz: reduction", reduction, ("max", "mean"))
     _check_neighbors("neighbor", state, neighbor)
     _check_neighbors("neighbor_output", output, neighbor_output)
     if neighbor.shape[:-1] != neighbor_output.shape[:-1]:

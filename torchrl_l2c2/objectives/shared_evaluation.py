@@ -18,7 +18,7 @@ class SharedEvaluation(LossModule):
 
     Examples:
         >>> from torchrl.objectives import DDPGLoss
-        >>> from torchrl_l2c2.objectives.shared_evaluation import SharedEvaluation
+        >>> from torchrl_l2c2.objectives import SharedEvaluation
         >>> class ThriftyLoss(DDPGLoss, SharedEvaluation):
         ...     def evaluate_at_batch(self, network, tensordict):
         ...         net = getattr(self, network)
