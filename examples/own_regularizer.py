@@ -18,7 +18,7 @@ from torchrl.objectives import LossModule, SACLoss, SoftUpdate
 
 from torchrl_l2c2 import RegularizedLoss, action_variation, make_actor
 
-FRAMES = 400
+FRAMES = 200
 FRAMES_PER_BATCH = 50
 
 

@@ -17,7 +17,7 @@ from torchrl.objectives import SACLoss, SoftUpdate
 
 from torchrl_l2c2 import L2C2Loss, Neighborhood, NeighborTransform, action_variation, make_actor
 
-FRAMES = 400
+FRAMES = 300
 FRAMES_PER_BATCH = 50
 RANDOM_FRAMES = 200
 UPDATES_PER_BATCH = 50

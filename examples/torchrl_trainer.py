@@ -25,7 +25,7 @@ from torchrl_l2c2 import (
     make_actor,
 )
 
-FRAMES = 400
+FRAMES = 200
 FRAMES_PER_BATCH = 50
 
 

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -57,3 +58,17 @@ def test_every_public_name_is_documented_with_an_example():
     for name in set(torchrl_l2c2.__all__) - {"__version__"}:
         public = getattr(torchrl_l2c2, name)
         assert "Examples:" in public.__doc__ and ">>>" in public.__doc__, name
+
+
+def test_an_installed_package_is_complete():
+    """Every folder with modules, and what conf/ combines, is named among the packages."""
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    folders = {path.parent for path in (ROOT / "torchrl_l2c2").rglob("*.py")}
+    modules = {".".join(folder.relative_to(ROOT).parts) for folder in folders}
+    configurations = {folder.parent for folder in (ROOT / "conf").rglob("*.yaml")}
+    mapped = {
+        ".".join(("torchrl_l2c2", *folder.relative_to(ROOT).parts)): str(folder.relative_to(ROOT))
+        for folder in configurations
+    }
+    assert set(settings["packages"]) == modules | mapped.keys()
+    assert settings["package-dir"] == mapped
