@@ -97,7 +97,8 @@ def run(config: ExperimentConfig, resume: str | None) -> None:
         if finished is None:
             with closing(Experiment(config, folder, resume=resume)) as experiment:
                 experiment.train(progress=True)
-                finished = experiment.finish(experiment.test(progress=True))
+                tests = [experiment.test(sampled=s, progress=True) for s in (False, True)]
+                finished = experiment.finish(*tests)
     except Interrupted as interruption:
         print(interruption, file=sys.stderr)
         sys.exit(interruption.exit_status)

@@ -15,8 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
-from torchrl.envs import EnvBase, ExplorationType
+from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 from tqdm import tqdm
 
 from torchrl_l2c2.experiment.collection import EpisodeCollector
@@ -60,16 +61,19 @@ def evaluate_policy(
     episodes: int,
     *,
     max_steps: int = 1000,
+    sampled: bool = False,
     compile_policy: bool = False,
     progress: bool = False,
 ) -> Evaluation:
-    """Plays episodes with the policy's mean action.
+    """Plays episodes with the policy's mean action, or with samples.
 
     Args:
         policy (TensorDictModule): acts deterministically under ``ExplorationType.DETERMINISTIC``.
         env (EnvBase): one Gymnasium environment, as :class:`EpisodeCollector` takes it.
         episodes (int): how many, at least 1. More give a surer mean.
         max_steps (int): longest episode. Default 1000.
+        sampled (bool): whether the policy acts as in training; the action variation is that of its
+            mean all the same, at the states that it then visits. Default ``False``.
         compile_policy (bool): whether to compile the policy. Default ``False``.
         progress (bool): whether to show a progress bar.
 
@@ -93,25 +97,29 @@ def evaluate_policy(
         env,
         policy,
         frames_per_batch=max_steps,
-        compile_policy=compile_policy,
-        exploration_type=ExplorationType.DETERMINISTIC,
+        # Modules that only explore take decisions that cannot be compiled.
+        compile_policy=compile_policy and not sampled,
+        exploration_type=ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC,
     )
-    bar = tqdm(range(episodes), "test", unit="episode", disable=not progress, leave=False)
+    name = "test, sampled" if sampled else "test"
+    bar = tqdm(range(episodes), name, unit="episode", disable=not progress, leave=False)
     for _ in bar:
-        total, variation, length = play_test_episode(collector)
-        returns.append(total)
-        variations.append(variation)
-        lengths.append(length)
+        episode = collector.rollout()
+        actions = mean_actions(policy, episode) if sampled else episode["action"]
+        returns.append(episode["next", "reward"].sum().item())
+        variations.append(_variation(actions))
+        lengths.append(len(episode))
         bar.set_postfix_str(f"return {statistics.fmean(returns):.1f}")
     collector.shutdown(close_env=False)
     return Evaluation(returns, variations, lengths)
 
 
-def play_test_episode(collector: EpisodeCollector) -> tuple[float, float, int]:
-    """Plays one episode; its return, its action variation and its length."""
-    episode = collector.rollout()
-    total = episode["next", "reward"].sum().item()
-    return total, _variation(episode["action"]), episode.shape[-1]
+@torch.no_grad()
+def mean_actions(policy: TensorDictModule, episode: TensorDictBase) -> torch.Tensor:
+    """The policy's mean actions ``[T, A]`` at the states of an episode."""
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        actions: torch.Tensor = policy(episode.select("observation"))["action"]
+    return actions
 
 
 class LateTests:
@@ -141,8 +149,9 @@ class LateTests:
             if self._collector is None:
                 self._collector = self._make_collector()
             self._collector.set_seed(self._seed + number)
-            total, variation, _ = play_test_episode(self._collector)
-        return {"test_return": total, "test_action_variation": variation}
+            episode = self._collector.rollout()
+        total = episode["next", "reward"].sum().item()
+        return {"test_return": total, "test_action_variation": _variation(episode["action"])}
 
     def none(self) -> dict[str, float]:
         """The same entries where no episode is played."""
@@ -203,10 +212,18 @@ def main(arguments: Iterable[str] | None = None) -> None:
     )
     parser.add_argument("folder", help="a run's folder, finished or not")
     parser.add_argument("--episodes", type=int, default=100, help="how many (default: 100)")
+    parser.add_argument("--sampled", action="store_true", help="act with samples, as in training")
     chosen = parser.parse_args(arguments)
     try:
         policy, env, max_steps = load_policy(chosen.folder)
-        result = evaluate_policy(policy, env, chosen.episodes, max_steps=max_steps, progress=True)
+        result = evaluate_policy(
+            policy,
+            env,
+            chosen.episodes,
+            max_steps=max_steps,
+            sampled=chosen.sampled,
+            progress=True,
+        )
     except (ValueError, OSError, RuntimeError) as error:
         sys.exit(f"error: {error}")
     print(json.dumps(result.summary(), indent=2))

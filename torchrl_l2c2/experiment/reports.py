@@ -83,23 +83,23 @@ class FinishedRun:
 
 
 def write_results(
-    folder: Path, config: ExperimentConfig, summary: dict[str, float], episodes: dict[str, Any]
+    folder: Path, config: ExperimentConfig, tests: dict[str, dict[str, Any]]
 ) -> FinishedRun:
     """Writes what a finished run's folder holds beside its policy: test episodes and picture.
 
     Args:
         folder (Path): of the run.
         config (ExperimentConfig): its settings.
-        summary (dict): means and standard deviations over test episodes.
-        episodes (dict): the figures of every one.
+        tests (dict): ``"mean"`` and, where there is one, ``"sampled"``: ``"summary"`` and
+            ``"episodes"`` of the test with the policy's mean and with samples.
 
     Returns:
         FinishedRun: the folder, read back.
     """
     named = {group: getattr(config, group).name for group in ("task", "algorithm", "regularizer")}
     run = {**named, "seed": config.seed, "solved_at": config.task.solved_at}
-    written = {"run": run, "summary": summary, "episodes": episodes}
-    write_json(folder / "evaluation.json", written)
+    rest = {name: test for name, test in tests.items() if name != "mean"}
+    write_json(folder / "evaluation.json", {"run": run, **tests["mean"], **rest})
     finished = FinishedRun.read(folder)
     draw_learning_curves([finished], folder / "learning_curves.png")
     return finished
@@ -232,21 +232,31 @@ def _save(figure: Any, path: str | Path) -> None:
 
 
 def compare_with_paper(run: FinishedRun) -> str:
-    """Two lines for the end of a run: its result and, for the paper's tasks, the paper's."""
-    own = run.evaluation["summary"]
-    lines = [
-        f"{'':>10}  {'return':>18}  {'action variation':>18}",
-        f"{'this run':>10}  {own['return_mean']:>9.1f} ({own['return_std']:>6.1f})"
-        f"  {own['action_variation_mean']:>10.3f} ({own['action_variation_std']:.3f})"
-        f"   {own['episodes']} test episodes, seed {run.seed}",
-    ]
+    """The end of a run in lines: its results and, for the paper's tasks, the paper's."""
+    lines = [f"{'':>20}  {'return':>18}  {'action variation':>18}"]
+    tests = {"mean actions": run.evaluation, "sampled actions": run.evaluation.get("sampled")}
+    for name, test in tests.items():
+        if test is not None:
+            own = test["summary"]
+            lines.append(
+                _compared(
+                    name,
+                    (own["return_mean"], own["return_std"]),
+                    (own["action_variation_mean"], own["action_variation_std"]),
+                    f"{own['episodes']} test episodes, seed {run.seed}",
+                )
+            )
     paper = PAPER.get((run.task, run.regularizer)) if run.algorithm == "ppo_rpe" else None
     if paper:
-        lines.append(
-            f"{'the paper':>10}  {paper[0]:>9.1f} ({paper[1]:>6.1f})"
-            f"  {paper[2]:>10.3f} ({paper[3]:.3f})   18 seeds"
-        )
+        lines.append(_compared("the paper", paper[:2], paper[2:], "18 seeds"))
     return "\n".join(lines)
+
+
+def _compared(name: str, total: tuple[float, ...], variation: tuple[float, ...], what: str) -> str:
+    return (
+        f"{name:>20}  {total[0]:>9.1f} ({total[1]:>6.1f})  {variation[0]:>10.3f} "
+        f"({variation[1]:.3f})   {what}"
+    )
 
 
 def main(arguments: Iterable[str] | None = None) -> None:

@@ -203,11 +203,14 @@ class Experiment:
         # Last: making and loading the above may have drawn from the global generators.
         self._process.load_state_dict(state["global_rng"])
 
-    def test(self, episodes: int | None = None, *, progress: bool = False) -> Evaluation:
+    def test(
+        self, episodes: int | None = None, *, sampled: bool = False, progress: bool = False
+    ) -> Evaluation:
         """Plays test episodes with the policy's mean, in a fresh environment with its own seed.
 
         Args:
             episodes (int, optional): how many. Default: the settings' ``test_episodes``.
+            sampled (bool): whether the policy acts as in training instead. Default ``False``.
             progress (bool): whether to show a progress bar.
 
         Returns:
@@ -221,17 +224,19 @@ class Experiment:
                 env,
                 episodes or config.test_episodes,
                 max_steps=config.task.max_steps,
+                sampled=sampled,
                 compile_policy=self._compile,
                 progress=progress,
             )
             env.close()
         return result
 
-    def finish(self, result: Evaluation) -> FinishedRun:
+    def finish(self, result: Evaluation, sampled: Evaluation | None = None) -> FinishedRun:
         """Writes what a finished run's folder holds: policy, test episodes and picture.
 
         Args:
             result (Evaluation): of :meth:`test`.
+            sampled (Evaluation, optional): of :meth:`test` with samples.
 
         Returns:
             FinishedRun: the folder, read back.
@@ -242,7 +247,13 @@ class Experiment:
         if self.folder is None:
             raise ValueError("this experiment has no folder to write to; give it one when made.")
         save_policy(self.agent.policy, self.folder / "policy.pt")
-        return write_results(self.folder, self.config, result.summary(), asdict(result))
+        tests = {"mean": result, "sampled": sampled}
+        written = {
+            name: {"summary": test.summary(), "episodes": asdict(test)}
+            for name, test in tests.items()
+            if test is not None
+        }
+        return write_results(self.folder, self.config, written)
 
     def close(self) -> None:
         """Ends the processes of ``num_workers``; the experiment cannot train any further."""
