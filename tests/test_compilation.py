@@ -36,7 +36,7 @@ def test_random_numbers_and_gradients_are_those_of_the_plain_function():
     torch.manual_seed(0)
     expected = noisy_slope(x)
     torch.manual_seed(0)
-    torch.testing.assert_close(compiled(noisy_slope)(x), expected)
+    torch.testing.assert_close(compiled(noisy_slope, takes_gradients=True)(x), expected)
 
 
 def test_a_constant_closure_is_looked_at_once_and_arguments_always():
@@ -66,7 +66,7 @@ def test_biases_are_added_where_the_product_is_used():
         y = network(x)
         return y.detach(), *torch.autograd.grad(y.square().sum(), list(network.parameters()))
 
-    found, (code,) = run_and_get_code(compiled(slopes), x)
+    found, (code,) = run_and_get_code(compiled(slopes, takes_gradients=True), x)
     torch.testing.assert_close(found, slopes(x))
     assert "addmm(" not in code and "extern_kernels.mm(" in code
     with torch._dynamo.config.patch(trace_autograd_ops=True):

@@ -13,8 +13,10 @@ from torch._inductor.custom_graph_pass import CustomGraphPass, get_hash_for_file
 from torch.fx import Graph
 
 
-def compiled(function: Callable[..., Any], *, constant_closure: bool = False) -> Callable[..., Any]:
-    """Compiles a function, which may take gradients, into one graph.
+def compiled(
+    function: Callable[..., Any], *, takes_gradients: bool = False, constant_closure: bool = False
+) -> Callable[..., Any]:
+    """Compiles a function into one graph.
 
     Random numbers are drawn as without compilation.
 
@@ -22,6 +24,8 @@ def compiled(function: Callable[..., Any], *, constant_closure: bool = False) ->
         function (Callable): what is compiled, at its first call.
 
     Keyword Args:
+        takes_gradients (bool): whether the function calls ``torch.autograd.grad``. Default
+            ``False``.
         constant_closure (bool): whether all that the function reaches other than by its arguments
             stays as it is at the first call, but for what is written *into* its tensors. It is
             then not checked at every call, which for an agent's hundreds of tensors takes longer
@@ -38,12 +42,11 @@ def compiled(function: Callable[..., Any], *, constant_closure: bool = False) ->
         options["guard_filter_fn"] = _only_arguments_of(function)
     # Every run of a sweep compiles the same code for objects of its own: counted together, they
     # would soon meet the limit of recompilations.
-    return _tracing_gradients(
-        # The stubs do not know of isolate_recompiles.
-        torch.compile(  # type: ignore[call-overload]
-            function, fullgraph=True, isolate_recompiles=True, options=options
-        )
+    graph = torch.compile(  # type: ignore[call-overload]  # The stubs lack isolate_recompiles.
+        function, fullgraph=True, isolate_recompiles=True, options=options
     )
+    # Not for all: setting and resetting takes as long as a smaller network's layer.
+    return _tracing_gradients(graph) if takes_gradients else graph
 
 
 def _tracing_gradients(function: Callable[..., Any]) -> Callable[..., Any]:

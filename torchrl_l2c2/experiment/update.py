@@ -92,9 +92,9 @@ def make_update(
     compile = compile and agent.compilable
     whole = isinstance(agent.optimizer, AdaTerm) and isinstance(agent.target_updater, TSoftUpdate)
     if compile and whole and not skip_nonfinite:
-        return compiled(update, constant_closure=True)
+        return compiled(update, takes_gradients=True, constant_closure=True)
     if compile:
-        differentiate = compiled(differentiate, constant_closure=True)
+        differentiate = compiled(differentiate, takes_gradients=True, constant_closure=True)
         apply = compiled(apply, constant_closure=True) if whole else apply
     if not skip_nonfinite:
         return update
