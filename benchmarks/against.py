@@ -1,7 +1,8 @@
 """Whether a change costs time: ``python -m benchmarks.against REVISION``.
 
 A process with this checkout and one with another revision take turns at the compiled update and at
-collecting, so that a machine's other work falls on both alike; prints the ratios of the medians.
+collecting, so that a machine's other work falls on both alike. Prints how fast each was at its
+fastest, and the median and quartiles of the turns' ratios.
 """
 
 from __future__ import annotations
@@ -68,6 +69,16 @@ def turn(process: subprocess.Popen[str], action: str) -> float:
     return float(process.stdout.readline())
 
 
+def in_turns(
+    ours: subprocess.Popen[str], theirs: subprocess.Popen[str], action: str, number: int
+) -> tuple[float, float]:
+    """Seconds of both; who comes first alternates."""
+    if number % 2:
+        second = turn(theirs, action)
+        return turn(ours, action), second
+    return turn(ours, action), turn(theirs, action)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.against", description=__doc__)
     parser.add_argument("revision", help="what to compare with: a commit, a tag or a branch")
@@ -80,14 +91,13 @@ def main() -> None:
         try:
             ours, theirs = start(ROOT), start(other)
             for action, units in (("update", UPDATES), ("collect", FRAMES)):
-                turns = [(turn(ours, action), turn(theirs, action)) for _ in range(options.rounds)]
-                medians = [
-                    1e6 * statistics.median(times) / units for times in zip(*turns, strict=True)
-                ]
-                ratio = statistics.median(a / b for a, b in turns)
+                turns = [in_turns(ours, theirs, action, n) for n in range(options.rounds)]
+                fastest = [1e6 * min(times) / units for times in zip(*turns, strict=True)]
+                low, middle, high = statistics.quantiles((a / b for a, b in turns), n=4)
                 print(
-                    f"{action}: {medians[0]:.1f} us here, {medians[1]:.1f} us at "
-                    f"{options.revision}; median of the turns' ratios {ratio:.3f}",
+                    f"{action}: at the fastest {fastest[0]:.1f} us here, {fastest[1]:.1f} us at "
+                    f"{options.revision}, ratio {fastest[0] / fastest[1]:.3f}; ratios of turns "
+                    f"{middle:.3f} ({low:.3f} to {high:.3f})",
                     flush=True,
                 )
             for process in (ours, theirs):
