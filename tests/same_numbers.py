@@ -20,7 +20,14 @@ import torch
 
 ROOT = Path(__file__).parent.parent
 HEADER = struct.calcsize("<13sI32s")  # of a checkpoint; torch.save follows
-SWINGUP = ["task=swingup", "task.episodes=4", "task.max_steps=200"]
+SWINGUP = [
+    "task=swingup",
+    "task.episodes=4",
+    "task.max_steps=200",
+    # Not left to defaults, which a revision may change.
+    "algorithm.critic_weighting=ratio",
+    "algorithm.updates=15",
+]
 PENDULUM = [
     "task=gymnasium",
     "task.env_id=Pendulum-v1",

@@ -96,7 +96,7 @@ def test_the_same_seed_gives_the_same_numbers_and_another_seed_others():
         {"algorithm": PPORPEConfig(schedule="step", updates=2)},
         {"algorithm": PPORPEConfig(acting_policy="online", baseline="target")},
         {"algorithm": PPORPEConfig(importance="mean")},
-        {"algorithm": PPORPEConfig(squash="none", threshold="ema", critic_weighting="none")},
+        {"algorithm": PPORPEConfig(squash="none", threshold="ema", critic_weighting="ratio")},
         {"algorithm": PPORPEConfig(reward_scale=1.0, hidden=(8,), num_heads=1, updates=3)},
         {"task": replace(PENDULUM, noise_scale=0.0)},
     ],
@@ -117,7 +117,7 @@ def test_every_alternative_changes_the_run(settings):
 
 def test_updates_follow_the_schedule():
     """One pass over the buffer after each episode, or so many after each step."""
-    episode = Experiment(small())
+    episode = Experiment(small(algorithm=PPORPEConfig(replay_ratio=None)))
     episode.train()
     assert episode.learner.updates == 40 // 32 + 80 // 32
     step = Experiment(small(algorithm=PPORPEConfig(schedule="step", updates=2)))
@@ -133,6 +133,8 @@ def test_the_replay_ratio_is_how_often_a_transition_is_drawn():
     assert [row["updates"] for row in ratio.train()] == [2, 5]
     with pytest.raises(ValueError, match="replay_ratio and updates both say"):
         PPORPEConfig(replay_ratio=2.0, updates=3)
+    # The default ratio gives way to a number.
+    assert PPORPEConfig(updates=3).updates_after(40, 80, 80, 32) == 3
 
 
 def test_late_policies_play_test_episodes_that_change_nothing_else():
@@ -244,7 +246,8 @@ def test_a_batch_that_is_not_finite_can_be_skipped(entry):
 def test_workers_play_rounds_that_are_learned_from_as_episodes(tmp_path):
     """As many updates as of one process's episodes; a worker that dies leaves a checkpoint."""
     task = replace(PENDULUM, episodes=4)
-    config = small(num_workers=2, task=task, checkpoint_interval=0.0)
+    one_pass = PPORPEConfig(replay_ratio=None)
+    config = small(num_workers=2, task=task, algorithm=one_pass, checkpoint_interval=0.0)
     with contextlib.closing(Experiment(config, tmp_path)) as experiment:
         rows = experiment.train()
         assert [row["episode"] for row in rows] == [1, 2, 3, 4]

@@ -111,7 +111,8 @@ def test_every_comparison_is_made_of_valid_runs(name, regularizer):
         composed(f"experiment={name}", f"regularizer={regularizer}")
     )
     env_id, algorithm, size = {
-        "swingup_table": (TaskConfig().env_id, "ppo_rpe", 32),
+        "table3": (TaskConfig().env_id, "ppo_rpe", 32),
+        "table3_tau": (TaskConfig().env_id, "ppo_rpe", 32),
         "pendulum": ("Pendulum-v1", "ppo_rpe", 64),
         "cartpole": ("CartPole-v1", "dqn", 64),
     }[name]
@@ -192,7 +193,7 @@ def test_wrong_settings_are_refused_with_what_is_allowed(settings, message):
     ("settings", "message"),
     [
         ({"num_workers": 0}, "num_workers must be greater than or equal to 1, got 0"),
-        ({"num_workers": 3}, r"task.episodes must be a multiple of num_workers=3.*use 198"),
+        ({"num_workers": 3}, r"task.episodes must be a multiple of num_workers=3.*use 399"),
         (
             {"num_workers": 2, "algorithm": SACConfig()},
             "num_workers must be 1 with algorithm.schedule=step",

@@ -33,7 +33,7 @@ def make_loss(**settings):
         return_log_prob=True,
     )
     critic = TensorDictModule(Heads(), ["observation"], ["state_value", "state_value_heads"])
-    return PPORPELoss(actor, critic, **settings)
+    return PPORPELoss(actor, critic, **{"critic_weighting": "ratio", **settings})
 
 
 def make_batch(loss, ratios, rewards, observations=None, next_observations=None, terminated=None):

@@ -30,7 +30,7 @@ class TaskConfig:
         ".01 for Swingup, none for other ids [paper]",
     )
     episodes: int = Field(
-        default=200, ge=1, description="to train for [inferred: the paper states none]"
+        default=400, ge=1, description="to train for [inferred: the paper states none]"
     )
     max_steps: int = Field(
         default=1000,
@@ -60,7 +60,7 @@ def _bullet(name: str) -> str:
 # Noise, steps and the returns that count as solved are the paper's; episodes are inferred.
 TASKS: dict[str, TaskConfig] = {
     "swingup": TaskConfig(solved_at=800.0),
-    "reacher": TaskConfig("reacher", _bullet("Reacher"), 0.01, 1000, 150, 18.0),
+    "reacher": TaskConfig("reacher", _bullet("Reacher"), 0.01, 3000, 150, 18.0),
     "hopper": TaskConfig("hopper", _bullet("Hopper"), 0.001, 1500, 1000, 2500.0),
     "ant": TaskConfig("ant", _bullet("Ant"), 0.001, 1500, 1000, 2500.0),
 }

@@ -74,7 +74,7 @@ class PPORPELoss(SharedEvaluation):
             :math:`|\rho_R - 1|` over batches; ``"ema"``: an exponential moving average of its
             batch mean. [inferred] Default ``"max"``.
         critic_weighting (str): ``"ratio"`` multiplies :math:`L_V` with the detached
-            :math:`\rho_R`; ``"none"`` does not. [inferred] Default ``"ratio"``.
+            :math:`\rho_R`; ``"none"`` does not. [inferred] Default ``"none"``.
         baseline (str): ``"stored"``: :math:`b` is the likelihood stored when the action was taken;
             ``"target"``: the target policy's likelihood now. [inferred] Default ``"stored"``.
         importance (str): what the importance weights of prioritized replay are divided by:
@@ -156,7 +156,7 @@ class PPORPELoss(SharedEvaluation):
         decay: float = 0.999,
         delta_min: float = 0.1,
         threshold: Literal["max", "ema"] = "max",
-        critic_weighting: Literal["ratio", "none"] = "ratio",
+        critic_weighting: Literal["ratio", "none"] = "none",
         baseline: Literal["stored", "target"] = "stored",
         importance: Literal["max", "mean"] = "max",
         reduction: str = "mean",

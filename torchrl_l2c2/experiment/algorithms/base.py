@@ -52,17 +52,25 @@ class AlgorithmConfig:
 
 
 class OffPolicyConfig(AlgorithmConfig):
-    """An algorithm that learns from a replay buffer."""
+    """An algorithm that learns from a replay buffer.
+
+    Attributes:
+        usual_replay_ratio: the default of ``replay_ratio``.
+    """
+
+    usual_replay_ratio: ClassVar[float | None] = None
 
     replay_ratio: float | None
     updates: int | None
     random_frames: int = 0
 
     def __post_init__(self) -> None:
-        if self.replay_ratio is not None and self.updates is not None:
+        # A usual ratio gives way to a number of updates, a chosen one does not.
+        chosen = self.replay_ratio not in (None, self.usual_replay_ratio)
+        if chosen and self.updates is not None:
             raise SettingError(
                 "replay_ratio",
-                f"and updates both say how many updates there are: set one to None, got "
+                f"and updates both say how many updates there are: leave one at null, got "
                 f"{self.replay_ratio} and {self.updates}.",
             )
 

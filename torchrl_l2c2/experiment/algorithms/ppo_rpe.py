@@ -23,6 +23,7 @@ class PPORPEConfig(OffPolicyConfig):
 
     usual_replay: ClassVar[str] = "prioritized"
     usual_optimizer: ClassVar[str] = "adaterm"
+    usual_replay_ratio: ClassVar[float | None] = 10.0
 
     name: str = "ppo_rpe"
     gamma: float = Field(default=0.99, ge=0, lt=1, description="discount")
@@ -40,7 +41,7 @@ class PPORPEConfig(OffPolicyConfig):
         default="max", description="how the deviation is tracked [inferred: max]"
     )
     critic_weighting: Literal["ratio", "none"] = Field(
-        default="ratio", description="weight of the value loss [inferred: ratio]"
+        default="none", description="weight of the value loss [inferred: none]"
     )
     baseline: Literal["stored", "target"] = Field(
         default="stored", description="likelihood that the ratio is taken to [inferred: stored]"
@@ -71,16 +72,16 @@ class PPORPEConfig(OffPolicyConfig):
         default="episode", description="when updates happen [inferred: after each episode]"
     )
     replay_ratio: float | None = Field(
-        default=None,
+        default=usual_replay_ratio,
         gt=0,
-        description="times that a transition is drawn on average, instead of updates: "
-        "ratio * frames / batch_size of them [inferred]",
+        description="times that a transition is drawn on average: ratio * frames / batch_size "
+        "updates [inferred: 10]",
     )
     updates: int | None = Field(
         default=None,
         ge=1,
-        description="per episode, or per step; null: by the replay ratio, else one pass over the "
-        "buffer, or one [inferred]",
+        description="per episode, or per step, instead; null: by the replay ratio, and where that "
+        "is null too, one pass over the buffer, or one",
     )
     tau: float = Field(
         default=0.1, gt=0, le=1, description="t-soft update: pace of the target networks [paper]"
