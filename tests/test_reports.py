@@ -7,6 +7,7 @@ import json
 import math
 import os
 import re
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ import pytest
 from scipy.stats import mannwhitneyu, trim_mean
 
 from torchrl_l2c2.experiment import ExperimentConfig, L2C2Config, PPORPEConfig, SACConfig
+from torchrl_l2c2.experiment.folder import code_commit
 from torchrl_l2c2.experiment.regularizers import REGULARIZERS
 from torchrl_l2c2.experiment.reports import (
     draw_learning_curves,
@@ -251,10 +253,17 @@ class TestGroups:
             "L2C2, replay_ratio=10",
         }
         _, last = results_tables(groups)
-        assert "`algorithm.critic_weighting=none`" in last.notes[0]
+        assert any("`algorithm.critic_weighting=none`" in note for note in last.notes)
 
 
 class TestSettings:
+    def test_the_commit_is_the_checkouts(self):
+        """As git names it; empty where the code lies in none."""
+        head = ["git", "rev-parse", "--short=12", "HEAD"]
+        found = subprocess.run(head, cwd=ROOT, capture_output=True, text=True, check=False)
+        expected = found.stdout.strip() if (ROOT / ".git").exists() else ""
+        assert code_commit().removesuffix("-dirty") == expected
+
     def test_what_changes_no_number_leaves_the_fingerprint(self):
         """Nor do the seed and the length; every other setting changes it."""
         plain = fingerprint(make_config().to_dict())
@@ -279,17 +288,18 @@ class TestSettings:
         }
 
     def test_the_papers_numbers_stand_beside_its_own_task_and_algorithm_alone(self, tmp_path):
-        """Not beside SAC, nor beside another task under its name."""
+        """Not beside SAC, another task under its name, or L2C2 with another gain."""
         other = replace(TASKS["swingup"], env_id="Pendulum-v1", episodes=20)
         for name, config in {
             "paper": make_config(),
             "sac": make_config(algorithm=SACConfig(), seed=1),
             "other": replace(make_config(seed=2), task=other),
+            "gain": make_config(regularizer=L2C2Config(beta=0.5)),
         }.items():
             make_run(tmp_path / name, config, 1.0, 0.1)
         beside = {run.folder.name: run.record.paper for run in read_runs(tmp_path)}
         assert beside["paper"].return_mean == 649.57
-        assert beside["sac"] is None and beside["other"] is None
+        assert all(beside[name] is None for name in ("sac", "other", "gain"))
 
 
 class TestStatistics:

@@ -11,7 +11,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from torchrl_l2c2.experiment.folder import write_atomically
+from torchrl_l2c2.experiment.folder import make_folder, write_atomically
 from torchrl_l2c2.experiment.reports.differences import read_differences
 from torchrl_l2c2.experiment.reports.paper import Published, method_order, paper_of
 from torchrl_l2c2.experiment.tasks import TASKS
@@ -95,8 +95,12 @@ class Record:
 
     @property
     def paper(self) -> Published | None:
-        """The paper's results, where the task and the algorithm are the paper's."""
-        if "task.env_id" in self.other_settings:
+        """The paper's results, where the task, the algorithm and the regularizer are the paper's.
+
+        What else the paper leaves open may differ; tables tell it below.
+        """
+        other = ("task.env_id", "task.noise_scale", "regularizer.")
+        if any(name.startswith(other) for name in self.other_settings):
             return None
         return paper_of(self.task, self.algorithm, self.method)
 
@@ -118,6 +122,7 @@ def read_records(path: str | Path) -> list[Record]:
 
 def write_records(path: str | Path, records: Iterable[Record]) -> None:
     """Writes records as CSV, sorted, whole or not at all; the same records give the same bytes."""
+    make_folder(Path(path).parent)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(field.name for field in fields(Record))

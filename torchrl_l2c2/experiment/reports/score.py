@@ -55,14 +55,10 @@ class Reading:
 
 
 def readings(groups: Sequence[Group]) -> list[Reading]:
-    """Pairs vanilla and CAPS where they have the same other settings and the paper has results.
-
-    CAPS counts with its own defaults, the paper's, alone.
-    """
+    """Pairs vanilla and CAPS of the paper's tasks where their other settings are the same."""
     pairs: dict[tuple[Any, ...], dict[str, Group]] = {}
     for group in groups:
-        own = [key for key in group.first.other_settings if key.startswith("regularizer.")]
-        if group.first.method in COMPARED and group.first.paper is not None and not own:
+        if group.first.method in COMPARED and group.first.paper is not None:
             pairs.setdefault(group.reading, {})[group.first.method] = group
     return [
         Reading(*(pair[method] for method in COMPARED))

@@ -14,6 +14,13 @@ from torchrl_l2c2.experiment.reports.records import FIGURES, QUANTITIES, Record
 from torchrl_l2c2.experiment.reports.score import COMPARED, Reading
 from torchrl_l2c2.experiment.reports.statistics import mean_and_deviation
 
+LEGEND = (
+    "Means over seeds, standard deviations over seeds in brackets; the paper's are of 18 seeds. "
+    "Late policies are those of the last tenth of training: one test episode of each with its mean "
+    "actions, and the training's own episodes, with sampled ones. The action variation is that of "
+    "the policy's mean in either case; smaller is smoother."
+)
+
 
 @dataclass(frozen=True)
 class Table:
@@ -59,9 +66,10 @@ class Table:
 
 def results_tables(groups: Sequence[Group]) -> list[Table]:
     """Means over seeds, standard deviations in brackets: late policies, and the last policy."""
+    notes = [LEGEND, *settings_notes(groups)]
     return [
         _results("Late policies", ("late_mean", "late_sampled"), groups, []),
-        _results("Last policy", ("last_mean", "last_sampled"), groups, settings_notes(groups)),
+        _results("Last policy", ("last_mean", "last_sampled"), groups, notes),
     ]
 
 
