@@ -24,7 +24,7 @@ objectives.__init__
 trainers __init__
 experiment.settings experiment.compilation experiment.environments experiment.folder
 experiment.process experiment.progress experiment.signals experiment.optimizers
-experiment.tasks experiment.replay experiment.collection experiment.reports
+experiment.tasks experiment.replay experiment.collection
 experiment.regularizers.base
 experiment.regularizers.none experiment.regularizers.caps experiment.regularizers.l2c2
 experiment.regularizers.__init__
@@ -33,6 +33,16 @@ experiment.algorithms.ppo_rpe experiment.algorithms.sac experiment.algorithms.td
 experiment.algorithms.dqn experiment.algorithms.ppo
 experiment.algorithms.__init__
 experiment.config
+experiment.reports.statistics experiment.reports.paper experiment.reports.differences
+experiment.reports.records
+experiment.reports.runs experiment.reports.groups
+experiment.reports.score
+experiment.reports.tables
+experiment.reports.comparison
+experiment.reports.figures
+experiment.reports.page experiment.reports.readme experiment.reports.results
+experiment.reports.__init__
+experiment.reports.__main__
 experiment.workers
 experiment.evaluate experiment.update experiment.player experiment.manual
 experiment.learner

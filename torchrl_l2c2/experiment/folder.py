@@ -18,6 +18,7 @@ import json
 import os
 import pickle
 import struct
+import subprocess
 import tempfile
 from collections.abc import Iterable, Mapping
 from importlib.metadata import PackageNotFoundError, version
@@ -47,6 +48,21 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             found[name] = "not installed"
     return found
+
+
+def code_commit() -> str:
+    """The commit of this code, ``-dirty`` if changed since; empty outside of a git checkout."""
+    root = Path(__file__).parents[2]
+    if not (root / ".git").exists():
+        return ""
+    describe = ("describe", "--always", "--dirty", "--abbrev=12", "--exclude=*")
+    try:
+        done = subprocess.run(
+            ("git", "-C", str(root), *describe), capture_output=True, text=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+    return done.stdout.strip()
 
 
 def make_folder(path: str | Path) -> Path:

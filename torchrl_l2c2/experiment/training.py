@@ -19,6 +19,7 @@ from torchrl_l2c2.experiment.evaluate import Evaluation, LateTests, evaluate_pol
 from torchrl_l2c2.experiment.folder import (
     CheckpointError,
     MetricsLog,
+    code_commit,
     list_checkpoints,
     load_newest,
     make_folder,
@@ -105,7 +106,7 @@ class Experiment:
         self._resume(resume)
         if self.folder is not None:
             write_json(self.folder / "config.json", config.to_dict())
-            write_json(self.folder / "versions.json", versions())
+            write_json(self.folder / "versions.json", {**versions(), "commit": code_commit()})
 
     def train(
         self, episodes: int | None = None, *, progress: bool = False

@@ -1,0 +1,534 @@
+"""Groups, tables, statistics and pictures of runs: of made-up folders, by numbers known by hand."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+import re
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import mannwhitneyu, trim_mean
+
+from torchrl_l2c2.experiment import ExperimentConfig, L2C2Config, PPORPEConfig, SACConfig
+from torchrl_l2c2.experiment.folder import code_commit
+from torchrl_l2c2.experiment.regularizers import REGULARIZERS
+from torchrl_l2c2.experiment.reports import (
+    draw_learning_curves,
+    draw_plane,
+    find_runs,
+    read_records,
+    read_runs,
+    sweep_summary,
+    write_records,
+    write_report,
+)
+from torchrl_l2c2.experiment.reports.__main__ import main
+from torchrl_l2c2.experiment.reports.comparison import statistics_tables
+from torchrl_l2c2.experiment.reports.differences import differences, fingerprint
+from torchrl_l2c2.experiment.reports.groups import group_records
+from torchrl_l2c2.experiment.reports.readme import END, START, fill
+from torchrl_l2c2.experiment.reports.records import FIGURES, merge
+from torchrl_l2c2.experiment.reports.score import readings
+from torchrl_l2c2.experiment.reports.statistics import (
+    bootstrap_interval,
+    curve_band,
+    interquartile_mean,
+    mean,
+    mean_and_deviation,
+    probability_of_improvement,
+)
+from torchrl_l2c2.experiment.reports.tables import results_tables
+from torchrl_l2c2.experiment.tasks import TASKS
+
+ROOT = Path(__file__).parents[1]
+METHODS = {
+    "vanilla": REGULARIZERS["none"],
+    "CAPS": REGULARIZERS["caps"],
+    "L2C2": REGULARIZERS["l2c2"],
+    "L2C2, beta=0.5": L2C2Config(beta=0.5),
+}
+
+
+def make_config(*, task="swingup", regularizer="none", episodes=20, seed=0, **settings):
+    method = (
+        REGULARIZERS.get(regularizer, regularizer) if isinstance(regularizer, str) else regularizer
+    )
+    return ExperimentConfig(
+        task=replace(TASKS[task], episodes=episodes), regularizer=method, seed=seed, **settings
+    )
+
+
+def make_run(folder, config, total, variation):
+    """A finished run's folder whose figures are simple sums.
+
+    Returns: sampled and late ``total``; mean and late ``total + 12``; of the last policy ``total +
+    20`` with its mean and ``total + 30`` with samples. Action variations likewise in thousandths.
+    """
+    folder.mkdir(parents=True)
+    rows = []
+    for episode in range(1, config.task.episodes + 1):
+        last_but = config.task.episodes - episode
+        late = last_but < 2
+        rows.append(
+            {
+                "episode": episode,
+                "frames": 100 * episode,
+                "updates": 10 * episode,
+                # Late, 1 more and 1 less; before, far off.
+                "return": total + (1 if last_but else -1) if late else -1e6,
+                "action_variation": variation if late else 9.0,
+                "policy_scale": 0.5 if late else 7.0,
+                "test_return": total + 12 + (2 if last_but else -2) if late else math.nan,
+                "test_action_variation": variation + 0.012 if late else math.nan,
+                "frames_per_second": 50.0,
+            }
+        )
+    with open(folder / "metrics.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+    def test(more):
+        summary = {
+            "episodes": 2,
+            "return_mean": total + more,
+            "return_std": 0.0,
+            "action_variation_mean": variation + more / 1000,
+            "action_variation_std": 0.0,
+        }
+        return {"summary": summary}
+
+    (folder / "config.json").write_text(json.dumps(config.to_dict()))
+    (folder / "evaluation.json").write_text(json.dumps({**test(20), "sampled": test(30)}))
+    (folder / "versions.json").write_text(json.dumps({"torch": "2.15.0", "commit": "abc"}))
+
+
+@pytest.fixture(scope="module")
+def forty(tmp_path_factory):
+    """Two tasks, four methods, five seeds: ``100 m + seed`` of method m, half of it on Reacher."""
+    folder = tmp_path_factory.mktemp("forty")
+    for task, scale in (("swingup", 1.0), ("reacher", 0.5)):
+        for m, (name, method) in enumerate(METHODS.items()):
+            for seed in range(5):
+                config = make_config(task=task, regularizer=method, seed=seed)
+                place = folder / task / name / str(seed)
+                make_run(place, config, scale * (100 * m + seed), 0.1 - 0.01 * m + 0.001 * seed)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def records(forty):
+    return [run.record for run in read_runs(forty)]
+
+
+def cells(table, *start):
+    """The cells of the only row that starts so."""
+    (row,) = (list(row) for row in table.rows if tuple(row[: len(start)]) == start)
+    return row[len(start) :]
+
+
+class TestGroups:
+    def test_forty_runs_are_eight_groups_with_the_figures_by_hand(self, records):
+        """Seeds are pooled, nothing else; means and deviations of 0 to 4: 2 and 1.58."""
+        late, last = results_tables(group_records(records))
+        assert [row[:4] for row in late.rows] == [
+            [task, "ppo_rpe", name, "0-4"] for task in ("swingup", "reacher") for name in METHODS
+        ]
+        # L2C2, the third: 200 + 2, and 12 more where the mean acts.
+        assert cells(late, "swingup", "ppo_rpe", "L2C2", "0-4") == [
+            "214.0 (1.6)",
+            "202.0 (1.6)",
+            "0.094 (0.002)",
+            "0.082 (0.002)",
+            "693.8 (123.8)",
+            "0.075 (0.012)",
+        ]
+        assert cells(last, "swingup", "ppo_rpe", "L2C2", "0-4")[:4] == [
+            "222.0 (1.6)",
+            "232.0 (1.6)",
+            "0.102 (0.002)",
+            "0.112 (0.002)",
+        ]
+        assert cells(late, "reacher", "ppo_rpe", "vanilla", "0-4")[:2] == [
+            "13.00 (0.79)",
+            "1.00 (0.79)",
+        ]
+
+    def test_one_run_in_one_line(self, records):
+        """Everything that is kept of it."""
+        (record,) = (r for r in records if (r.task, r.method, r.seed) == ("swingup", "caps", 3))
+        assert (record.episodes, record.frames, record.updates) == (20, 2000, 200)
+        assert (record.policy_scale, record.seconds) == (0.5, 40.0)
+        assert (record.torch, record.commit, record.length) == ("2.15.0", "abc", "20 episodes")
+        assert record.differences == "task.episodes=20"
+        assert (record.late_sampled_return, record.late_mean_return) == (103.0, 115.0)
+        assert (record.last_mean_return, record.last_sampled_return) == (123.0, 133.0)
+
+    def test_without_tests_of_late_policies_their_figures_are_unknown(self, tmp_path):
+        """But those of the training's own episodes are there."""
+        make_run(tmp_path / "a", make_config(), 5.0, 0.1)
+        path = tmp_path / "a" / "metrics.csv"
+        lines = [row | {"test_return": "nan"} for row in csv.DictReader(path.open())]
+        with open(path, "w", newline="") as file:
+            writer = csv.DictWriter(file, list(lines[0]))
+            writer.writeheader()
+            writer.writerows(lines)
+        (run,) = read_runs(tmp_path)
+        assert math.isnan(run.record.late_mean_return) and run.record.late_sampled_return == 5.0
+        late, _ = results_tables(group_records([run.record]))
+        assert cells(late, "swingup", "ppo_rpe", "vanilla", "0")[:2] == ["-", "5.00"]
+
+    def test_a_seed_that_comes_twice_is_told_and_not_pooled(self, tmp_path):
+        """The newer one stands."""
+        for name, total, time in (("new", 7.0, 2000), ("old", 900.0, 1000)):
+            make_run(tmp_path / name, make_config(seed=4), total, 0.1)
+            os.utime(tmp_path / name / "evaluation.json", (time, time))
+        found = find_runs([tmp_path])
+        (run,) = found.runs
+        assert run.record.late_sampled_return == 7.0
+        (note,) = found.notes
+        assert note.startswith("1 the same settings and seed as a newer one, left out")
+        assert str(tmp_path / "old") in note
+
+    def test_a_folder_that_is_named_twice_is_read_once(self, tmp_path):
+        """Also where one lies within the other."""
+        make_run(tmp_path / "a" / "b", make_config(), 1.0, 0.1)
+        found = find_runs([tmp_path, tmp_path / "a"])
+        assert len(found.runs) == 1 and not found.notes
+
+    def test_runs_of_other_lengths_are_told_and_not_pooled(self, tmp_path):
+        """Each is a row of its own, named by its length."""
+        for seed, episodes in enumerate((20, 20, 10)):
+            make_run(tmp_path / str(seed), make_config(seed=seed, episodes=episodes), 1.0, 0.1)
+        groups = group_records(run.record for run in read_runs(tmp_path))
+        assert {(group.name, *group.seeds) for group in groups} == {
+            ("vanilla, 20 episodes", 0, 1),
+            ("vanilla, 10 episodes", 2),
+        }
+        _, last = results_tables(groups)
+        assert any("runs of 10 episodes and of 20 episodes are rows" in note for note in last.notes)
+
+    def test_unfinished_failed_and_damaged_folders_are_counted_and_named(self, tmp_path):
+        """None is passed over in silence, and none stops the others from being read."""
+        make_run(tmp_path / "good", make_config(), 1.0, 0.1)
+        make_run(tmp_path / "cut", make_config(seed=1), 1.0, 0.1)
+        (tmp_path / "cut" / "evaluation.json").write_text('{"run"')
+        make_run(tmp_path / "going", make_config(seed=2), 1.0, 0.1)
+        (tmp_path / "going" / "evaluation.json").unlink()
+        (tmp_path / "refused" / ".hydra").mkdir(parents=True)
+        found = find_runs([tmp_path])
+        assert [run.folder.name for run in found.runs] == ["good"]
+        for start, name in (
+            ("1 unfinished", "going"),
+            ("1 failed before they began", "refused"),
+            ("1 unreadable", "cut"),
+        ):
+            assert sum(n.startswith(start) and str(tmp_path / name) in n for n in found.notes) == 1
+        summary = sweep_summary(tmp_path)
+        assert "| vanilla | 0 |" in summary and all(note in summary for note in found.notes)
+
+    def test_names_tell_what_differs_and_only_that(self, tmp_path):
+        """What all have in common is a note; what CAPS does not have does not name it."""
+        chosen = {"algorithm": PPORPEConfig(replay_ratio=10, critic_weighting="none")}
+        for name, config in {
+            "a": make_config(**chosen),
+            "b": make_config(algorithm=PPORPEConfig(replay_ratio=5, critic_weighting="none")),
+            "c": make_config(regularizer="caps", **chosen),
+            "d": make_config(regularizer=L2C2Config(beta=0.0), **chosen),
+            "e": make_config(regularizer=L2C2Config(), **chosen),
+        }.items():
+            make_run(tmp_path / name, config, 1.0, 0.1)
+        groups = group_records(run.record for run in read_runs(tmp_path))
+        assert {group.name for group in groups} == {
+            "vanilla, replay_ratio=10",
+            "vanilla, replay_ratio=5",
+            "CAPS, replay_ratio=10",
+            "L2C2, replay_ratio=10, beta=0",
+            "L2C2, replay_ratio=10",
+        }
+        _, last = results_tables(groups)
+        assert any("`algorithm.critic_weighting=none`" in note for note in last.notes)
+
+
+class TestSettings:
+    def test_the_commit_is_the_checkouts(self):
+        """As git names it; empty where the code lies in none."""
+        head = ["git", "rev-parse", "--short=12", "HEAD"]
+        found = subprocess.run(head, cwd=ROOT, capture_output=True, text=True, check=False)
+        expected = found.stdout.strip() if (ROOT / ".git").exists() else ""
+        assert code_commit().removesuffix("-dirty") == expected
+
+    def test_what_changes_no_number_leaves_the_fingerprint(self):
+        """Nor do the seed and the length; every other setting changes it."""
+        plain = fingerprint(make_config().to_dict())
+        free = make_config(seed=9, episodes=7, threads=2, test_episodes=3, late_share=0.5)
+        assert fingerprint(free.to_dict()) == plain
+        assert fingerprint(make_config(compile=False).to_dict()) != plain
+        assert fingerprint(make_config(regularizer="caps").to_dict()) != plain
+
+    def test_differences_are_from_the_defaults_of_what_is_chosen_by_name(self):
+        """Another replay's own defaults are none; a task of one's own is its id."""
+        config = ExperimentConfig.from_dict(
+            {
+                "task": {"name": "Pendulum-v1", "env_id": "Pendulum-v1", "noise_scale": 0.05},
+                "algorithm": {"name": "sac"},
+                "replay": {"name": "prioritized", "alpha": 0.5},
+            }
+        )
+        assert differences(config.to_dict()) == {
+            "replay.alpha": "0.5",
+            "replay.name": "prioritized",
+            "task.noise_scale": "0.05",
+        }
+
+    def test_the_papers_numbers_stand_beside_its_own_task_and_algorithm_alone(self, tmp_path):
+        """Not beside SAC, another task under its name, or L2C2 with another gain."""
+        other = replace(TASKS["swingup"], env_id="Pendulum-v1", episodes=20)
+        for name, config in {
+            "paper": make_config(),
+            "sac": make_config(algorithm=SACConfig(), seed=1),
+            "other": replace(make_config(seed=2), task=other),
+            "gain": make_config(regularizer=L2C2Config(beta=0.5)),
+        }.items():
+            make_run(tmp_path / name, config, 1.0, 0.1)
+        beside = {run.folder.name: run.record.paper for run in read_runs(tmp_path)}
+        assert beside["paper"].return_mean == 649.57
+        assert all(beside[name] is None for name in ("sac", "other", "gain"))
+
+
+class TestStatistics:
+    def test_mean_and_deviation_by_hand(self):
+        """Of 1, 2, 6: 3, and the root of (4 + 1 + 9) / 2; a single run has no deviation."""
+        center, deviation = mean_and_deviation(np.array([[1.0], [2.0], [6.0]]))
+        assert (center.item(), deviation.item()) == (3.0, pytest.approx(math.sqrt(7.0)))
+        assert math.isnan(mean_and_deviation(np.ones((1, 1)))[1].item())
+
+    def test_the_interquartile_mean_leaves_out_a_quarter_on_either_side(self):
+        """Over runs and tasks together: of 0 to 7 it is the mean of 2 to 5; like SciPy's."""
+        assert interquartile_mean(np.arange(8.0).reshape(2, 4)).item() == 3.5
+        scores = np.random.default_rng(0).normal(size=(18, 3))
+        expected = trim_mean(scores, 0.25, axis=None)
+        assert interquartile_mean(scores).item() == pytest.approx(expected)
+
+    def test_the_probability_of_improvement_counts_pairs(self):
+        """Of 1, 3 over 1, 2: a tie, a loss and two wins; like SciPy's Mann-Whitney statistic."""
+        ours, theirs = np.array([[1.0], [3.0]]), np.array([[1.0], [2.0]])
+        assert probability_of_improvement(ours, theirs).item() == 2.5 / 4
+        generator = np.random.default_rng(0)
+        ours, theirs = generator.normal(0.5, size=(7, 2)), generator.normal(size=(5, 2))
+        pairs = zip(ours.T, theirs.T, strict=True)
+        expected = np.mean([mannwhitneyu(*pair).statistic / 35 for pair in pairs])
+        assert probability_of_improvement(ours, theirs).item() == pytest.approx(expected)
+
+    def test_the_bootstrap_of_two_runs_by_hand(self):
+        """Means of 0 and 1 drawn anew: 0, 1/2 and 1, with probabilities 1/4, 1/2 and 1/4."""
+
+        def interval(confidence):
+            generator = np.random.default_rng(0)
+            scores = np.array([[0.0], [1.0]])
+            return bootstrap_interval(mean, scores, generator=generator, confidence=confidence)
+
+        assert interval(0.4) == (0.5, 0.5)
+        assert interval(0.95) == (0.0, 1.0)
+
+    def test_the_bootstrap_draws_for_every_task_by_itself(self):
+        """Then all runs are 0 in 1 of 16; drawn together, in 1 of 4."""
+        scores = np.array([[0.0, 0.0], [1.0, 1.0]])
+        generator = np.random.default_rng(0)
+        interval = bootstrap_interval(mean, scores, generator=generator, confidence=0.8)
+        assert interval == (0.25, 0.75)
+
+    def test_the_bootstraps_settings_have_ranges(self):
+        """Said with what was given."""
+        for name, value in (("confidence", 1.0), ("resamples", 0)):
+            with pytest.raises(ValueError, match=f"{name} must be .*got {value}"):
+                bootstrap_interval(
+                    mean, np.ones((2, 1)), generator=np.random.default_rng(0), **{name: value}
+                )
+
+    def test_a_band_is_of_whole_curves(self):
+        """Of (0, 1) and (1, 0) the mean of a resample is a run's own or 1/2 everywhere."""
+        curves = np.array([[0.0, 1.0], [1.0, 0.0]])
+        lower, upper = curve_band(curves, generator=np.random.default_rng(0))
+        assert lower.tolist() == [0.0, 0.0] and upper.tolist() == [1.0, 1.0]
+        lower, upper = curve_band(curves, generator=np.random.default_rng(0), confidence=0.4)
+        assert lower.tolist() == upper.tolist() == [0.5, 0.5]
+
+    def test_the_tables_of_statistics_by_hand(self, records):
+        """Interquartile means of 0 to 4 are those of 1 to 3; 100 more always beats vanilla."""
+        tables = statistics_tables(group_records(records))
+        assert [table.title for table in tables] == [f"Statistics: {t}" for t in FIGURES.values()]
+        row = cells(tables[1], "swingup", "ppo_rpe", "CAPS", "5")
+        assert row[0].startswith("102.0 [") and row[1] == "1.00 [1.00, 1.00]"
+        # Of .09 to .094 against .1 to .104 every pair is smoother.
+        assert row[2].startswith("0.092 [") and row[3] == "1.00 [1.00, 1.00]"
+        assert cells(tables[1], "swingup", "ppo_rpe", "vanilla", "5")[1::2] == ["", ""]
+        across = cells(tables[1], "2 tasks", "ppo_rpe", "CAPS", "5")
+        assert across == ["", "1.00 [1.00, 1.00]", "", "1.00 [1.00, 1.00]"]
+
+
+class TestScore:
+    def test_the_score_is_the_protocols_by_hand(self, tmp_path):
+        """Distances in the paper's deviations, at most 5, of vanilla and CAPS alone."""
+        # The mean over seeds lies 77.96 above the paper's: one deviation. Smoother by 2 of .011.
+        for seed, more in enumerate((67.96, 87.96)):
+            make_run(tmp_path / f"none{seed}", make_config(seed=seed), 649.57 + more, 0.084 - 0.022)
+        # 3 deviations of 26.56 below, and 100 of .002 too rough, which count as 5.
+        make_run(tmp_path / "caps", make_config(regularizer="caps"), 239.57 - 79.68, 0.226)
+        make_run(tmp_path / "l2c2", make_config(regularizer="l2c2"), -1e9, 9.0)
+        found = read_runs(tmp_path)
+        (reading,) = readings(group_records(run.record for run in found))
+        assert reading.score("late_sampled") == pytest.approx((1 + 2 + 3 + 5) / 4)
+        # With mean actions, returns are 12 higher and variations .012.
+        distances = (1 + 12 / 77.96, 2 - 0.012 / 0.011, 3 - 12 / 26.56, 5)
+        assert reading.score("late_mean") == pytest.approx(sum(distances) / 4, abs=1e-5)
+
+    def test_only_equal_settings_are_one_reading(self, tmp_path):
+        """Vanilla of one and CAPS of another give no score."""
+        make_run(tmp_path / "a", make_config(), 1.0, 0.1)
+        other = make_config(regularizer="caps", algorithm=PPORPEConfig(replay_ratio=5))
+        make_run(tmp_path / "b", other, 1.0, 0.1)
+        assert not readings(group_records(run.record for run in read_runs(tmp_path)))
+
+
+class TestRecords:
+    def test_the_file_gives_the_same_tables_as_the_folders(self, records, tmp_path):
+        """To the character, with sorted lines that do not depend on the order they came in."""
+        write_records(tmp_path / "a.csv", records)
+        write_records(tmp_path / "b.csv", reversed(records))
+        assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
+        groups = [group_records(r) for r in (records, read_records(tmp_path / "a.csv"))]
+        for make in (results_tables, statistics_tables):
+            ours, theirs = ([table.markdown() for table in make(g)] for g in groups)
+            assert ours == theirs
+
+    def test_a_run_is_replaced_by_its_newer_self(self, records):
+        """Others stay as they are."""
+        newer = replace(records[7], late_mean_return=-1.0)
+        merged = merge(records, [newer])
+        assert len(merged) == len(records)
+        assert [a for a, b in zip(merged, records, strict=True) if a != b] == [newer]
+
+    def test_an_unknown_number_is_an_empty_cell(self, records, tmp_path):
+        """And comes back as unknown."""
+        write_records(tmp_path / "runs.csv", [replace(records[0], policy_scale=math.nan)])
+        (back,) = read_records(tmp_path / "runs.csv")
+        assert math.isnan(back.policy_scale) and back.seconds == records[0].seconds
+
+    def test_a_file_of_something_else_is_refused(self, records, tmp_path):
+        """With its name, and the line where there is one."""
+        path = tmp_path / "runs.csv"
+        path.write_text("a,b\n1,2\n")
+        with pytest.raises(ValueError, match=r"runs\.csv has the columns"):
+            read_records(path)
+        write_records(path, records[:1])
+        path.write_text(path.read_text().replace(",2000,", ",many,"))
+        with pytest.raises(ValueError, match=r"runs\.csv, line 2: .*many"):
+            read_records(path)
+
+
+class TestPictures:
+    def test_the_same_runs_give_the_same_bytes_without_a_date(self, forty, records, tmp_path):
+        """So that a picture in a repository changes only with its numbers."""
+        runs = [run for run in read_runs(forty) if run.task == "swingup"]
+        for name in ("a.svg", "b.svg"):
+            draw_learning_curves(runs, tmp_path / f"curves_{name}")
+            draw_plane(group_records(records[:20]), "late_mean", tmp_path / f"plane_{name}")
+        for kind in ("curves", "plane"):
+            first, second = ((tmp_path / f"{kind}_{n}.svg").read_text() for n in "ab")
+            assert first == second and "<dc:date>" not in first
+            assert all(name in first for name in METHODS)
+
+    def test_a_single_run_is_drawn_as_png(self, forty, tmp_path):
+        """As every run's folder has it."""
+        draw_learning_curves(read_runs(forty)[:1], tmp_path / "curves.png")
+        assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
+
+
+class TestReport:
+    def test_the_page_needs_nothing_else(self, forty, tmp_path):
+        """Every picture is within it, every table, and no address."""
+        found = find_runs([forty])
+        page = write_report(tmp_path, [run.record for run in found.runs], found.runs)
+        text = page.read_text()
+        pictures = sorted(path.stem for path in tmp_path.glob("*.svg"))
+        assert pictures == [
+            "learning_curves_reacher_ppo_rpe",
+            "learning_curves_swingup_ppo_rpe",
+            *sorted(f"plane_{figure}" for figure in FIGURES),
+        ]
+        assert text.count('src="data:image/svg+xml;base64,') == len(pictures)
+        assert not re.search(r'(?:src|href)="(?!data:)', text) and "http" not in text
+        markdown = (tmp_path / "report.md").read_text()
+        for title in ("Late policies", "Last policy", "Score of the readings", "Every run"):
+            assert f"<h2>{title}</h2>" in text and f"**{title}**" in markdown
+        groups = json.loads((tmp_path / "report.json").read_text())["groups"]
+        assert groups[2]["statistics"]["late_sampled_return"]["mean"] == 202.0
+        assert groups[2]["paper"]["return_mean"] == 693.77
+
+    def test_the_command_prints_the_same_from_folders_and_from_their_records(
+        self, forty, tmp_path, capsys
+    ):
+        """And no report, unless it is asked for."""
+        file = str(tmp_path / "runs.csv")
+        main([str(forty), "--csv", file])
+        tables, _, _ = capsys.readouterr().out.partition("\n\nrecords: ")
+        assert tables.count("\n| ") == 20
+        main(["--from", file])
+        assert capsys.readouterr().out.strip() == tables
+        main(["--from", file, "--score"])
+        assert capsys.readouterr().out.count("| reacher | task.episodes=20 | 0-4 |") == 2
+        assert not (forty / "report").exists()
+
+    def test_the_report_lies_in_the_runs_folder(self, tmp_path, capsys):
+        """Where no other is named; the same command reads past it."""
+        make_run(tmp_path / "run", make_config(), 1.0, 0.1)
+        main([str(tmp_path)])
+        assert str(tmp_path / "report" / "report.html") in capsys.readouterr().out
+        assert (tmp_path / "report" / "report.html").exists()
+        assert len(read_runs(tmp_path)) == 1
+
+    def test_what_cannot_be_done_is_one_line(self, tmp_path, capsys):
+        """An empty folder, no folder, a file that is not there."""
+        with pytest.raises(SystemExit, match="error: no finished run"):
+            main([str(tmp_path)])
+        with pytest.raises(SystemExit, match=r"error: there is no file"):
+            main(["--from", str(tmp_path / "runs.csv")])
+        with pytest.raises(SystemExit):
+            main([])
+        assert "name folders of runs" in capsys.readouterr().err
+
+
+class TestReadme:
+    def test_its_results_are_those_of_the_records(self):
+        """python -m torchrl_l2c2.experiment.reports --from results/runs.csv --readme README.md"""
+        recorded = read_records(ROOT / "results" / "runs.csv")
+        text = (ROOT / "README.md").read_text()
+        assert fill(text, recorded) == text
+        assert (ROOT / "docs" / "results.svg").exists() == bool(recorded)
+
+    def test_the_command_fills_it_in(self, records, tmp_path):
+        """Between the marks, whatever stood there; with the picture beside it."""
+        (tmp_path / "docs").mkdir()
+        readme, file = tmp_path / "README.md", tmp_path / "runs.csv"
+        readme.write_text(f"before\n{START}\nold\n{END}\nafter\n")
+        write_records(file, records)
+        main(["--from", str(file), "--readme", str(readme)])
+        text = readme.read_text()
+        assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
+        assert "| swingup | ppo_rpe | L2C2 | 0-4 | 214.0 (1.6) |" in text
+        assert (tmp_path / "docs" / "results.svg").exists()
+        write_records(file, [])
+        main(["--from", str(file), "--readme", str(readme)])
+        assert readme.read_text() == f"before\n{START}\nNo runs are recorded yet.\n{END}\nafter\n"
+
+    def test_a_text_without_the_marks_is_refused(self, records):
+        """Rather than changed somewhere."""
+        with pytest.raises(ValueError, match="once each"):
+            fill(f"{END} and {START}", records)

@@ -1,0 +1,48 @@
+"""Tables, statistics and pictures of finished runs, beside the paper's numbers.
+
+``python -m torchrl_l2c2.experiment.reports outputs/swingup`` reads every run below a folder, prints
+their tables and writes a report; ``--help`` says what else it does.
+"""
+
+from torchrl_l2c2.experiment.reports.figures import draw_learning_curves, draw_plane
+from torchrl_l2c2.experiment.reports.page import write_report
+from torchrl_l2c2.experiment.reports.paper import PAPER
+from torchrl_l2c2.experiment.reports.records import (
+    FIGURES,
+    QUANTITIES,
+    Record,
+    read_records,
+    write_records,
+)
+from torchrl_l2c2.experiment.reports.results import (
+    compare_with_paper,
+    sweep_summary,
+    write_results,
+)
+from torchrl_l2c2.experiment.reports.runs import (
+    FinishedRun,
+    Found,
+    find_runs,
+    finished_run,
+    read_runs,
+)
+
+__all__ = [
+    "FIGURES",
+    "PAPER",
+    "QUANTITIES",
+    "FinishedRun",
+    "Found",
+    "Record",
+    "compare_with_paper",
+    "draw_learning_curves",
+    "draw_plane",
+    "find_runs",
+    "finished_run",
+    "read_records",
+    "read_runs",
+    "sweep_summary",
+    "write_records",
+    "write_report",
+    "write_results",
+]

@@ -1,0 +1,101 @@
+"""The command line: tables of runs, a report, a file of records, a README's results."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from torchrl_l2c2.experiment.reports.groups import group_records
+from torchrl_l2c2.experiment.reports.page import write_report
+from torchrl_l2c2.experiment.reports.readme import fill_readme
+from torchrl_l2c2.experiment.reports.records import Record, merge, read_records, write_records
+from torchrl_l2c2.experiment.reports.runs import FinishedRun, find_runs
+from torchrl_l2c2.experiment.reports.score import readings
+from torchrl_l2c2.experiment.reports.tables import results_tables, score_table
+
+DESCRIPTION = """\
+Reads every finished run below folders, prints their tables beside the paper's numbers, and writes a
+report: tables, statistics and pictures, as one page, as Markdown, SVG and JSON.
+"""
+EXAMPLES = """\
+examples:
+  python -m torchrl_l2c2.experiment.reports outputs
+  python -m torchrl_l2c2.experiment.reports outputs --csv results/runs.csv
+  python -m torchrl_l2c2.experiment.reports --from results/runs.csv --readme README.md
+"""
+
+
+def main(arguments: Iterable[str] | None = None) -> None:
+    """Does what the command line says; an error is one line."""
+    parser = _parser()
+    chosen = parser.parse_args(None if arguments is None else list(arguments))
+    if bool(chosen.folders) == bool(chosen.records):
+        parser.error("name folders of runs, or a file of records with --from")
+    if chosen.records and chosen.csv:
+        parser.error("--csv writes records of folders; --from has them already")
+    try:
+        _report(chosen)
+    except (OSError, ValueError) as error:
+        sys.exit(f"error: {error}")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m torchrl_l2c2.experiment.reports",
+        description=DESCRIPTION,
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("folders", nargs="*", metavar="FOLDER", help="of runs, at any depth, e.g. outputs/swingup")
+    add("--from", dest="records", metavar="CSV", help="records of runs instead of their folders")
+    add(
+        "--output",
+        metavar="FOLDER",
+        help="of the report (default: report/ in the first folder; with --from, --csv, --score or "
+        "--readme there is a report only if this is given)",
+    )
+    add("--csv", metavar="CSV", help="file that gets a line for every run, or its newer line")
+    add("--score", action="store_true", help="print how near vanilla and CAPS come to the paper")
+    add("--readme", metavar="FILE", help="make the results between this file's marks anew")
+    return parser
+
+
+def _report(chosen: argparse.Namespace) -> None:
+    records, runs, notes = _read(chosen)
+    if chosen.score:
+        print(score_table(readings(group_records(records))).markdown())
+    elif records:
+        tables = results_tables(group_records(records))
+        print("\n\n".join([*(table.markdown() for table in tables), *notes]))
+    if chosen.csv:
+        write_records(chosen.csv, merge(read_records(chosen.csv), records))
+        print(f"\nrecords: {chosen.csv}")
+    if chosen.readme:
+        fill_readme(chosen.readme, records)
+        print(f"\nresults: {chosen.readme}")
+    alone = not (chosen.records or chosen.csv or chosen.score or chosen.readme)
+    if chosen.output or alone:
+        folder = Path(chosen.output or Path(chosen.folders[0]) / "report")
+        print(f"\nreport: {write_report(folder, records, runs, notes)}")
+
+
+def _read(
+    chosen: argparse.Namespace,
+) -> tuple[Sequence[Record], Sequence[FinishedRun], Sequence[str]]:
+    if chosen.records:
+        if not Path(chosen.records).exists():
+            raise FileNotFoundError(f"there is no file {chosen.records!r}; make it with --csv.")
+        return read_records(chosen.records), [], []
+    found = find_runs(chosen.folders)
+    if not found.runs:
+        named = ", ".join(map(repr, chosen.folders))
+        nothing = f"no finished run (evaluation.json) below {named}; name a folder of train.py's."
+        raise FileNotFoundError(" ".join([nothing, *found.notes]))
+    return [run.record for run in found.runs], found.runs, found.notes
+
+
+if __name__ == "__main__":
+    main()

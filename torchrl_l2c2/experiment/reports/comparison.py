@@ -1,0 +1,172 @@
+"""Groups against vanilla: interquartile means and probabilities of improvement, with intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from torchrl_l2c2.experiment.reports.groups import Group, baseline_of
+from torchrl_l2c2.experiment.reports.records import FIGURES, QUANTITIES
+from torchrl_l2c2.experiment.reports.statistics import (
+    Interval,
+    Scores,
+    bootstrap_interval,
+    interquartile_mean,
+    mean_and_deviation,
+    probability_of_improvement,
+)
+from torchrl_l2c2.experiment.reports.tables import Table, number
+
+# What is better: a larger return, a smaller action variation.
+SIGNS = {"return": 1.0, "action_variation": -1.0}
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A statistic and its 95% interval; a single run has none."""
+
+    value: float
+    interval: Interval | None
+
+    @classmethod
+    def of(cls, statistic: Callable[..., Scores], *scores: Scores) -> Estimate | None:
+        """By the stratified bootstrap, which is seeded: the same scores, the same ends."""
+        if not all(len(matrix) for matrix in scores):
+            return None
+        value, generator = float(statistic(*scores)), np.random.default_rng(0)
+        if max(len(matrix) for matrix in scores) == 1:
+            return cls(value, None)
+        return cls(value, bootstrap_interval(statistic, *scores, generator=generator))
+
+    def text(self, write: Callable[[float], str]) -> str:
+        """``value [lower, upper]``."""
+        if self.interval is None:
+            return write(self.value)
+        return f"{write(self.value)} [{', '.join(map(write, self.interval))}]"
+
+
+def improvement(
+    groups: Sequence[Group], baselines: Sequence[Group], figure: str, quantity: str
+) -> Estimate | None:
+    """Probability that a run is better than a vanilla one, over tasks.
+
+    Args:
+        groups (sequence of Group): one of each task; runs count whose seed every task has.
+        baselines (sequence of Group): vanilla of the same tasks.
+        figure (str): one of ``FIGURES``.
+        quantity (str): one of ``QUANTITIES``; a smaller action variation is better.
+
+    Returns:
+        Estimate: ``None`` where there are no such runs.
+    """
+    matrices = [_matrix(side, figure, quantity) for side in (groups, baselines)]
+    return Estimate.of(
+        probability_of_improvement, *(SIGNS[quantity] * matrix for matrix in matrices)
+    )
+
+
+def statistics_tables(groups: Sequence[Group]) -> list[Table]:
+    """Interquartile means and probabilities of improvement, a table for each kind of figure."""
+    return [_statistics(figure, groups) for figure in FIGURES]
+
+
+def _statistics(figure: str, groups: Sequence[Group]) -> Table:
+    columns = ["task", "algorithm", "method", "runs"]
+    for quantity, better in zip(QUANTITIES.values(), ("larger", "smaller"), strict=True):
+        columns += [f"{quantity}: interquartile mean", f"P({better} than vanilla)"]
+    rows = [_statistics_row(figure, group, baseline_of(group, groups)) for group in groups]
+    rows += _across_tasks(figure, groups)
+    notes = [
+        "95% intervals of the stratified bootstrap in brackets (Agarwal et al. 2021). "
+        "P: how probable it is that a run is better than one of vanilla with the same other "
+        "settings, ties halved."
+    ]
+    return Table(f"Statistics: {FIGURES[figure]}", columns, rows, notes)
+
+
+def _statistics_row(figure: str, group: Group, baseline: Group | None) -> list[str]:
+    cells = [group.first.task, group.first.algorithm, group.name, str(len(group.records))]
+    for quantity in QUANTITIES:
+        center = Estimate.of(interquartile_mean, group.scores(figure, quantity))
+        better = improvement([group], [baseline], figure, quantity) if baseline else None
+        if center is None:
+            cells += ["-", ""]
+        else:
+            write = partial(number, quantity=quantity, beside=center.value)
+            cells += [center.text(write), _probability(better)]
+    return cells
+
+
+def _across_tasks(figure: str, groups: Sequence[Group]) -> list[list[str]]:
+    """Rows over all tasks, of methods that several have: probabilities need no common scale."""
+    rows = []
+    for algorithm, name in dict.fromkeys((g.first.algorithm, g.name) for g in groups):
+        pairs = [
+            (group, baseline)
+            for group in groups
+            if (group.first.algorithm, group.name) == (algorithm, name)
+            and (baseline := baseline_of(group, groups)) is not None
+        ]
+        if len(pairs) < 2:
+            continue
+        ours, theirs = zip(*pairs, strict=True)
+        better = [_probability(improvement(ours, theirs, figure, q)) for q in QUANTITIES]
+        runs = str(len(_matrix(ours, figure, "return")))
+        rows.append([f"{len(pairs)} tasks", algorithm, name, runs, "", better[0], "", better[1]])
+    return rows
+
+
+def summary(groups: Sequence[Group]) -> list[dict[str, Any]]:
+    """Every group's statistics as plain values, for a JSON file."""
+    return [_summary(group, baseline_of(group, groups)) for group in groups]
+
+
+def _summary(group: Group, baseline: Group | None) -> dict[str, Any]:
+    statistics: dict[str, Any] = {}
+    for figure in FIGURES:
+        for quantity in QUANTITIES:
+            scores = group.scores(figure, quantity)
+            if not len(scores):
+                continue
+            center, deviation = mean_and_deviation(scores)
+            better = improvement([group], [baseline], figure, quantity) if baseline else None
+            statistics[f"{figure}_{quantity}"] = {
+                "mean": center.item(),
+                "standard_deviation": deviation.item() if len(scores) > 1 else None,
+                "interquartile_mean": _plain(Estimate.of(interquartile_mean, scores)),
+                "probability_of_improvement": _plain(better),
+                "by_seed": {str(s): v for s, v in group.by_seed(figure, quantity).items()},
+            }
+    first = group.first
+    return {
+        "task": first.task,
+        "algorithm": first.algorithm,
+        "method": first.method,
+        "name": group.name,
+        "settings": first.settings,
+        "differences": first.differences,
+        "length": first.length,
+        "seeds": group.seeds,
+        "paper": first.paper._asdict() if first.paper else None,
+        "statistics": statistics,
+    }
+
+
+def _plain(estimate: Estimate | None) -> dict[str, Any] | None:
+    return None if estimate is None else {"value": estimate.value, "interval": estimate.interval}
+
+
+def _matrix(groups: Sequence[Group], figure: str, quantity: str) -> Scores:
+    """``[runs, tasks]``: runs of the seeds that every group has the figure of."""
+    columns = [group.by_seed(figure, quantity) for group in groups]
+    seeds = sorted(set.intersection(*(set(column) for column in columns)))
+    matrix = np.array([[column[seed] for column in columns] for seed in seeds])
+    return matrix.reshape(len(seeds), len(groups))
+
+
+def _probability(estimate: Estimate | None) -> str:
+    return "" if estimate is None else estimate.text(lambda value: f"{value:.2f}")

@@ -1,0 +1,110 @@
+"""Which settings a run has: as one short code, and as what differs from the defaults."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from torchrl_l2c2.experiment.config import (
+    FREE_SETTINGS,
+    FREE_TASK_SETTINGS,
+    GROUPS,
+    ExperimentConfig,
+)
+from torchrl_l2c2.experiment.tasks import TASKS
+
+# Chosen by name; what else these groups have are settings of what was chosen.
+_COMPARED = ("task", "algorithm", "regularizer")
+
+
+def fingerprint(config: Mapping[str, Any]) -> str:
+    """Ten hexadecimal digits that two runs share if, and only if, they may be pooled.
+
+    They stand for every setting but the seed, the logger, and those that change none of the
+    numbers or only the length of the training.
+
+    Args:
+        config (Mapping): of ``config.json``; settings that it lacks have their defaults.
+
+    Raises:
+        SettingError: a setting that is not known.
+    """
+    compared = {k: v for k, v in _flat(ExperimentConfig.from_dict(config)).items() if _counts(k)}
+    return hashlib.sha256(json.dumps(compared, sort_keys=True).encode()).hexdigest()[:10]
+
+
+def differences(config: Mapping[str, Any]) -> dict[str, str]:
+    """The settings that differ from the defaults of what the run's names choose.
+
+    Args:
+        config (Mapping): of ``config.json``.
+
+    Returns:
+        dict: such as ``{"algorithm.replay_ratio": "10", "task.episodes": "400"}``, sorted; without
+        the settings that change none of the numbers.
+
+    Raises:
+        SettingError: a setting that is not known.
+
+    Examples:
+        >>> config = ExperimentConfig().to_dict()
+        >>> config["regularizer"]["beta"] = 0.5
+        >>> differences(config)
+        {'regularizer.beta': '0.5'}
+    """
+    own = _flat(ExperimentConfig.from_dict(config))
+    usual = _flat(ExperimentConfig.from_dict(_names(config, _COMPARED)))
+    chosen = _flat(ExperimentConfig.from_dict(_names(config, GROUPS)))
+    budgets = {f"task.{name}" for name in FREE_TASK_SETTINGS - {"solved_at"}}
+    return {
+        name: _word(value)
+        for name, value in sorted(own.items())
+        if (_counts(name) or name in budgets)
+        and value != (usual if name.endswith(".name") else chosen)[name]
+    }
+
+
+def write_differences(values: Mapping[str, str]) -> str:
+    """One line of what differs: ``a=1 b=2``."""
+    return " ".join(f"{name}={value}" for name, value in values.items())
+
+
+def read_differences(line: str) -> dict[str, str]:
+    """Reads :func:`write_differences` back."""
+    return dict(pair.split("=", 1) for pair in line.split())
+
+
+def _names(config: Mapping[str, Any], groups: Any) -> dict[str, Any]:
+    named = {group: {"name": config[group]["name"]} for group in groups if group in config}
+    if named["task"]["name"] not in TASKS:  # A task of one's own is what its id says.
+        named["task"]["env_id"] = config["task"]["env_id"]
+    return named
+
+
+def _flat(config: ExperimentConfig) -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    # Through JSON, where a tuple and a list are the same.
+    for name, value in json.loads(json.dumps(config.to_dict())).items():
+        flat |= {f"{name}.{k}": v for k, v in value.items()} if name in GROUPS else {name: value}
+    return flat
+
+
+def _counts(name: str) -> bool:
+    group, _, setting = name.partition(".")
+    return (
+        name != "seed"
+        and group != "logger"
+        and name not in FREE_SETTINGS
+        and not (group == "task" and setting in FREE_TASK_SETTINGS)
+    )
+
+
+def _word(value: Any) -> str:
+    """A value without a space in it: as JSON, but for plain words and whole floats."""
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
+    if isinstance(value, str) and value.replace("_", "").isalnum():
+        return value
+    return json.dumps(value, separators=(",", ":")).replace(" ", "\\u0020")

@@ -1,0 +1,207 @@
+"""Pictures of runs: learning curves, and return against smoothness."""
+
+from __future__ import annotations
+
+import io
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchrl_l2c2.experiment.folder import write_atomically
+from torchrl_l2c2.experiment.reports.comparison import Estimate
+from torchrl_l2c2.experiment.reports.groups import Group, group_records
+from torchrl_l2c2.experiment.reports.paper import METHODS
+from torchrl_l2c2.experiment.reports.records import FIGURES
+from torchrl_l2c2.experiment.reports.runs import FinishedRun
+from torchrl_l2c2.experiment.reports.statistics import Scores, curve_band, mean
+
+PANELS = {
+    "return": "return",
+    "action_variation": "action variation",
+    "policy_scale": "policy scale",
+}
+POINTS = 200
+_OTHER_COLORS = ("#2a7f62", "#b0416b", "#8a6d1d", "#444444")
+_LINES, _MARKERS = ("-", "--", ":", "-."), "os^v"
+
+
+def draw_learning_curves(runs: Sequence[FinishedRun], path: str | Path) -> None:
+    """Draws return, action variation and the policy's scale of training episodes against frames.
+
+    Of a single run, its episodes as a thin line and their moving average; of several seeds, the
+    mean of their moving averages with its 95% bootstrap interval as a band.
+
+    Args:
+        runs (sequence of FinishedRun): of one task and algorithm.
+        path (str or Path): of the file; its ending, ``.png`` or ``.svg``, decides what it is.
+    """
+    groups = group_records(run.record for run in runs)
+    runs_of = {run.record.identity: run for run in runs}
+    styles = _styles(groups)
+    known = [name for name in PANELS if any(np.isfinite(run.column(name)).any() for run in runs)]
+    window = max(10, max(len(run.metrics) for run in runs) // 40)
+    figure, axes = _subplots(len(known), 1, (3.4 * len(known) + 0.6, 3.6))
+    for axis, name in zip(axes, known, strict=True):
+        for group in groups:
+            members = [runs_of[record.identity] for record in group.records]
+            style = {k: styles[group.name][k] for k in ("color", "linestyle")}
+            _draw_curve(axis, members, name, window, label=group.name, **style)
+        axis.set_xlabel("thousand frames")
+        axis.xaxis.set_major_formatter(lambda frames, _: f"{frames / 1000:g}")
+        axis.set_ylabel(PANELS[name])
+    if runs[0].solved_at is not None:
+        axes[0].axhline(runs[0].solved_at, color="black", linestyle=":", linewidth=1)
+    title = f"{runs[0].task}, {runs[0].algorithm}: training episodes, moving mean of {window}"
+    _finish(figure, axes, title, path)
+
+
+def draw_plane(groups: Sequence[Group], figure: str, path: str | Path) -> None:
+    """Draws return against action variation: up and to the left is better and smoother.
+
+    A dot for each group, the mean over its seeds with 95% bootstrap intervals; a hollow diamond
+    for the paper's mean with its standard deviation, dotted.
+
+    Args:
+        groups (sequence of Group): a panel is drawn for each task and algorithm.
+        figure (str): one of ``FIGURES``, such as ``"late_mean"``.
+        path (str or Path): of the file; its ending, ``.png`` or ``.svg``, decides what it is.
+    """
+    panels = list(dict.fromkeys((group.first.task, group.first.algorithm) for group in groups))
+    across = min(4, len(panels))
+    down = -(-len(panels) // across)
+    drawn, axes = _subplots(across, down, (max(3.4 * across, 5.4), 3.2 * down + 0.6))
+    for axis, (task, algorithm) in zip(axes, panels, strict=False):
+        together = [g for g in groups if (g.first.task, g.first.algorithm) == (task, algorithm)]
+        styles = _styles(together)
+        for group in together:
+            _draw_point(axis, group, figure, styles[group.name])
+        axis.set_title(f"{task}, {algorithm}", fontsize=10)
+        axis.set_xlabel("action variation")
+        axis.set_ylabel("return")
+    for axis in axes[len(panels) :]:
+        axis.set_visible(False)
+    _finish(drawn, axes, f"{FIGURES[figure]}; hollow: the paper", path)
+
+
+def _draw_curve(
+    axis: Any, runs: Sequence[FinishedRun], name: str, window: int, **style: Any
+) -> None:
+    curves = [
+        (np.array(run.column("frames")), _moving_average(np.array(run.column(name)), window))
+        for run in runs
+    ]
+    if len(runs) == 1:
+        ((frames, average),) = curves
+        axis.plot(frames, runs[0].column(name), color=style["color"], alpha=0.25, linewidth=0.7)
+        axis.plot(frames, average, linewidth=1.6, **style)
+        return
+    # Where every run has been.
+    start, end = max(f[0] for f, _ in curves), min(f[-1] for f, _ in curves)
+    shared = np.linspace(start, end, POINTS)
+    matrix = np.stack([np.interp(shared, frames, average) for frames, average in curves])
+    lower, upper = curve_band(matrix, generator=np.random.default_rng(0))
+    axis.fill_between(shared, lower, upper, color=style["color"], alpha=0.18, linewidth=0)
+    axis.plot(shared, matrix.mean(0), linewidth=1.6, **style)
+
+
+def _moving_average(values: Scores, window: int) -> Scores:
+    """Mean of the last ``window`` values, of fewer at the start."""
+    sums = np.concatenate([[0.0], values.cumsum()])
+    ends = np.arange(1, len(values) + 1)
+    starts = np.maximum(0, ends - window)
+    averages: Scores = (sums[ends] - sums[starts]) / (ends - starts)
+    return averages
+
+
+def _draw_point(axis: Any, group: Group, figure: str, style: dict[str, str]) -> None:
+    color = style["color"]
+    estimates = [
+        Estimate.of(mean, group.scores(figure, name)) for name in ("action_variation", "return")
+    ]
+    if None not in estimates:
+        (x, x_bars), (y, y_bars) = ((e.value, _bars(e)) for e in estimates if e is not None)
+        shape = {"fmt": style["marker"], "markersize": 6, "elinewidth": 1.6, "capsize": 3}
+        axis.errorbar([x], [y], y_bars, x_bars, label=group.name, color=color, **shape)
+    paper = group.first.paper
+    if paper is not None:
+        center = (paper.action_variation_mean, paper.return_mean)
+        bars = axis.errorbar(
+            *([value] for value in center),
+            xerr=paper.action_variation_std,
+            yerr=paper.return_std,
+            fmt="D",
+            markersize=5,
+            markerfacecolor="white",
+            color=color,
+            elinewidth=0.9,
+            alpha=0.8,
+        )
+        for line in bars[2]:
+            line.set_linestyle(":")
+
+
+def _bars(estimate: Estimate) -> list[list[float]] | None:
+    if estimate.interval is None:
+        return None
+    lower, upper = estimate.interval
+    # A percentile interval may leave the mean of a skewed few just outside.
+    return [[max(0.0, estimate.value - lower)], [max(0.0, upper - estimate.value)]]
+
+
+def _styles(groups: Sequence[Group]) -> dict[str, dict[str, str]]:
+    """A color for each method, and a line and a marker for each of its groups."""
+    others = sorted({g.first.method for g in groups} - METHODS.keys())
+    colors = {name: color for name, (_, color) in METHODS.items()}
+    colors |= {name: _OTHER_COLORS[i % len(_OTHER_COLORS)] for i, name in enumerate(others)}
+    seen: Counter[str] = Counter()
+    styles = {}
+    for group in groups:
+        method = group.first.method
+        styles[group.name] = {
+            "color": colors[method],
+            "linestyle": _LINES[seen[method] % len(_LINES)],
+            "marker": _MARKERS[seen[method] % len(_MARKERS)],
+        }
+        seen[method] += 1
+    return styles
+
+
+def _subplots(across: int, down: int, size: tuple[float, float]) -> tuple[Any, list[Any]]:
+    # Imported here: drawing takes a second to import and no other function needs it.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, list(figure.subplots(down, across, squeeze=False).flat)
+
+
+def _finish(figure: Any, axes: Sequence[Any], title: str, path: str | Path) -> None:
+    named: dict[str, Any] = {}
+    for axis in axes:
+        axis.grid(alpha=0.25)
+        handles, names = axis.get_legend_handles_labels()
+        named.update(zip(names, handles, strict=True))
+    figure.suptitle(title, fontsize=11)
+    if named:
+        # A longer name, at some 14 letters an inch, leaves fewer beside one another.
+        width = figure.get_figwidth() / (0.7 + max(map(len, named)) / 14)
+        columns = max(1, min(len(named), int(width)))
+        legend = {"loc": "outside lower center", "frameon": False, "ncols": columns}
+        figure.legend(named.values(), named.keys(), **legend)
+    save(figure, path)
+
+
+def save(figure: Any, path: str | Path) -> None:
+    """Writes a picture whole or not at all; the same picture gives the same bytes."""
+    from matplotlib import rc_context
+
+    content, kind = io.BytesIO(), Path(path).suffix[1:]
+    # Without these an SVG file has the date and random names in it.
+    metadata = {"Date": None, "Creator": None} if kind == "svg" else {"Software": None}
+    with rc_context({"svg.hashsalt": "torchrl_l2c2", "svg.fonttype": "none"}):
+        figure.savefig(content, dpi=110, format=kind, metadata=metadata)
+    write_atomically(path, content.getvalue())

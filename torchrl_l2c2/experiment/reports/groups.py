@@ -1,0 +1,140 @@
+"""Runs that differ in nothing but their seeds, as one group; and what tells groups apart."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from torchrl_l2c2.experiment.reports.paper import method_name
+from torchrl_l2c2.experiment.reports.records import Record
+from torchrl_l2c2.experiment.reports.statistics import Scores
+
+# In the records' length, not in their names.
+_BUDGETS = ("task.episodes", "task.frames")
+
+
+@dataclass(frozen=True)
+class Group:
+    """Runs with the same settings and length, one of each seed.
+
+    Attributes:
+        records: by seed.
+        name: the method, and what tells the group from others of its task and algorithm, such as
+            ``"L2C2, beta=0.5"``.
+    """
+
+    records: tuple[Record, ...]
+    name: str
+
+    @property
+    def first(self) -> Record:
+        """Any of them, for what they have in common."""
+        return self.records[0]
+
+    @property
+    def seeds(self) -> list[int]:
+        """Of its runs."""
+        return [record.seed for record in self.records]
+
+    @property
+    def reading(self) -> tuple[Any, ...]:
+        """Every setting but the regularizer's: what is compared with it has the same."""
+        others = _without(self.first, "regularizer.")
+        return (self.first.task, self.first.algorithm, self.first.length, *sorted(others.items()))
+
+    def by_seed(self, figure: str, quantity: str) -> dict[int, float]:
+        """One of the eight figures of every run that has it."""
+        values = {record.seed: record.figure(figure, quantity) for record in self.records}
+        return {seed: value for seed, value in values.items() if not math.isnan(value)}
+
+    def scores(self, figure: str, quantity: str) -> Scores:
+        """The same as a matrix ``[runs, 1]``."""
+        return np.array(list(self.by_seed(figure, quantity).values())).reshape(-1, 1)
+
+
+def group_records(records: Iterable[Record]) -> list[Group]:
+    """Groups records by every setting but the seed, in the order of tables."""
+    pooled: dict[tuple[Any, ...], list[Record]] = defaultdict(list)
+    for record in sorted(records, key=lambda record: record.place):
+        # Without the seed, which is the last of it.
+        pooled[record.identity[:-1]].append(record)
+    groups = [Group(tuple(members), "") for members in pooled.values()]
+    compared: dict[tuple[str, str], list[Group]] = defaultdict(list)
+    for group in groups:
+        compared[group.first.task, group.first.algorithm].append(group)
+    return [named for together in compared.values() for named in _named(together)]
+
+
+def baseline_of(group: Group, groups: Iterable[Group]) -> Group | None:
+    """The vanilla runs with the same other settings; ``None`` for themselves or without any."""
+    if group.first.method == "none":
+        return None
+    candidates = (other for other in groups if other.first.method == "none")
+    return next((other for other in candidates if other.reading == group.reading), None)
+
+
+def differing_lengths(groups: Sequence[Group]) -> list[str]:
+    """A line for every kind of run that was trained for different lengths, which is not pooled."""
+    lengths: dict[tuple[str, str], list[Group]] = defaultdict(list)
+    for group in groups:
+        lengths[group.first.method, group.first.settings].append(group)
+    return [
+        f"{same[0].first.task}, {same[0].first.algorithm}, {method_name(same[0].first.method)}: "
+        f"runs of {' and of '.join(group.first.length for group in same)} are rows of their own"
+        for same in lengths.values()
+        if len(same) > 1
+    ]
+
+
+def common_settings(groups: Sequence[Group]) -> dict[str, str]:
+    """What differs from the defaults in all groups alike."""
+    first, *rest = ({**group.first.other_settings} for group in groups)
+    return {k: v for k, v in first.items() if all(other.get(k) == v for other in rest)}
+
+
+def _without(record: Record, *prefixes: str) -> dict[str, str]:
+    return {k: v for k, v in record.other_settings.items() if not k.startswith(prefixes)}
+
+
+def _named(groups: list[Group]) -> list[Group]:
+    """Groups of one task and algorithm, each named by what the others have differently."""
+    differing = [_differing(group, groups) for group in groups]
+    keys = {key for values in differing for key in values}
+    short = {key: _shortest(key, keys) for key in keys}
+    several = len({group.first.length for group in groups}) > 1
+    names = [
+        ", ".join(
+            [method_name(group.first.method)]
+            + [f"{short[key]}={value}" for key, value in values.items()]
+            + ([group.first.length] if several else [])
+        )
+        for group, values in zip(groups, differing, strict=True)
+    ]
+    # Other defaults, when it was run: only the code of the settings tells.
+    return [
+        replace(group, name=f"{name}, {group.first.settings}" if names.count(name) > 1 else name)
+        for group, name in zip(groups, names, strict=True)
+    ]
+
+
+def _differing(group: Group, groups: Sequence[Group]) -> dict[str, str]:
+    def others_have(key: str) -> set[str | None]:
+        own_kind = key.startswith("regularizer.")
+        return {
+            other.first.other_settings.get(key)
+            for other in groups
+            if not own_kind or other.first.method == group.first.method
+        }
+
+    return {k: v for k, v in _without(group.first, *_BUDGETS).items() if len(others_have(k)) > 1}
+
+
+def _shortest(key: str, keys: set[str]) -> str:
+    """A setting's name without its group, where that is clear."""
+    ending = key.rpartition(".")[2]
+    return ending if sum(k.rpartition(".")[2] == ending for k in keys) == 1 else key

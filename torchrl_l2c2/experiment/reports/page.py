@@ -1,0 +1,110 @@
+"""A report: tables, pictures and numbers of many runs in one folder, and one page of all of it."""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Sequence
+from pathlib import Path
+
+from torchrl_l2c2.experiment.folder import make_folder, write_atomically, write_json
+from torchrl_l2c2.experiment.reports.comparison import statistics_tables, summary
+from torchrl_l2c2.experiment.reports.figures import draw_learning_curves, draw_plane
+from torchrl_l2c2.experiment.reports.groups import group_records
+from torchrl_l2c2.experiment.reports.records import FIGURES, Record
+from torchrl_l2c2.experiment.reports.runs import FinishedRun
+from torchrl_l2c2.experiment.reports.score import readings
+from torchrl_l2c2.experiment.reports.tables import Table, results_tables, runs_table, score_table
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 75rem; margin: 2rem auto; padding: 0 1rem;
+  color: #222; background: #fff; }
+h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin: 2rem 0 .5rem; }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; font-size: 13px; font-variant-numeric: tabular-nums; }
+th, td { text-align: left; padding: .25rem .6rem; border-bottom: 1px solid #ddd; }
+th { vertical-align: bottom; border-bottom: 2px solid #888; }
+td { white-space: nowrap; } img { max-width: 100%; } p { font-size: 13px; color: #555; }
+"""
+
+
+def all_tables(records: Sequence[Record]) -> list[Table]:
+    """Every table that can be made of these records, the readings' score where there are any."""
+    groups = group_records(records)
+    scored = readings(groups)
+    return [
+        *results_tables(groups),
+        *statistics_tables(groups),
+        *([score_table(scored)] if scored else []),
+        runs_table(records),
+    ]
+
+
+def write_report(
+    folder: str | Path,
+    records: Sequence[Record],
+    runs: Sequence[FinishedRun] = (),
+    notes: Sequence[str] = (),
+) -> Path:
+    """Writes ``report.md``, ``report.html``, ``report.json`` and the pictures as SVG files.
+
+    Args:
+        folder (str or Path): made where it is not there.
+        records (sequence of Record): what the tables are of, at least one.
+        runs (sequence of FinishedRun): the same runs' folders, for their learning curves; without
+            them there are none.
+        notes (sequence of str): on what was left out.
+
+    Returns:
+        Path: of the page; it has its pictures in it and needs no other file.
+    """
+    folder = make_folder(folder)
+    tables, groups = all_tables(records), group_records(records)
+    pictures = _draw(folder, records, runs)
+    text = "\n\n".join(
+        [
+            "# Runs",
+            *notes,
+            *(table.markdown() for table in tables),
+            *(f"![{path.stem.replace('_', ' ')}]({path.name})" for path in pictures),
+        ]
+    )
+    write_atomically(folder / "report.md", f"{text}\n".encode())
+    write_json(folder / "report.json", {"groups": summary(groups), "notes": list(notes)})
+    page = folder / "report.html"
+    write_atomically(page, _page(tables, pictures, notes).encode())
+    return page
+
+
+def _draw(folder: Path, records: Sequence[Record], runs: Sequence[FinishedRun]) -> list[Path]:
+    paths = []
+    for task, algorithm in dict.fromkeys((run.task, run.algorithm) for run in runs):
+        together = [run for run in runs if (run.task, run.algorithm) == (task, algorithm)]
+        paths.append(folder / f"learning_curves_{task.replace('/', '_')}_{algorithm}.svg")
+        draw_learning_curves(together, paths[-1])
+    for figure in FIGURES:
+        groups = [g for g in group_records(records) if len(g.scores(figure, "return"))]
+        if groups:
+            paths.append(folder / f"plane_{figure}.svg")
+            draw_plane(groups, figure, paths[-1])
+    return paths
+
+
+def _page(tables: Sequence[Table], pictures: Sequence[Path], notes: Sequence[str]) -> str:
+    drawn = "\n".join(
+        f'<p><img alt="{html.escape(path.stem.replace("_", " "))}" '
+        f'src="data:image/svg+xml;base64,{base64.b64encode(path.read_bytes()).decode()}"></p>'
+        for path in pictures
+    )
+    results, others = tables[:2], tables[2:]
+    parts = [
+        "<h1>Runs</h1>",
+        *(f"<p>{html.escape(note)}</p>" for note in notes),
+        *(table.html() for table in results),
+        f"<h2>Pictures</h2>\n{drawn}",
+        *(table.html() for table in others),
+    ]
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>Runs</title>\n'
+        f"<style>{_STYLE}</style></head>\n<body>\n" + "\n".join(parts) + "\n</body></html>\n"
+    )

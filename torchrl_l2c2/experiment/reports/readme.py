@@ -1,0 +1,50 @@
+"""The part of a README that is made from records: results' tables and picture."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from torchrl_l2c2.experiment.folder import write_atomically
+from torchrl_l2c2.experiment.reports.figures import draw_plane
+from torchrl_l2c2.experiment.reports.groups import group_records
+from torchrl_l2c2.experiment.reports.records import Record
+from torchrl_l2c2.experiment.reports.tables import results_tables
+
+START, END = "<!-- results: start -->", "<!-- results: end -->"
+PICTURE = Path("docs") / "results.svg"
+
+
+def results_text(records: Sequence[Record]) -> str:
+    """What stands between the marks: a picture and both tables, or that there are no runs yet."""
+    if not records:
+        return "No runs are recorded yet."
+    picture = f"![Return against action variation of every method]({PICTURE.as_posix()})"
+    return "\n\n".join([picture, *(t.markdown() for t in results_tables(group_records(records)))])
+
+
+def fill(text: str, records: Sequence[Record]) -> str:
+    """A README's text with its results made anew.
+
+    Raises:
+        ValueError: the marks are not there, once each and in order.
+    """
+    pattern = re.compile(f"{re.escape(START)}.*?{re.escape(END)}", re.S)
+    if (text.count(START), text.count(END), len(pattern.findall(text))) != (1, 1, 1):
+        raise ValueError(f"the text must have {START} and behind it {END}, once each.")
+    made = f"{START}\n{results_text(records)}\n{END}"
+    return pattern.sub(lambda _: made, text)
+
+
+def fill_readme(path: str | Path, records: Sequence[Record]) -> None:
+    """Makes a README's results anew, and the picture in the ``docs`` folder beside it.
+
+    Raises:
+        ValueError: the marks are not there, once each and in order.
+    """
+    path = Path(path)
+    text = fill(path.read_text(), records)
+    if records:
+        draw_plane(group_records(records), "late_mean", path.parent / PICTURE)
+    write_atomically(path, text.encode())

@@ -1,0 +1,155 @@
+"""A run as one line of ``results/runs.csv``, from which every table can be made."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from torchrl_l2c2.experiment.folder import make_folder, write_atomically
+from torchrl_l2c2.experiment.reports.differences import read_differences
+from torchrl_l2c2.experiment.reports.paper import Published, method_order, paper_of
+from torchrl_l2c2.experiment.tasks import TASKS
+
+# Which policies act, and how: the last policy's test episodes, or one episode of every policy
+# late in training; with mean actions, or with samples as in training.
+FIGURES = {
+    "late_mean": "late policies, mean actions",
+    "late_sampled": "late policies, sampled actions",
+    "last_mean": "last policy, mean actions",
+    "last_sampled": "last policy, sampled actions",
+}
+QUANTITIES = {"return": "return", "action_variation": "action variation"}
+
+
+@dataclass(frozen=True)
+class Record:
+    """What is kept of a finished run; a number that is not known is NaN, an empty cell.
+
+    Attributes:
+        method: the regularizer's name.
+        length: how long it was trained, such as ``"400 episodes"``.
+        settings: :func:`~.differences.fingerprint` of the others.
+        differences: what differs from the defaults, such as ``"algorithm.replay_ratio=10"``.
+        late_mean_return: mean over the last tenth's policies of a test episode with mean actions.
+        late_sampled_return: mean over the training episodes of the same policies.
+        last_mean_return: mean over the last policy's test episodes with mean actions.
+        last_sampled_return: the same with sampled actions.
+        policy_scale: of the late policies.
+        seconds: of training: frames over the frames a second of the last call.
+        commit: of the code, where it lay in a git checkout.
+    """
+
+    task: str
+    algorithm: str
+    method: str
+    settings: str
+    length: str
+    seed: int
+    episodes: int
+    frames: int
+    updates: int
+    late_mean_return: float
+    late_mean_action_variation: float
+    late_sampled_return: float
+    late_sampled_action_variation: float
+    last_mean_return: float
+    last_mean_action_variation: float
+    last_sampled_return: float
+    last_sampled_action_variation: float
+    policy_scale: float
+    seconds: float
+    torch: str
+    torchrl: str
+    commit: str
+    differences: str
+
+    @property
+    def identity(self) -> tuple[str | int, ...]:
+        """Two records with the same are the same run, made twice; the seed is the last of it."""
+        return (self.task, self.algorithm, self.method, self.settings, self.length, self.seed)
+
+    @property
+    def place(self) -> tuple[Any, ...]:
+        """Sorts as tables do: the paper's order, and what differs least from the defaults first."""
+        task = list(TASKS).index(self.task) if self.task in TASKS else len(TASKS)
+        settings = (len(self.other_settings), self.differences, self.settings)
+        method = (self.algorithm, *method_order(self.method))
+        amount, unit = self.length.split()
+        return (task, self.task, *method, *settings, unit, int(amount), self.seed)
+
+    def figure(self, figure: str, quantity: str) -> float:
+        """One of the eight figures, by the names of ``FIGURES`` and ``QUANTITIES``."""
+        value: float = getattr(self, f"{figure}_{quantity}")
+        return value
+
+    @cached_property
+    def other_settings(self) -> dict[str, str]:
+        """What differs from the defaults, by name."""
+        return read_differences(self.differences)
+
+    @property
+    def paper(self) -> Published | None:
+        """The paper's results, where the task, the algorithm and the regularizer are the paper's.
+
+        What else the paper leaves open may differ; tables tell it below.
+        """
+        other = ("task.env_id", "task.noise_scale", "regularizer.")
+        if any(name.startswith(other) for name in self.other_settings):
+            return None
+        return paper_of(self.task, self.algorithm, self.method)
+
+
+def read_records(path: str | Path) -> list[Record]:
+    """Reads what :func:`write_records` wrote; an empty or absent file has none.
+
+    Raises:
+        ValueError: the file has other columns, or a cell that is no number where one must be.
+    """
+    path = Path(path)
+    text = path.read_text() if path.exists() else ""
+    lines = csv.DictReader(io.StringIO(text))
+    names = [field.name for field in fields(Record)]
+    if text and list(lines.fieldnames or ()) != names:
+        raise ValueError(f"{path} has the columns {lines.fieldnames}; they must be {names}.")
+    return merge([], (_parse(path, number, line) for number, line in enumerate(lines, start=2)))
+
+
+def write_records(path: str | Path, records: Iterable[Record]) -> None:
+    """Writes records as CSV, sorted, whole or not at all; the same records give the same bytes."""
+    make_folder(Path(path).parent)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(field.name for field in fields(Record))
+    for record in sorted(records, key=lambda record: record.place):
+        writer.writerow(_cell(getattr(record, field.name)) for field in fields(Record))
+    write_atomically(path, text.getvalue().encode())
+
+
+def merge(old: Iterable[Record], new: Iterable[Record]) -> list[Record]:
+    """Old and new records, sorted; a run's newer record takes the place of its older one."""
+    merged = {record.identity: record for record in (*old, *new)}
+    return sorted(merged.values(), key=lambda record: record.place)
+
+
+def _cell(value: Any) -> str:
+    if not isinstance(value, float):
+        return str(value)
+    return "" if math.isnan(value) else f"{value:.6g}"
+
+
+def _parse(path: Path, number: int, line: dict[str, str]) -> Record:
+    readers: dict[str, Callable[[str], Any]] = {
+        "int": int,
+        "float": lambda cell: float(cell or "nan"),
+        "str": str,
+    }
+    try:
+        return Record(**{f.name: readers[str(f.type)](line[f.name]) for f in fields(Record)})
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}, line {number}: {error}.") from None

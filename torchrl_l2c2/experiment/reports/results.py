@@ -1,0 +1,72 @@
+"""What is said and drawn of runs when they end: one run's results, a sweep's table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from torchrl_l2c2.experiment.reports.figures import draw_learning_curves
+from torchrl_l2c2.experiment.reports.groups import group_records
+from torchrl_l2c2.experiment.reports.records import QUANTITIES
+from torchrl_l2c2.experiment.reports.runs import FinishedRun, find_runs, write_evaluation
+from torchrl_l2c2.experiment.reports.tables import results_tables
+
+if TYPE_CHECKING:
+    from torchrl_l2c2.experiment.config import ExperimentConfig
+
+
+def write_results(
+    folder: Path, config: ExperimentConfig, tests: dict[str, dict[str, Any]]
+) -> FinishedRun:
+    """Writes what a finished run's folder holds beside its policy: test episodes and picture.
+
+    Args:
+        folder (Path): of the run.
+        config (ExperimentConfig): its settings.
+        tests (dict): ``"mean"`` and ``"sampled"``, where there is one: ``"summary"`` and
+            ``"episodes"`` of the test with the policy's mean and with samples.
+
+    Returns:
+        FinishedRun: the folder, read back.
+    """
+    finished = write_evaluation(folder, config, tests)
+    draw_learning_curves([finished], folder / "learning_curves.png")
+    return finished
+
+
+def compare_with_paper(run: FinishedRun) -> str:
+    """The end of a run in lines: its results and, for the paper's tasks, the paper's."""
+    lines = [f"{'':>20}  {'return':>18}  {'action variation':>18}"]
+    tests = {"mean actions": run.evaluation, "sampled actions": run.evaluation.get("sampled")}
+    for name, test in tests.items():
+        own = (test or {}).get("summary")
+        if own is not None:
+            total, variation = ((own[f"{q}_mean"], own[f"{q}_std"]) for q in QUANTITIES)
+            what = f"{own['episodes']} test episodes, seed {run.seed}"
+            lines.append(_compared(name, total, variation, what))
+    paper = run.record.paper
+    if paper:
+        lines.append(_compared("the paper", paper[:2], paper[2:], "18 seeds"))
+    return "\n".join(lines)
+
+
+def sweep_summary(folder: str | Path) -> str:
+    """The end of a sweep: tables of all runs below a folder, and what did not finish.
+
+    Args:
+        folder (str or Path): of the sweep; runs of earlier ones in it are counted in.
+
+    Returns:
+        str: Markdown; no error where nothing finished.
+    """
+    found = find_runs([folder])
+    tables = results_tables(group_records(run.record for run in found.runs)) if found.runs else []
+    none = [] if found.runs else [f"No finished run below {folder}."]
+    return "\n\n".join([*(table.markdown() for table in tables), *none, *found.notes])
+
+
+def _compared(name: str, total: tuple[float, ...], variation: tuple[float, ...], what: str) -> str:
+    return (
+        f"{name:>20}  {total[0]:>9.1f} ({total[1]:>6.1f})  {variation[0]:>10.3f} "
+        f"({variation[1]:.3f})   {what}"
+    )

@@ -1,0 +1,252 @@
+"""Runs' folders, read back: settings, learning curves, test episodes."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import statistics
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from torchrl_l2c2.experiment.folder import write_json
+from torchrl_l2c2.experiment.reports.differences import differences, fingerprint, write_differences
+from torchrl_l2c2.experiment.reports.records import Record
+
+if TYPE_CHECKING:
+    from torchrl_l2c2.experiment.config import ExperimentConfig
+
+
+@dataclass(frozen=True)
+class FinishedRun:
+    """One run's folder, read back: its settings, its learning curve and its test episodes."""
+
+    folder: Path
+    config: dict[str, Any]
+    evaluation: dict[str, Any]
+    metrics: list[dict[str, str]]
+    versions: dict[str, str]
+
+    @classmethod
+    def read(cls, folder: Path) -> FinishedRun:
+        """Reads a run's folder; ``evaluation.json`` marks it as finished."""
+        with open(folder / "metrics.csv", newline="") as file:
+            metrics = list(csv.DictReader(file))
+        config, evaluation = (
+            json.loads((folder / name).read_text()) for name in ("config.json", "evaluation.json")
+        )
+        versions = folder / "versions.json"
+        known = json.loads(versions.read_text()) if versions.exists() else {}
+        return cls(folder, config, evaluation, metrics, known)
+
+    @property
+    def task(self) -> str:
+        return str(self.config["task"]["name"])
+
+    @property
+    def algorithm(self) -> str:
+        return str(self.config["algorithm"]["name"])
+
+    @property
+    def regularizer(self) -> str:
+        return str(self.config["regularizer"]["name"])
+
+    @property
+    def seed(self) -> int:
+        return int(self.config["seed"])
+
+    @property
+    def solved_at(self) -> float | None:
+        solved: float | None = self.config["task"].get("solved_at")
+        return solved
+
+    def column(self, name: str) -> list[float]:
+        """A column of the metrics, a number per episode; NaN where it was not measured."""
+        return [float(row.get(name) or "nan") for row in self.metrics]
+
+    @cached_property
+    def record(self) -> Record:
+        """The run in one line, its numbers to six digits, as the file has them.
+
+        Raises:
+            SettingError: a setting that is not known.
+            ValueError: the run has no episode.
+        """
+        if not self.metrics:
+            raise ValueError("metrics.csv has no episode.")
+        end = self.metrics[-1]
+        frames, speed = int(end["frames"]), self.column("frames_per_second")[-1]
+        numbers = {
+            **self._last("mean", self.evaluation.get("summary")),
+            **self._last("sampled", (self.evaluation.get("sampled") or {}).get("summary")),
+            **self._late(),
+            "seconds": frames / speed if speed > 0.0 else math.nan,
+        }
+        return Record(
+            task=self.task,
+            algorithm=self.algorithm,
+            method=self.regularizer,
+            settings=fingerprint(self.config),
+            length=self._length(),
+            seed=self.seed,
+            episodes=len(self.metrics),
+            frames=frames,
+            updates=int(end["updates"]),
+            torch=self.versions.get("torch", ""),
+            torchrl=self.versions.get("torchrl", ""),
+            commit=self.versions.get("commit", ""),
+            differences=write_differences(differences(self.config)),
+            **{name: float(f"{value:.6g}") for name, value in numbers.items()},
+        )
+
+    def _length(self) -> str:
+        frames = self.config["task"].get("frames")
+        return f"{len(self.metrics)} episodes" if frames is None else f"{frames:.0f} frames"
+
+    def _last(self, acting: str, summary: dict[str, float] | None) -> dict[str, float]:
+        names = {"return": "return_mean", "action_variation": "action_variation_mean"}
+        return {
+            f"last_{acting}_{quantity}": (summary or {}).get(name, math.nan)
+            for quantity, name in names.items()
+        }
+
+    def _late(self) -> dict[str, float]:
+        """Of the last tenth of training, those policies that played a test episode."""
+        tested = [not math.isnan(value) for value in self.column("test_return")]
+        start = len(tested) - max(1, round(len(tested) * 0.1))
+        late = [row for row in range(start, len(tested)) if tested[row] or not any(tested[start:])]
+
+        def average(name: str) -> float:
+            values = self.column(name)
+            return statistics.fmean(values[row] for row in late)
+
+        return {
+            "late_mean_return": average("test_return"),
+            "late_mean_action_variation": average("test_action_variation"),
+            "late_sampled_return": average("return"),
+            "late_sampled_action_variation": average("action_variation"),
+            "policy_scale": average("policy_scale"),
+        }
+
+
+def write_evaluation(
+    folder: Path, config: ExperimentConfig, tests: dict[str, dict[str, Any]]
+) -> FinishedRun:
+    """Writes a finished run's test episodes.
+
+    Args:
+        folder (Path): of the run.
+        config (ExperimentConfig): its settings.
+        tests (dict): ``"mean"`` and ``"sampled"``, where there is one: ``"summary"`` and
+            ``"episodes"`` of the test with the policy's mean and with samples.
+
+    Returns:
+        FinishedRun: the folder, read back.
+    """
+    named = {group: getattr(config, group).name for group in ("task", "algorithm", "regularizer")}
+    run = {**named, "seed": config.seed, "solved_at": config.task.solved_at}
+    rest = {name: test for name, test in tests.items() if name != "mean"}
+    write_json(folder / "evaluation.json", {"run": run, **tests.get("mean", {}), **rest})
+    return FinishedRun.read(folder)
+
+
+def finished_run(folder: str | Path, settings: dict[str, Any]) -> FinishedRun | None:
+    """The finished run of these very settings in a folder; ``None`` where there is none."""
+    folder = Path(folder)
+    if not (folder / "evaluation.json").exists():
+        return None
+    saved = json.loads((folder / "config.json").read_text())
+    # As JSON, where a tuple and a list are the same.
+    return FinishedRun.read(folder) if saved == json.loads(json.dumps(settings)) else None
+
+
+@dataclass(frozen=True)
+class Found:
+    """What lies below some folders: one finished run of each kind, and notes on all others."""
+
+    runs: list[FinishedRun]
+    notes: list[str]
+
+
+def find_runs(folders: Iterable[str | Path]) -> Found:
+    """Reads every finished run below folders, and names what is not one.
+
+    Of runs with the same settings and the same seed the one that finished last is taken.
+
+    Args:
+        folders (iterable of str or Path): searched to their depths.
+
+    Returns:
+        Found: runs in the order of their tables, and notes on folders that are unfinished, never
+        started, cannot be read, or repeat another.
+    """
+    runs: list[FinishedRun] = []
+    unread: list[str] = []
+    places = _places(folders)
+    for folder in places["finished"]:
+        try:
+            run = FinishedRun.read(folder)
+            _ = run.record
+        except (OSError, ValueError, KeyError) as error:
+            unread.append(f"{folder} ({error})")
+        else:
+            runs.append(run)
+    newest, repeated = _newest(runs)
+    named = {
+        "unfinished (running, interrupted or failed)": [str(path) for path in places["unfinished"]],
+        "failed before they began": [str(path) for path in places["failed"]],
+        "unreadable": unread,
+        "the same settings and seed as a newer one, left out": repeated,
+    }
+    notes = [f"{len(names)} {what}: {', '.join(names)}" for what, names in named.items() if names]
+    return Found(sorted(newest, key=lambda run: run.record.place), notes)
+
+
+def read_runs(folder: str | Path) -> list[FinishedRun]:
+    """Every finished run below a folder, as :func:`find_runs` sorts them.
+
+    Raises:
+        FileNotFoundError: there is none.
+    """
+    found = find_runs([folder])
+    if not found.runs:
+        raise FileNotFoundError(
+            f"no finished run (evaluation.json) below {str(folder)!r}; name a folder of "
+            f"train.py's. {'; '.join(found.notes)}".rstrip()
+        )
+    return found.runs
+
+
+def _places(folders: Iterable[str | Path]) -> dict[str, list[Path]]:
+    """Folders of runs by how far they came."""
+    marks: dict[Path, set[str]] = {}
+    shown: dict[Path, Path] = {}
+    for folder in folders:
+        for name in ("config.json", "evaluation.json", ".hydra"):
+            for path in Path(folder).rglob(name):
+                place = path.parent.resolve()
+                marks.setdefault(place, set()).add(name)
+                shown.setdefault(place, path.parent)
+    stages: dict[str, list[Path]] = {"finished": [], "unfinished": [], "failed": []}
+    for place in sorted(marks):
+        found = marks[place]
+        began = "unfinished" if "config.json" in found else "failed"
+        stages["finished" if "evaluation.json" in found else began].append(shown[place])
+    return stages
+
+
+def _newest(runs: Sequence[FinishedRun]) -> tuple[list[FinishedRun], list[str]]:
+    def finished_at(run: FinishedRun) -> float:
+        return (run.folder / "evaluation.json").stat().st_mtime
+
+    newest: dict[tuple[Any, ...], FinishedRun] = {}
+    repeated = []
+    for run in sorted(runs, key=finished_at):
+        older = newest.get(run.record.identity)
+        if older is not None:
+            repeated.append(f"{older.folder} (as {run.folder})")
+        newest[run.record.identity] = run
+    return list(newest.values()), repeated

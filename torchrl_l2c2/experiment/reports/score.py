@@ -1,0 +1,67 @@
+"""How near a reading of the paper comes to its table, as docs/protocol.md defines it."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from torchrl_l2c2.experiment.reports.groups import Group
+from torchrl_l2c2.experiment.reports.records import QUANTITIES
+
+COMPARED = ("none", "caps")  # L2C2 is not looked at until a reading is taken.
+CAP = 5.0
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One choice of what the paper leaves open, on one task: its runs of vanilla and of CAPS."""
+
+    vanilla: Group
+    caps: Group
+
+    def cells(self, figure: str) -> dict[tuple[str, str], float]:
+        """By method and quantity, how many of the paper's standard deviations lie between.
+
+        Args:
+            figure (str): one of ``records.FIGURES``.
+
+        Returns:
+            dict: ``|mean over seeds - the paper's mean| / the paper's standard deviation``, at
+            most 5; NaN where the runs do not have the figure.
+        """
+        cells = {}
+        for group in (self.vanilla, self.caps):
+            for quantity in QUANTITIES:
+                published = group.first.paper
+                center = getattr(published, f"{quantity}_mean")
+                deviation = getattr(published, f"{quantity}_std")
+                values = group.scores(figure, quantity)
+                distance = abs(values.mean() - center) / deviation if len(values) else math.nan
+                # A NaN first stays one.
+                cells[group.first.method, quantity] = float(min(distance, CAP))
+        return cells
+
+    def score(self, figure: str) -> float:
+        """Mean of the four cells, from 0 to 5; smaller is nearer to the paper."""
+        return statistics.fmean(self.cells(figure).values())
+
+    @property
+    def updates(self) -> float:
+        """Mean over its runs: of two readings that are as near, the one with fewer is taken."""
+        return statistics.fmean(r.updates for r in (*self.vanilla.records, *self.caps.records))
+
+
+def readings(groups: Sequence[Group]) -> list[Reading]:
+    """Pairs vanilla and CAPS of the paper's tasks where their other settings are the same."""
+    pairs: dict[tuple[Any, ...], dict[str, Group]] = {}
+    for group in groups:
+        if group.first.method in COMPARED and group.first.paper is not None:
+            pairs.setdefault(group.reading, {})[group.first.method] = group
+    return [
+        Reading(*(pair[method] for method in COMPARED))
+        for pair in pairs.values()
+        if pair.keys() == set(COMPARED)
+    ]

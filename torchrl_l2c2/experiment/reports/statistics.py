@@ -1,0 +1,152 @@
+"""Statistics of few runs: pure functions of (runs x tasks) matrices of scores.
+
+As proposed by Agarwal et al., *Deep Reinforcement Learning at the Edge of the Statistical
+Precipice*, NeurIPS 2021, arXiv:2108.13264. Their package ``rliable`` (1.2.0) cannot be imported
+beside pandas 3, which it needs and does not pin; its definitions are kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+Scores = NDArray[np.float64]
+Interval = tuple[float, float]
+
+
+def mean_and_deviation(scores: Scores) -> tuple[Scores, Scores]:
+    """Mean and sample standard deviation over runs, as in the paper's Table III.
+
+    Args:
+        scores (array): ``[runs, ...]``.
+
+    Returns:
+        Two arrays of shape ``[...]``; the deviation of a single run is NaN.
+
+    Examples:
+        >>> mean, deviation = mean_and_deviation(np.array([[1.0], [2.0], [6.0]]))
+        >>> mean.item(), round(deviation.item(), 4)
+        (3.0, 2.6458)
+    """
+    single = np.full(scores.shape[1:], np.nan)
+    return scores.mean(0), scores.std(0, ddof=1) if len(scores) > 1 else single
+
+
+def mean(scores: Scores) -> Scores:
+    """Mean over runs and tasks: ``[..., runs, tasks]`` to ``[...]``."""
+    return np.asarray(scores.mean((-2, -1)))
+
+
+def interquartile_mean(scores: Scores) -> Scores:
+    """Mean of the middle half of all scores: outliers count less than in the mean.
+
+    Of ``n`` scores the ``floor(n / 4)`` smallest and largest are left out; fewer than four are
+    all kept.
+
+    Args:
+        scores (array): ``[..., runs, tasks]``; scores of several tasks need one scale.
+
+    Returns:
+        Array of shape ``[...]``.
+
+    Examples:
+        >>> interquartile_mean(np.array([[0.0], [1.0], [2.0], [3.0], [100.0]])).item()
+        2.0
+    """
+    ordered = np.sort(scores.reshape(*scores.shape[:-2], -1), -1)
+    count = ordered.shape[-1]
+    cut = count // 4
+    return np.asarray(ordered[..., cut : count - cut].mean(-1))
+
+
+def probability_of_improvement(scores: Scores, baseline: Scores) -> Scores:
+    """How probable it is that a run scores higher than one of the baseline, ties halved.
+
+    It is the mean over tasks of the Mann-Whitney statistic over the number of pairs; .5 where
+    neither is better, 1 where every run beats every one of the baseline. It needs no common scale
+    of tasks.
+
+    Args:
+        scores (array): ``[..., runs, tasks]``; larger is better, so negate what should be small.
+        baseline (array): ``[..., other runs, tasks]``.
+
+    Returns:
+        Array of shape ``[...]``.
+
+    Examples:
+        >>> probability_of_improvement(np.array([[1.0], [3.0]]), np.array([[1.0], [2.0]])).item()
+        0.625
+    """
+    ours, theirs = scores[..., :, None, :], baseline[..., None, :, :]
+    return np.asarray(((ours > theirs) + 0.5 * (ours == theirs)).mean((-3, -2, -1)))
+
+
+def bootstrap_interval(
+    statistic: Callable[..., Scores],
+    *scores: Scores,
+    generator: np.random.Generator,
+    confidence: float = 0.95,
+    resamples: int = 2000,
+) -> Interval:
+    """Stratified bootstrap confidence interval: runs are drawn anew for each task by itself.
+
+    Args:
+        statistic (Callable): of matrices ``[..., runs, tasks]``, to ``[...]``.
+        *scores (array): a matrix ``[runs, tasks]`` for each of its arguments.
+
+    Keyword Args:
+        generator (numpy.random.Generator): draws the runs.
+        confidence (float): share of the resamples between the ends, in (0, 1). Larger: wider.
+        resamples (int): how many, at least 1. More: steadier ends.
+
+    Returns:
+        The lower and the upper end: percentiles of the resamples.
+
+    Raises:
+        ValueError: ``confidence`` or ``resamples`` out of its range.
+
+    Examples:
+        >>> bootstrap_interval(mean, np.ones((3, 1)), generator=np.random.default_rng(0))
+        (1.0, 1.0)
+    """
+    if not 0.0 < confidence < 1.0:
+        raise ValueError(f"confidence must be in (0, 1), got {confidence}.")
+    if resamples < 1:
+        raise ValueError(f"resamples must be at least 1, got {resamples}.")
+    drawn = []
+    for matrix in scores:
+        rows = generator.integers(len(matrix), size=(resamples, *matrix.shape))
+        drawn.append(np.take_along_axis(matrix[None], rows, 1))
+    tail = (1.0 - confidence) / 2.0
+    lower, upper = np.quantile(statistic(*drawn), [tail, 1.0 - tail])
+    return float(lower), float(upper)
+
+
+def curve_band(
+    curves: Scores,
+    *,
+    generator: np.random.Generator,
+    confidence: float = 0.95,
+    resamples: int = 1000,
+) -> tuple[Scores, Scores]:
+    """Pointwise bootstrap interval of the mean of curves, which are drawn whole.
+
+    Args:
+        curves (array): ``[runs, points]``.
+
+    Keyword Args:
+        generator (numpy.random.Generator): draws the runs.
+        confidence (float): share of the resamples between the ends. Larger: wider.
+        resamples (int): how many. More: smoother ends.
+
+    Returns:
+        The lower and the upper curve, ``[points]`` each.
+    """
+    runs = len(curves)
+    # How often each run is in each resample; so nothing of size [resamples, runs, points] is made.
+    counts = generator.multinomial(runs, np.full(runs, 1.0 / runs), size=resamples)
+    tail = (1.0 - confidence) / 2.0
+    lower, upper = np.quantile(counts @ curves / runs, [tail, 1.0 - tail], axis=0)
+    return lower, upper

@@ -1,0 +1,211 @@
+"""Tables of groups of runs, beside the paper's numbers."""
+
+from __future__ import annotations
+
+import html
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from torchrl_l2c2.experiment.reports.groups import Group, common_settings, differing_lengths
+from torchrl_l2c2.experiment.reports.paper import method_name
+from torchrl_l2c2.experiment.reports.records import FIGURES, QUANTITIES, Record
+from torchrl_l2c2.experiment.reports.score import COMPARED, Reading
+from torchrl_l2c2.experiment.reports.statistics import mean_and_deviation
+
+LEGEND = (
+    "Means over seeds, standard deviations over seeds in brackets; the paper's are of 18 seeds. "
+    "Late policies are those of the last tenth of training: one test episode of each with its mean "
+    "actions, and the training's own episodes, with sampled ones. The action variation is that of "
+    "the policy's mean in either case; smaller is smoother."
+)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Cells of text under a title, with notes below.
+
+    Examples:
+        >>> print(Table("Squares", ["n", "n²"], [["2", "4"]], ["by hand"]).markdown())
+        **Squares**
+        <BLANKLINE>
+        | n | n² |
+        | --- | --- |
+        | 2 | 4 |
+        <BLANKLINE>
+        by hand
+    """
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    notes: Sequence[str] = field(default_factory=list)
+
+    def markdown(self) -> str:
+        """As a pipe table."""
+        lines = [self.columns, ["---"] * len(self.columns), *self.rows]
+        table = "\n".join(
+            "| " + " | ".join(_escape(cell) for cell in line) + " |" for line in lines
+        )
+        return "\n\n".join([f"**{self.title}**", table, *self.notes])
+
+    def html(self) -> str:
+        """As elements of a page."""
+
+        def row(cells: Sequence[str], tag: str) -> str:
+            return "<tr>" + "".join(f"<{tag}>{html.escape(c)}</{tag}>" for c in cells) + "</tr>"
+
+        body = "\n".join(row(cells, "td") for cells in self.rows)
+        notes = "".join(f"<p>{_code(html.escape(note))}</p>" for note in self.notes)
+        return (
+            f"<h2>{html.escape(self.title)}</h2>\n<div class='wide'><table>"
+            f"<thead>{row(self.columns, 'th')}</thead>\n<tbody>{body}</tbody></table></div>{notes}"
+        )
+
+
+def results_tables(groups: Sequence[Group]) -> list[Table]:
+    """Means over seeds, standard deviations in brackets: late policies, and the last policy."""
+    notes = [LEGEND, *settings_notes(groups)]
+    return [
+        _results("Late policies", ("late_mean", "late_sampled"), groups, []),
+        _results("Last policy", ("last_mean", "last_sampled"), groups, notes),
+    ]
+
+
+def _results(
+    title: str, figures: Sequence[str], groups: Sequence[Group], notes: Sequence[str]
+) -> Table:
+    columns = ["task", "algorithm", "method", "seeds"]
+    columns += [
+        f"{QUANTITIES[q]}, {FIGURES[f].split(', ')[1]}" for q in QUANTITIES for f in figures
+    ]
+    columns += [f"paper: {name}" for name in QUANTITIES.values()]
+    rows = [
+        [
+            *(group.first.task, group.first.algorithm, group.name, number_range(group.seeds)),
+            *(_pooled(group, figure, quantity) for quantity in QUANTITIES for figure in figures),
+            *(_published(group.first, quantity) for quantity in QUANTITIES),
+        ]
+        for group in groups
+    ]
+    return Table(title, columns, rows, notes)
+
+
+def settings_notes(groups: Sequence[Group]) -> list[str]:
+    """What the runs' settings are beyond the defaults, and which lengths were not pooled."""
+    notes = []
+    for task, algorithm in dict.fromkeys((g.first.task, g.first.algorithm) for g in groups):
+        together = [g for g in groups if (g.first.task, g.first.algorithm) == (task, algorithm)]
+        shared = common_settings(together)
+        if shared:
+            settings = ", ".join(f"`{name}={value}`" for name, value in shared.items())
+            notes.append(f"{task}, {algorithm}, other than the defaults in every row: {settings}.")
+    return notes + [f"{line}." for line in differing_lengths(groups)]
+
+
+def runs_table(records: Sequence[Record]) -> Table:
+    """Every run by itself, with all of its figures."""
+    columns = ["task", "algorithm", "method", "seed", "settings", "length", "frames", "updates"]
+    columns += [f"{QUANTITIES[q]}: {name}" for q in QUANTITIES for name in FIGURES.values()]
+    columns += ["policy scale"]
+    rows = [
+        [
+            *(r.task, r.algorithm, r.method, str(r.seed), r.settings, r.length),
+            *(str(r.frames), str(r.updates)),
+            *(number(r.figure(f, q), q) for q in QUANTITIES for f in FIGURES),
+            number(r.policy_scale, "policy_scale"),
+        ]
+        for r in records
+    ]
+    return Table("Every run", columns, rows)
+
+
+def score_table(readings: Sequence[Reading]) -> Table:
+    """The score of every reading, by late policies with mean and with sampled actions."""
+    columns = ["task", "reading", "seeds", "updates", "actions", "score"]
+    columns += [
+        f"{method_name(method)}: {name}" for method in COMPARED for name in QUANTITIES.values()
+    ]
+    rows = []
+    for reading in readings:
+        first = reading.vanilla.first
+        seeds = list(dict.fromkeys(number_range(g.seeds) for g in (reading.vanilla, reading.caps)))
+        for figure in ("late_mean", "late_sampled"):
+            cells = reading.cells(figure)
+            rows.append(
+                [
+                    *(first.task, first.differences or "the defaults", "; ".join(seeds)),
+                    *(f"{reading.updates:.0f}", FIGURES[figure].split(", ")[1]),
+                    _or_dash(reading.score(figure), ".2f"),
+                    *(_or_dash(cells[m, q], ".2f") for m in COMPARED for q in QUANTITIES),
+                ]
+            )
+    notes = [
+        "Cells: the distance of the mean over seeds from the paper's mean, in the paper's standard "
+        "deviations, at most 5; the score is their mean, smaller is nearer. Late policies."
+    ]
+    return Table("Score of the readings", columns, rows, notes)
+
+
+def number(value: float, quantity: str, beside: float | None = None) -> str:
+    """A number with the digits that its quantity is told with; a dash where it is not known.
+
+    Args:
+        value (float): to write.
+        quantity (str): returns of 100 and more have one digit, others two; all else has three.
+        beside (float, optional): the number that it belongs to and whose digits it gets.
+    """
+    size = abs(value if beside is None else beside)
+    digits = 3 if quantity != "return" else 1 if size >= 100 else 2
+    return _or_dash(value, f".{digits}f")
+
+
+def number_range(values: Sequence[int]) -> str:
+    """Whole numbers, three and more in a row shortened.
+
+    Examples:
+        >>> number_range([0, 1, 2, 3, 7, 8])
+        '0-3, 7, 8'
+    """
+    spans: list[list[int]] = []
+    for value in sorted(values):
+        if spans and value == spans[-1][-1] + 1:
+            spans[-1].append(value)
+        else:
+            spans.append([value])
+    return ", ".join(
+        f"{span[0]}-{span[-1]}" if len(span) > 2 else ", ".join(map(str, span)) for span in spans
+    )
+
+
+def _pooled(group: Group, figure: str, quantity: str) -> str:
+    scores = group.scores(figure, quantity)
+    if not len(scores):
+        return "-"
+    center, deviation = mean_and_deviation(scores)
+    cell = number(center.item(), quantity)
+    if len(scores) > 1:
+        cell += f" ({number(deviation.item(), quantity, center.item())})"
+    missing = len(group.records) - len(scores)
+    return f"{cell}, of {len(scores)} runs" if missing else cell
+
+
+def _published(record: Record, quantity: str) -> str:
+    paper = record.paper
+    if paper is None:
+        return ""
+    center, deviation = getattr(paper, f"{quantity}_mean"), getattr(paper, f"{quantity}_std")
+    return f"{number(center, quantity)} ({number(deviation, quantity, center)})"
+
+
+def _or_dash(value: float, spec: str) -> str:
+    return "-" if math.isnan(value) else format(value, spec)
+
+
+def _escape(cell: str) -> str:
+    return cell.replace("|", "\\|")
+
+
+def _code(text: str) -> str:
+    return re.sub(r"`([^`]*)`", r"<code>\1</code>", text)
