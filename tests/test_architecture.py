@@ -22,7 +22,8 @@ objectives.regularized
 objectives.l2c2 objectives.caps objectives.ppo_rpe
 objectives.__init__
 trainers __init__
-experiment.settings experiment.compilation experiment.environments experiment.folder
+experiment.settings experiment.compilation experiment.spaces experiment.folder
+experiment.environments
 experiment.process experiment.progress experiment.signals experiment.optimizers
 experiment.tasks experiment.replay experiment.collection experiment.reports
 experiment.regularizers.base
