@@ -36,6 +36,7 @@ experiment.algorithms.__init__
 experiment.config
 experiment.workers
 experiment.evaluate experiment.update experiment.player experiment.manual
+experiment.influence
 experiment.learner
 experiment.schedules
 experiment.training

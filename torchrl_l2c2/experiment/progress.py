@@ -39,7 +39,7 @@ class Progress:
         self._waiting = shown and compiles
         self._bar = tqdm(total=total, initial=done, unit=unit, disable=not shown)
         self._column = {"episode": "episode", "frame": "frames"}[unit]
-        self._done = done
+        self._done: float = done
         if self._waiting:
             self._bar.set_postfix_str("compiling at the first updates, up to two minutes")
 

@@ -28,7 +28,7 @@ from torchrl_l2c2.experiment.folder import (
     write_atomically,
     write_json,
 )
-from torchrl_l2c2.experiment.learner import Learner
+from torchrl_l2c2.experiment.learner import Learner, untrained
 from torchrl_l2c2.experiment.player import Episode, Player, SimulatorError
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.progress import Progress
@@ -125,10 +125,14 @@ class Experiment:
             list: a dictionary of metrics per episode.
 
         Raises:
-            FloatingPointError: NaN or infinity in what the environment gave, in a loss or in a
-                gradient; names the key and the step, and the last good checkpoint.
+            FloatingPointError: NaN or infinity in what the environment or the policy gave, in a
+                loss or in a parameter; names the key and the step, and the last good checkpoint.
             SimulatorError: the environment failed; names the frame and the last good checkpoint.
             Interrupted: a signal ended the training.
+
+        Warns:
+            UserWarning: no update was made, or every action was random: there is no trained policy;
+                or a regularizer's terms are too small to matter.
         """
         budget = self.config.task.budget if episodes is None else Budget(episodes)
         algorithm, saved = self.config.algorithm, time.monotonic()
@@ -156,17 +160,15 @@ class Experiment:
                     saved = time.monotonic()
                 if signals and not ended:
                     raise Interrupted(signals[0], len(self.metrics), self.folder)
+        if problem := self._untrained():
+            warnings.warn(problem, stacklevel=2)
         return self.metrics
 
     def save(self) -> Path | None:
         """Writes a checkpoint of everything that the rest of the run depends on."""
         if self.folder is None:
             return None
-        for name, parameter in self.agent.loss.named_parameters():
-            if not parameter.isfinite().all():
-                raise FloatingPointError(
-                    f"{name} is not finite after update {self.learner.updates}: a gradient was not."
-                )
+        self.learner.check_parameters()
         return save_checkpoint(
             self.folder, len(self.metrics), self.state_dict(), self.config.checkpoint_keep
         )
@@ -257,10 +259,15 @@ class Experiment:
             raise ValueError("this experiment has no folder to write to; give it one when made.")
         save_policy(self.agent.policy, self.folder / "policy.pt")
         tests = {"mean": result, "sampled": sampled}
-        written = {
+        written: dict[str, dict[str, Any]] = {
             name: {"summary": test.summary(), "episodes": asdict(test)}
             for name, test in tests.items()
             if test is not None
+        }
+        written["mean"]["training"] = {
+            "frames": self.player.frames,
+            "updates": self.learner.updates,
+            "untrained": self._untrained(),
         }
         return write_results(self.folder, self.config, written)
 
@@ -286,6 +293,10 @@ class Experiment:
             warnings.warn(f"{message} The one before it is used.", stacklevel=3)
         self.load_state_dict(state)
         print(f"continuing after episode {len(self.metrics)} from {path}", file=sys.stderr)
+
+    def _untrained(self) -> str | None:
+        random_frames = getattr(self.config.algorithm, "random_frames", 0)
+        return untrained(self.player.frames, self.learner.updates, random_frames)
 
     def _spent(self, budget: Budget) -> int:
         return budget.spent(len(self.metrics), self.player.frames)
