@@ -116,13 +116,17 @@ def check_finite(batch: TensorDictBase, first_frame: int) -> None:
     Raises:
         FloatingPointError: names the key and the frame.
     """
+    found = []
+    # In the order in which they come about: what follows a bad action is bad as well.
     for key in ("observation", "action", ("next", "observation"), ("next", "reward")):
         bad = ~batch[key].isfinite()
         if bad.any():
-            step = int(bad.flatten(1).any(1).nonzero()[0])
-            value = batch[key][step].flatten().tolist()
-            giver = "policy" if key == "action" else "environment"
-            raise FloatingPointError(
-                f"{key} is not finite at frame {first_frame + step}: {value}. "
-                f"The {giver} gave it; nothing was learned from this episode."
-            )
+            found.append((int(bad.flatten(1).any(1).nonzero()[0]), key))
+    if found:
+        step, key = min(found, key=lambda each: each[0])
+        giver = "policy" if key == "action" else "environment"
+        raise FloatingPointError(
+            f"{key} is not finite at frame {first_frame + step}: "
+            f"{batch[key][step].flatten().tolist()}. "
+            f"The {giver} gave it; nothing was learned from this episode."
+        )
