@@ -22,7 +22,8 @@ objectives.regularized
 objectives.l2c2 objectives.caps objectives.ppo_rpe
 objectives.__init__
 trainers __init__
-experiment.settings experiment.compilation experiment.environments experiment.folder
+experiment.settings experiment.compilation experiment.spaces experiment.folder
+experiment.environments
 experiment.process experiment.progress experiment.signals experiment.optimizers
 experiment.tasks experiment.replay experiment.collection
 experiment.regularizers.base
@@ -45,6 +46,7 @@ experiment.reports.__init__
 experiment.reports.__main__
 experiment.workers
 experiment.evaluate experiment.update experiment.player experiment.manual
+experiment.influence
 experiment.learner
 experiment.schedules
 experiment.training

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import astuple
 from typing import Any
 
 import torch
@@ -29,7 +30,7 @@ def draw_neighbors(
     Arguments and errors are those of :class:`NeighborTransform`.
 
     Returns:
-        The neighbors, ``[*B, K, *F]`` under each key, and their ``"distance"``, ``[*B, K]``.
+        The entry that :class:`NeighborTransform` writes.
 
     Examples:
         >>> import torch
@@ -74,7 +75,9 @@ def _place(
         )
         neighbors.set(key, neighbor)
         distances.append(distance)
-    return neighbors.set("distance", torch.stack(distances).amax(0))
+    distance = torch.stack(distances).amax(0)
+    numbers = distance.new_tensor(astuple(neighborhood)).expand(*tensordict.batch_size, -1)
+    return neighbors.set("neighborhood", numbers).set("distance", distance)
 
 
 def _transitions(tensordict: TensorDictBase, in_keys: Sequence[NestedKey]) -> Transitions:
@@ -135,6 +138,7 @@ class NeighborTransform(_RandomTransform):
         neighbor = {
             "observation": [*B, K, *F],   # one per key of in_keys, nested as there
             "distance": [*B, K],
+            "neighborhood": [*B, 3],      # its numbers, for the loss to compare
         }
 
     Several keys are parts of one state: their displacements are drawn independently and the
@@ -196,10 +200,10 @@ class NeighborTransform(_RandomTransform):
             generator=generator,
         )
         roots = [key if isinstance(key, str) else key[0] for key in self.in_keys]
-        if not roots or "distance" in roots:
+        if not roots or {"distance", "neighborhood"} & set(roots):
             raise ValueError(
-                f"in_keys must name at least one entry and none called 'distance', which holds "
-                f"the neighbors' distances; got {self.in_keys}."
+                f"in_keys must name at least one entry and none called 'distance' or "
+                f"'neighborhood', which say how far away neighbors are; got {self.in_keys}."
             )
         self.neighborhood = neighborhood
         self.num_samples = num_samples
@@ -211,10 +215,7 @@ class NeighborTransform(_RandomTransform):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes neighbors and distances into the tensordict, of any batch size; returns it."""
-        neighbors = draw_neighbors(
-            tensordict, self.neighborhood, self.in_keys, self.num_samples, self.generator
-        )
-        return tensordict.set(self.out_key, neighbors)
+        return self.place(tensordict, self.draw(tensordict))
 
     def draw(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The random numbers that :meth:`forward` uses, for :meth:`place`: ``[*B, K, *F]`` per key.

@@ -16,7 +16,7 @@ from torchrl.envs import (
     Compose,
     EnvBase,
     ExplorationType,
-    GymEnv,
+    GymWrapper,
     Transform,
     TransformedEnv,
     set_exploration_type,
@@ -37,8 +37,9 @@ class EpisodeCollector(Collector):
     An episode's entries are kept in lists and stacked once.
 
     Args:
-        env (EnvBase): a ``GymEnv``, or one transformed by :class:`ObservationNoise` alone, with
-            one tensor of observations under ``"observation"``.
+        env (EnvBase): a ``GymEnv`` or ``GymWrapper``, or one transformed by
+            :class:`ObservationNoise` alone, with one tensor of observations under
+            ``"observation"``.
         policy (TensorDictModule): reads ``"observation"``.
 
     Keyword Args:
@@ -198,13 +199,13 @@ class EpisodeCollector(Collector):
         )
 
 
-def _parts(env: EnvBase) -> tuple[GymEnv, ObservationNoise | None]:
+def _parts(env: EnvBase) -> tuple[GymWrapper, ObservationNoise | None]:
     """The simulator and its noise."""
     transforms: list[Transform] = []
     simulator = env
     if isinstance(env, TransformedEnv):
         transforms, simulator = list(_flat(env.transform)), env.base_env
-    if not isinstance(simulator, GymEnv) or simulator.batch_size:
+    if not isinstance(simulator, GymWrapper) or simulator.batch_size:
         raise TypeError(
             f"EpisodeCollector takes one GymEnv, got {type(simulator).__name__} of batch size "
             f"{tuple(simulator.batch_size)}; use torchrl.collectors.Collector for any other."

@@ -37,7 +37,8 @@ def register() -> None:
     for group, choices in GROUPS.items():
         for name, chosen in choices.items():
             store.store(group=group, name=name, node=_node(chosen))
-    any_task = {"name": "${task.env_id}", "env_id": None, "noise_scale": None, "solved_at": None}
+    unknown = dict.fromkeys(("env_id", "noise_scale", "max_steps", "solved_at"))
+    any_task = {"name": "${task.env_id}", **unknown}
     store.store(
         group="task", name="gymnasium", node={**_node(GROUPS["task"]["swingup"]), **any_task}
     )

@@ -146,7 +146,7 @@ class ExperimentConfig:
         import torch
 
         # The last episodes may go past the rollout's frames.
-        longest = getattr(self.algorithm, "frames", 0) + self.num_workers * self.task.max_steps
+        longest = getattr(self.algorithm, "frames", 0) + self.num_workers * self.task.time_limit
         buffer = self.replay.make(torch.Generator().manual_seed(self.seed), longest)
         transform = self.regularizer.transform(torch.Generator().manual_seed(self.seed))
         if transform is not None:
@@ -171,7 +171,7 @@ class ExperimentConfig:
                 f"must be 1 with algorithm.schedule=step, which updates after every frame, got "
                 f"{workers}: use algorithm.schedule=episode, or one worker.",
             )
-        if episodes % workers:
+        if episodes % workers and self.task.frames is None:
             raise SettingError(
                 "task.episodes",
                 f"must be a multiple of num_workers={workers}, which play one each in a round, got "
@@ -201,12 +201,14 @@ FREE_SETTINGS = {
     "checkpoint_interval",
     "checkpoint_keep",
 }
-# More episodes are a longer run of the same kind.
-FREE_TASK_SETTINGS = {"episodes", "solved_at"}
+# More episodes or frames are a longer run of the same kind.
+FREE_TASK_SETTINGS = {"episodes", "frames", "solved_at"}
 
 
 def check_same_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     """Refuses to continue a run with settings that would change its numbers.
+
+    Settings that were not there yet when a run was saved have their defaults in it.
 
     Raises:
         OtherRunError: names the first setting that differs, with both values.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import importlib
 import os
 import sys
 from collections.abc import Iterator
@@ -11,9 +12,9 @@ from typing import TYPE_CHECKING
 
 import gymnasium
 import torch
-from torchrl.data import Bounded, Unbounded
-from torchrl.envs import EnvBase, GymEnv, TransformedEnv
+from torchrl.envs import EnvBase, GymWrapper, TransformedEnv
 
+from torchrl_l2c2.experiment.spaces import Env, observing_vector, taking_vector
 from torchrl_l2c2.transforms import ObservationNoise
 
 if TYPE_CHECKING:
@@ -31,23 +32,17 @@ def make_env(task: TaskConfig, seed: int) -> EnvBase:
         seed (int): of the simulator and, separately, of the noise.
 
     Returns:
-        EnvBase: a ``GymEnv``, transformed by :class:`ObservationNoise` where there is noise.
+        EnvBase: a ``GymWrapper`` that observes one vector of float32, transformed by
+            :class:`ObservationNoise` where there is noise.
 
     Raises:
-        ValueError: an id that Gymnasium does not know, or a task whose observation is not one
-            tensor of floats.
+        ValueError: an id that Gymnasium does not know, a task without a time limit, or one whose
+            observations or actions are not vectors of numbers.
     """
-    try:
-        with quiet_output():
-            env = GymEnv(task.env_id, max_episode_steps=task.max_steps)
-            env.reset()
-    except (gymnasium.error.Error, ModuleNotFoundError) as error:
-        raise ValueError(
-            f"task.env_id={task.env_id!r} is not a task that Gymnasium can make here ({error}). "
-            "Use task=swingup|reacher|hopper|ant, or task=gymnasium with a registered id; "
-            "`module:id` imports the module that registers it."
-        ) from error
-    _check_spaces(env, task)
+    simulator = taking_vector(observing_vector(_make(task), flatten=task.flatten))
+    with quiet_output():
+        env = GymWrapper(simulator)
+        env.reset()
     env.set_seed(seed)
     if not task.noise_scale:
         return env
@@ -55,13 +50,43 @@ def make_env(task: TaskConfig, seed: int) -> EnvBase:
     return TransformedEnv(env, ObservationNoise(task.noise_scale, generator=generator))
 
 
-def _check_spaces(env: GymEnv, task: TaskConfig) -> None:
-    observation = env.observation_spec.get("observation", None)
-    if not isinstance(observation, Bounded | Unbounded) or not observation.dtype.is_floating_point:
+def time_limit(task: TaskConfig) -> int:
+    """Frames of a task's longest episode: its own setting, or what Gymnasium has registered.
+
+    Raises:
+        ValueError: neither is there, or Gymnasium does not know the task.
+    """
+    if task.max_steps is not None:
+        return task.max_steps
+    module, _, name = task.env_id.rpartition(":")
+    with _explained(task):
+        if module:
+            importlib.import_module(module)
+        registered = gymnasium.spec(name).max_episode_steps
+    if registered is None:
         raise ValueError(
-            f"task.env_id={task.env_id!r} observes {env.observation_spec}; this experiment needs "
-            "one observation of floats. Compose the components yourself for anything else."
+            f"task.env_id={task.env_id!r} is registered without a limit of its episodes: set "
+            "task.max_steps, for example to 1000."
         )
+    return registered
+
+
+def _make(task: TaskConfig) -> Env:
+    limit = time_limit(task)
+    with _explained(task), quiet_output():
+        return gymnasium.make(task.env_id, max_episode_steps=limit)
+
+
+@contextlib.contextmanager
+def _explained(task: TaskConfig) -> Iterator[None]:
+    try:
+        yield
+    except (gymnasium.error.Error, ImportError) as error:
+        raise ValueError(
+            f"task.env_id={task.env_id!r} is not a task that Gymnasium can make here ({error}). "
+            "Use task=swingup|reacher|hopper|ant, or task=gymnasium with a registered id; "
+            "`module:id` imports the module that registers it."
+        ) from error
 
 
 @contextlib.contextmanager

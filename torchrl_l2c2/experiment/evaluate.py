@@ -166,7 +166,7 @@ class LateTests:
         return EpisodeCollector(
             make_env(self._task, self._seed),
             self._policy,
-            frames_per_batch=self._task.max_steps,
+            frames_per_batch=self._task.time_limit,
             compile_policy=self._compile,
             exploration_type=ExplorationType.DETERMINISTIC,
         )
@@ -202,7 +202,7 @@ def load_policy(folder: str | Path) -> tuple[TensorDictModule, EnvBase, int]:
         agent.loss.load_state_dict(newest[1]["loss"])
     else:
         raise FileNotFoundError(f"{str(folder)!r} holds neither policy.pt nor a checkpoint yet.")
-    return agent.policy, env, config.task.max_steps
+    return agent.policy, env, config.task.time_limit
 
 
 def main(arguments: Iterable[str] | None = None) -> None:

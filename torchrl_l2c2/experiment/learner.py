@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from typing import Any
 
 import torch
@@ -10,7 +11,33 @@ from tensordict import TensorDictBase
 from torchrl.data import TensorDictReplayBuffer
 
 from torchrl_l2c2.experiment.algorithms.agent import Agent
+from torchrl_l2c2.experiment.influence import gradient_shares
 from torchrl_l2c2.experiment.update import ReplayUpdate, Step, is_loss, make_update
+from torchrl_l2c2.objectives import L2C2Loss
+from torchrl_l2c2.transforms import NeighborTransform
+
+# Updates after which the regularizer's gradients are measured, and the share of the loss's own
+# below which they are told to be too small.
+MEASURED_AFTER = 100
+FAINT = 1e-3
+
+
+def untrained(frames: int, updates: int, random_frames: int) -> str | None:
+    """Why a training of so many frames and updates has no policy to show; ``None`` if it has.
+
+    Args:
+        frames (int): that were played.
+        updates (int): that were made.
+        random_frames (int): first frames whose actions were random.
+    """
+    if updates and frames > random_frames:
+        return None
+    what = "no update was made" if not updates else "the policy never acted"
+    return (
+        f"{what} in {frames} frames, the first {random_frames} of which were random "
+        "(algorithm.random_frames): the policy is as good as untrained. Train for longer, or need "
+        "fewer frames before the first update (also by replay.batch_size and algorithm.frames)."
+    )
 
 
 class Learner:
@@ -52,6 +79,10 @@ class Learner:
         self._compile = compile
         self._skip_nonfinite = skip_nonfinite
         self._terms: list[torch.Tensor] = []
+        # Here, as a compiled update would not tell.
+        for transform in replay.transform.transforms:
+            if isinstance(agent.loss, L2C2Loss) and isinstance(transform, NeighborTransform):
+                agent.loss.compare_neighbors(transform.neighborhood, transform.num_samples)
         self.renew()
 
     def renew(self) -> None:
@@ -97,6 +128,21 @@ class Learner:
             return
         self.updates += 1
         self._terms.append(result[0])
+        if self.updates == MEASURED_AFTER:
+            self._tell_faint_regularizer(*batch)
+
+    def _tell_faint_regularizer(self, *batch: TensorDictBase) -> None:
+        if isinstance(self.update, ReplayUpdate):
+            batch = (self.update.example(),)
+        shares = gradient_shares(self.agent.loss, *batch)
+        if shares and max(shares.values()) < FAINT:
+            each = ", ".join(f"{key}: {share:.1g}" for key, share in shares.items())
+            warnings.warn(
+                f"after {self.updates} updates the gradients of the regularizer's terms are less "
+                f"than {FAINT:g} of the loss's own ({each}), too little to change the result: "
+                "raise the gains of the regularizer, or lower algorithm.reward_scale.",
+                stacklevel=2,
+            )
 
     def report(self, last_frame: int) -> dict[str, float]:
         """Means of every entry of the loss over the updates since the last report.
@@ -108,13 +154,15 @@ class Learner:
             last_frame (int): frames that were played, for errors.
 
         Raises:
-            FloatingPointError: an entry was NaN or infinite; names it, the update and the frame.
+            FloatingPointError: an entry was NaN or infinite, or a parameter is now; names it, the
+                update and the frame.
         """
         keys, terms = self.agent.loss.out_keys, self._terms
         self._terms = []
         if terms:
             values = torch.stack(terms)
             self._check_finite(values, last_frame)
+            self.check_parameters()
             values = values.mean(0)
         else:
             values = torch.full((len(keys),), float("nan"))
@@ -125,6 +173,18 @@ class Learner:
             k.replace("loss", "share"): v / total if total else 0.0 for k, v in losses.items()
         }
         return {**means, **shares}
+
+    def check_parameters(self) -> None:
+        """Stops at a parameter that is not finite.
+
+        Raises:
+            FloatingPointError: names the parameter and the update.
+        """
+        for name, parameter in self.agent.loss.named_parameters():
+            if not parameter.isfinite().all():
+                raise FloatingPointError(
+                    f"{name} is not finite after update {self.updates}: a gradient was not."
+                )
 
     def _check_finite(self, values: torch.Tensor, last_frame: int) -> None:
         bad = ~values.isfinite()

@@ -60,7 +60,7 @@ class Player:
         """One episode of every process, all by the policy as it is now.
 
         Raises:
-            FloatingPointError: NaN or infinity in what the environment gave.
+            FloatingPointError: NaN or infinity in what the environment or the policy gave.
             SimulatorError: the environment failed.
         """
         last_frame, episodes = self.frames, []
@@ -111,17 +111,22 @@ class Player:
 
 
 def check_finite(batch: TensorDictBase, first_frame: int) -> None:
-    """Stops at the first NaN or infinity that the environment gave.
+    """Stops at the first NaN or infinity that the environment or the policy gave.
 
     Raises:
         FloatingPointError: names the key and the frame.
     """
-    for key in ("observation", ("next", "observation"), ("next", "reward")):
+    found = []
+    # In the order in which they come about: what follows a bad action is bad as well.
+    for key in ("observation", "action", ("next", "observation"), ("next", "reward")):
         bad = ~batch[key].isfinite()
         if bad.any():
-            step = int(bad.flatten(1).any(1).nonzero()[0])
-            value = batch[key][step].flatten().tolist()
-            raise FloatingPointError(
-                f"{key} is not finite at frame {first_frame + step}: {value}. "
-                "The environment gave it; nothing was learned from this episode."
-            )
+            found.append((int(bad.flatten(1).any(1).nonzero()[0]), key))
+    if found:
+        step, key = min(found, key=lambda each: each[0])
+        giver = "policy" if key == "action" else "environment"
+        raise FloatingPointError(
+            f"{key} is not finite at frame {first_frame + step}: "
+            f"{batch[key][step].flatten().tolist()}. "
+            f"The {giver} gave it; nothing was learned from this episode."
+        )

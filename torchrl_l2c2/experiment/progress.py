@@ -12,22 +12,34 @@ from tqdm import tqdm
 
 
 class Progress:
-    """A bar over the episodes of a run, with what they were like lately.
+    """A bar over the episodes or frames of a run, with what episodes were like lately.
 
     Args:
-        total (int): episodes in all.
-        done (int): episodes of an earlier call.
+        total (int): episodes or frames in all.
+        done (int): those of an earlier call.
         frames (int): frames of an earlier call.
 
     Keyword Args:
         shown (bool): whether there is a bar.
         compiles (bool): whether the first updates wait for a compiler.
+        unit (str): what is counted, ``"episode"`` or ``"frame"``. Default ``"episode"``.
     """
 
-    def __init__(self, total: int, done: int, frames: int, *, shown: bool, compiles: bool) -> None:
+    def __init__(
+        self,
+        total: int,
+        done: int,
+        frames: int,
+        *,
+        shown: bool,
+        compiles: bool,
+        unit: str = "episode",
+    ) -> None:
         self._started, self._first_frame = time.monotonic(), frames
         self._waiting = shown and compiles
-        self._bar = tqdm(total=total, initial=done, unit="episode", disable=not shown)
+        self._bar = tqdm(total=total, initial=done, unit=unit, disable=not shown)
+        self._column = {"episode": "episode", "frame": "frames"}[unit]
+        self._done: float = done
         if self._waiting:
             self._bar.set_postfix_str("compiling at the first updates, up to two minutes")
 
@@ -48,7 +60,8 @@ class Progress:
 
     def show(self, rows: Sequence[dict[str, float]], first_update_seconds: float | None) -> None:
         """Counts an episode; its metrics are the last row."""
-        self._bar.update()
+        self._bar.update(rows[-1][self._column] - self._done)
+        self._done = rows[-1][self._column]
         if self._waiting and first_update_seconds is not None:
             self._waiting = False
             self._bar.write(f"compiled within {first_update_seconds:.0f} s", sys.stderr)

@@ -62,7 +62,9 @@ def settings(cls: type[Group]) -> type[Group]:
 
 
 def read(make: Callable[..., Group], values: Mapping[str, Any], prefix: str) -> Group:
-    """Settings from plain values, as a file or a command line has them; lists stand for tuples.
+    """Settings from plain values, as a file or a command line has them.
+
+    Lists stand for tuples, and whole floats for integers, as in ``task.frames=1e6``.
 
     Args:
         make (Callable): a class of settings, or a ``functools.partial`` of ``dataclasses.replace``
@@ -73,11 +75,18 @@ def read(make: Callable[..., Group], values: Mapping[str, Any], prefix: str) -> 
     Raises:
         SettingError: an unknown name, or a value outside its range.
     """
-    plain = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    plain = {name: _plain(value) for name, value in values.items()}
     try:
         return make(**plain)
     except SettingError as error:
         raise SettingError(error.setting, error.problem, prefix) from None
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, list):
+        return tuple(value)
+    # Where a float is wanted, pydantic makes one of the integer.
+    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def describe(group: type) -> dict[str, tuple[str, str]]:

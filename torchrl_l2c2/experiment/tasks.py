@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
@@ -12,6 +13,27 @@ if TYPE_CHECKING:
     from torchrl.envs import EnvBase
 
 SWINGUP = "pybullet_envs_gymnasium:InvertedPendulumSwingupBulletEnv-v0"
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How long a training is.
+
+    Attributes:
+        total: so many episodes, or so many frames and what is left of their last episode.
+        unit: which of the two.
+    """
+
+    total: int
+    unit: Literal["episode", "frame"] = "episode"
+
+    def spent(self, episodes: int, frames: int) -> int:
+        """What a training of so many episodes and frames has used of it."""
+        return episodes if self.unit == "episode" else frames
+
+    def is_late(self, spent: int, share: float) -> bool:
+        """Whether a training is in the last share of it, which has one unit at least."""
+        return share > 0.0 and self.total - spent < max(1, round(self.total * share))
 
 
 @settings
@@ -30,21 +52,46 @@ class TaskConfig:
         ".01 for Swingup, none for other ids [paper]",
     )
     episodes: int = Field(
-        default=400, ge=1, description="to train for [inferred: the paper states none]"
-    )
-    max_steps: int = Field(
-        default=1000,
+        default=400,
         ge=1,
-        description="longest episode; at most so many frames are collected at once",
+        description="to train for, unless frames are given [inferred: the paper states none]",
+    )
+    max_steps: int | None = Field(
+        default=None,
+        ge=1,
+        description="longest episode; null: as the task is registered with Gymnasium",
     )
     solved_at: float | None = Field(
         default=None, description="return at which the task counts as solved, a line in the picture"
+    )
+    frames: int | None = Field(
+        default=None,
+        ge=1,
+        description="to train for instead of episodes, such as 1e6: training ends with the first "
+        "episode that reaches them",
+    )
+    flatten: bool = Field(
+        default=False,
+        description="make one vector of matrices, nested entries and labels (as one-hot vectors) "
+        "that are observed; several vectors become one, in the order of their names, without it",
     )
 
     def __post_init__(self) -> None:
         if self.noise_scale is None:
             # Frozen: this is how a default that depends on another field is set.
             object.__setattr__(self, "noise_scale", 0.01 if self.env_id == SWINGUP else 0.0)
+
+    @property
+    def time_limit(self) -> int:
+        """Frames of the longest episode: :func:`~.environments.time_limit`."""
+        from torchrl_l2c2.experiment.environments import time_limit
+
+        return time_limit(self)
+
+    @property
+    def budget(self) -> Budget:
+        """How long to train."""
+        return Budget(self.episodes) if self.frames is None else Budget(self.frames, "frame")
 
     def make_env(self, seed: int) -> EnvBase:
         """The task's environment, noisy and seeded: :func:`~.environments.make_env`."""
@@ -59,7 +106,7 @@ def _bullet(name: str) -> str:
 
 # Noise, steps and the returns that count as solved are the paper's; episodes are inferred.
 TASKS: dict[str, TaskConfig] = {
-    "swingup": TaskConfig(solved_at=800.0),
+    "swingup": TaskConfig(max_steps=1000, solved_at=800.0),
     "reacher": TaskConfig("reacher", _bullet("Reacher"), 0.01, 3000, 150, 18.0),
     "hopper": TaskConfig("hopper", _bullet("Hopper"), 0.001, 1500, 1000, 2500.0),
     "ant": TaskConfig("ant", _bullet("Ant"), 0.001, 1500, 1000, 2500.0),

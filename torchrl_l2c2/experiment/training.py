@@ -29,7 +29,7 @@ from torchrl_l2c2.experiment.folder import (
     write_atomically,
     write_json,
 )
-from torchrl_l2c2.experiment.learner import Learner
+from torchrl_l2c2.experiment.learner import Learner, untrained
 from torchrl_l2c2.experiment.player import Episode, Player, SimulatorError
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.progress import Progress
@@ -37,6 +37,7 @@ from torchrl_l2c2.experiment.replay import load_replay_state, replay_state
 from torchrl_l2c2.experiment.reports import FinishedRun, write_results
 from torchrl_l2c2.experiment.schedules import SCHEDULES
 from torchrl_l2c2.experiment.signals import Interrupted, stop_on_signals
+from torchrl_l2c2.experiment.tasks import Budget
 from torchrl_l2c2.experiment.workers import make_collector
 
 
@@ -117,49 +118,58 @@ class Experiment:
         checkpoint; a second one ends it at once.
 
         Args:
-            episodes (int, optional): how many there are to be in all. Default: the task's.
+            episodes (int, optional): how many there are to be in all. Default: the task's, or its
+                frames.
             progress (bool): whether to show a progress bar.
 
         Returns:
             list: a dictionary of metrics per episode.
 
         Raises:
-            FloatingPointError: NaN or infinity in what the environment gave, in a loss or in a
-                gradient; names the key and the step, and the last good checkpoint.
+            FloatingPointError: NaN or infinity in what the environment or the policy gave, in a
+                loss or in a parameter; names the key and the step, and the last good checkpoint.
             SimulatorError: the environment failed; names the frame and the last good checkpoint.
             Interrupted: a signal ended the training.
+
+        Warns:
+            UserWarning: no update was made, or every action was random: there is no trained policy;
+                or a regularizer's terms are too small to matter.
         """
-        total = self.config.task.episodes if episodes is None else episodes
+        budget = self.config.task.budget if episodes is None else Budget(episodes)
         algorithm, saved = self.config.algorithm, time.monotonic()
         schedule = SCHEDULES[algorithm.schedule](self.player, self.learner, algorithm)
         compiles = self._compile and self.agent.compilable and not self.learner.updates
         bar = Progress(
-            total, len(self.metrics), self.player.frames, shown=progress, compiles=compiles
+            budget.total,
+            self._spent(budget),
+            self.player.frames,
+            shown=progress,
+            compiles=compiles,
+            unit=budget.unit,
         )
+        ended = self._spent(budget) >= budget.total
         with self._process, bar, stop_on_signals() as signals, self._checkpoint_named():
-            while len(self.metrics) < total:
+            while not ended:
                 episode = next(schedule)
-                self._write(self._row(episode, total), bar)
+                self._write(self._row(episode, budget), bar)
                 if not episode.ends_round:
                     continue
-                ended = len(self.metrics) >= total
+                ended = self._spent(budget) >= budget.total
                 overdue = time.monotonic() - saved > self.config.checkpoint_interval
                 if ended or signals or overdue:
                     self.save()
                     saved = time.monotonic()
                 if signals and not ended:
                     raise Interrupted(signals[0], len(self.metrics), self.folder)
+        if problem := self._untrained():
+            warnings.warn(problem, stacklevel=2)
         return self.metrics
 
     def save(self) -> Path | None:
         """Writes a checkpoint of everything that the rest of the run depends on."""
         if self.folder is None:
             return None
-        for name, parameter in self.agent.loss.named_parameters():
-            if not parameter.isfinite().all():
-                raise FloatingPointError(
-                    f"{name} is not finite after update {self.learner.updates}: a gradient was not."
-                )
+        self.learner.check_parameters()
         return save_checkpoint(
             self.folder, len(self.metrics), self.state_dict(), self.config.checkpoint_keep
         )
@@ -188,7 +198,8 @@ class Experiment:
             ValueError: the state is of a run with other settings.
         """
         learner = self.learner
-        check_same_settings(json.loads(state["config"]), self.config.to_dict())
+        saved = ExperimentConfig.from_dict(json.loads(state["config"]))
+        check_same_settings(saved.to_dict(), self.config.to_dict())
         self.agent.loss.load_state_dict(state["loss"])
         self.agent.optimizer.load_state_dict(state["optimizer"])
         for part in ("target_updater", "exploration"):
@@ -224,7 +235,7 @@ class Experiment:
                 self.agent.policy,
                 env,
                 episodes or config.test_episodes,
-                max_steps=config.task.max_steps,
+                max_steps=config.task.time_limit,
                 sampled=sampled,
                 compile_policy=self._compile,
                 progress=progress,
@@ -249,10 +260,15 @@ class Experiment:
             raise ValueError("this experiment has no folder to write to; give it one when made.")
         save_policy(self.agent.policy, self.folder / "policy.pt")
         tests = {"mean": result, "sampled": sampled}
-        written = {
+        written: dict[str, dict[str, Any]] = {
             name: {"summary": test.summary(), "episodes": asdict(test)}
             for name, test in tests.items()
             if test is not None
+        }
+        written["mean"]["training"] = {
+            "frames": self.player.frames,
+            "updates": self.learner.updates,
+            "untrained": self._untrained(),
         }
         return write_results(self.folder, self.config, written)
 
@@ -279,10 +295,16 @@ class Experiment:
         self.load_state_dict(state)
         print(f"continuing after episode {len(self.metrics)} from {path}", file=sys.stderr)
 
-    def _row(self, episode: Episode, total: int) -> dict[str, float]:
+    def _untrained(self) -> str | None:
+        random_frames = getattr(self.config.algorithm, "random_frames", 0)
+        return untrained(self.player.frames, self.learner.updates, random_frames)
+
+    def _spent(self, budget: Budget) -> int:
+        return budget.spent(len(self.metrics), self.player.frames)
+
+    def _row(self, episode: Episode, budget: Budget) -> dict[str, float]:
         number = len(self.metrics) + 1
-        share = self.config.late_share
-        late = share > 0.0 and total - number < max(1, round(total * share))
+        late = budget.is_late(budget.spent(number, episode.last_frame), self.config.late_share)
         return {
             "episode": number,
             "frames": episode.last_frame,

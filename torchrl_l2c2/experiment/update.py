@@ -184,13 +184,26 @@ class ReplayUpdate:
             self._source = storage._storage
             self._names, self._stored = zip(*self._source.items(True, True), strict=True)
         index, info = self._replay.sampler.sample(storage, self._replay.batch_size)
-        uniform = None
-        if self._neighbors is not None:
-            near, count = self._neighbors.neighborhood, self._neighbors.num_samples
-            # Only the shape of the states counts: any rows will do.
-            states = self._source.get("observation")[: len(index)]
-            uniform = near.draw(states, count, self._neighbors.generator)
-        return Draw(self._stored, index, info.get("priority_weight"), uniform)
+        generator = None if self._neighbors is None else self._neighbors.generator
+        return Draw(
+            self._stored, index, info.get("priority_weight"), self._uniform(len(index), generator)
+        )
+
+    def example(self) -> TensorDictBase:
+        """A batch from all over the storage, for which nothing that runs depend on is drawn."""
+        size = self._replay.batch_size
+        rows = torch.linspace(0, len(self._replay) - 1, size).long()
+        weight = torch.ones(size) if self._prioritized else None
+        uniform = self._uniform(size, torch.Generator().manual_seed(0))
+        return self.read(self._stored, rows, weight, uniform)
+
+    def _uniform(self, size: int, generator: torch.Generator | None) -> Tensor | None:
+        """Random numbers for the neighbors of so many rows."""
+        if self._neighbors is None or self._source is None:
+            return None
+        near, count = self._neighbors.neighborhood, self._neighbors.num_samples
+        # Only the shape of the states counts: any rows will do.
+        return near.draw(self._source.get("observation")[:size], count, generator)
 
     def prioritize(self, index: Tensor, priority: Tensor | None) -> None:
         """Sets the priorities of rows, where the buffer has any."""

@@ -33,13 +33,13 @@ def make_collector(
         "random_frames": getattr(config.algorithm, "random_frames", 0),
     }
     if config.num_workers == 1:
-        frames = 1 if config.algorithm.schedule == "step" else config.task.max_steps
+        frames = 1 if config.algorithm.schedule == "step" else config.task.time_limit
         return EpisodeCollector(env, agent.policy, frames_per_batch=frames, **options)
     return MultiEpisodeCollector(
         partial(make_env, config.task, config.seed),
         agent.policy,
         num_workers=config.num_workers,
-        max_steps=config.task.max_steps,
+        max_steps=config.task.time_limit,
         seed=config.seed,
         **options,
     )

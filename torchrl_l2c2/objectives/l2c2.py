@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
+from dataclasses import astuple
+from math import isclose
 
+import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torch.distributions import Categorical, Distribution
@@ -46,7 +50,8 @@ class L2C2Loss(RegularizedLoss):
     weights [inferred: the paper weights neither or both].
 
     Neighbors are read from the batch where :class:`~torchrl_l2c2.NeighborTransform` has written
-    them (give it the same neighborhood), and otherwise drawn from the observations and next
+    them (give it the same neighborhood and ``num_samples``; a difference is told once, as a
+    warning), and otherwise drawn from the observations and next
     observations with torch's global generator. Drawn here, those floating-point inputs of the
     regularized networks are moved that have a successor in the batch, and the distance is the
     largest of theirs.
@@ -75,8 +80,8 @@ class L2C2Loss(RegularizedLoss):
     Keyword Args:
         coeff (float): multiplies all terms, at least 0; 0 leaves the plain loss's values and
             gradients. Scheduled as ``l2c2_coeff``. Defaults to ``1.0``.
-        num_samples (int): neighbors per state where they are drawn here, at least 1. More give a
-            less noisy estimate at so many times the network evaluations. Defaults to ``1``.
+        num_samples (int): neighbors per state, drawn here or by the transform, at least 1. More
+            give a less noisy estimate at so many times the network evaluations. Defaults to ``1``.
         hellinger_samples (int, optional): actions drawn from each policy for the paper's Monte
             Carlo estimate of :math:`d_\pi`, at least 1. Defaults to ``None``, its closed form.
         neighbor_key (NestedKey): the entry that ``NeighborTransform`` writes. Defaults to
@@ -144,6 +149,7 @@ class L2C2Loss(RegularizedLoss):
         self.l2c2_num_samples = num_samples
         self.l2c2_hellinger_samples = hellinger_samples
         self.l2c2_neighbor_key = neighbor_key
+        self._l2c2_compared = False
         self._l2c2_policies = self.policy_networks()
         self._l2c2_values = self.value_networks() if beta else []
         self.register_coefficient("l2c2_coeff", coeff)
@@ -195,6 +201,38 @@ class L2C2Loss(RegularizedLoss):
             return super().known_states(tensordict)
         return self._neighbors(tensordict)[0]
 
+    def compare_neighbors(self, neighborhood: Neighborhood, num_samples: int) -> None:
+        """Warns, once, where neighbors are drawn otherwise than this loss counts them.
+
+        A batch that :class:`~torchrl_l2c2.NeighborTransform` has been through is compared by
+        itself, unless the loss is compiled.
+
+        Args:
+            neighborhood: where the neighbors are drawn.
+            num_samples: neighbors per state.
+
+        Warns:
+            UserWarning: the neighborhood or the number is not that of this loss.
+        """
+        self._compare(astuple(neighborhood), num_samples)
+
+    def _compare(self, drawn: Sequence[float], num_samples: int) -> None:
+        if self._l2c2_compared or not drawn:  # an empty batch
+            return
+        self._l2c2_compared = True
+        own = astuple(self.l2c2_neighborhood)
+        # The batch has them in its own precision.
+        same = all(isclose(a, b, rel_tol=0.01) for a, b in zip(drawn, own, strict=True))
+        if not same or num_samples != self.l2c2_num_samples:
+            names = ("sigma", "lambda_min", "lambda_max", "num_samples")
+            pairs = zip(names, (*drawn, num_samples), (*own, self.l2c2_num_samples), strict=True)
+            each = ", ".join(f"{name} {a:.4g} and {b:.4g}" for name, a, b in pairs)
+            warnings.warn(
+                f"neighbors are drawn otherwise than L2C2Loss counts them: {each}. Give the same "
+                "neighborhood and num_samples to NeighborTransform and L2C2Loss.",
+                stacklevel=3,
+            )
+
     def _value_difference(
         self, network: str, tensordict: TensorDictBase, states: TensorDictBase
     ) -> Tensor:
@@ -227,7 +265,9 @@ class L2C2Loss(RegularizedLoss):
                 f"{self.l2c2_neighbor_key!r} holds {list(entries)}, but no 'distance': write it "
                 "with NeighborTransform, or name another neighbor_key."
             )
-        distance = entries.pop("distance")
+        distance, drawn = entries.pop("distance"), entries.pop("neighborhood", None)
+        if drawn is not None and not (self._l2c2_compared or torch.compiler.is_compiling()):
+            self._compare(drawn.reshape(3, -1)[:, :1].flatten().tolist(), len(distance))
         return TensorDict(entries, batch_size=distance.shape), distance
 
     def _draw(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -62,6 +62,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
     Attributes:
         policy_terms (frozenset of str): the ``loss_*`` keys of all regularizers applied that train
             the policy.
+        added_terms (frozenset of str): all ``loss_*`` keys of all regularizers applied.
 
     Raises:
         TypeError: the loss cannot be regularized, or already is by this regularizer.
@@ -95,6 +96,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
     """
 
     policy_terms: frozenset[str] = frozenset()
+    added_terms: frozenset[str] = frozenset()
     _coefficients: frozenset[str] = frozenset()
 
     def __new__(cls, base_loss: LossModule, *args: Any, **kwargs: Any) -> RegularizedLoss:
@@ -194,6 +196,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
                     raise ValueError(f"{kind} with 'loss_', got {key!r}: rename it.")
         self.out_keys = [*self.out_keys, *policy, *value, *diagnostics]
         self.policy_terms = self.policy_terms.union(policy)
+        self.added_terms = self.added_terms.union(policy, value)
 
     def register_coefficient(self, name: str, value: float, used: bool = True) -> None:
         """Makes a gain, a buffer of shape ``[]`` that can be assigned to later on.

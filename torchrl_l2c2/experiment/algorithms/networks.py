@@ -6,15 +6,19 @@ from copy import deepcopy
 
 from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictParams
 from torch import nn
+from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase, ExplorationType
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
 
-def check_actions(env: EnvBase, algorithm: str, *, continuous: bool) -> None:
+def check_actions(
+    env: EnvBase, algorithm: str, *, continuous: bool, squashed: bool = False
+) -> None:
     """Refuses actions that an algorithm cannot take.
 
     Raises:
-        ValueError: they are discrete where continuous ones are needed, or the other way round.
+        ValueError: they are discrete where continuous ones are needed, or the other way round, or
+            have no bounds to be squashed into.
     """
     if env.action_spec.dtype.is_floating_point != continuous:
         raise ValueError(
@@ -22,6 +26,18 @@ def check_actions(env: EnvBase, algorithm: str, *, continuous: bool) -> None:
             f"this task's are {type(env.action_spec).__name__} of shape "
             f"{tuple(env.action_spec.shape)}."
         )
+    if squashed and not _bounded(env.action_spec):
+        raise ValueError(
+            f"algorithm={algorithm} squashes actions into their bounds, and this task's have none: "
+            "use algorithm=ppo_rpe with algorithm.squash=none, or register the task with a "
+            "gymnasium.ActionWrapper that has bounds."
+        )
+
+
+def _bounded(spec: TensorSpec) -> bool:
+    # An unbounded one has the largest floats as its low and high.
+    sides = (spec.space.low, spec.space.high)
+    return isinstance(spec, Bounded) and all(bool(side.isfinite().all()) for side in sides)
 
 
 def observation_size(env: EnvBase) -> int:

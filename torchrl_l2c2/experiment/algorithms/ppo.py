@@ -72,7 +72,7 @@ class PPOConfig(AlgorithmConfig):
             tanh_normal_actor,
         )
 
-        check_actions(env, self.name, continuous=True)
+        check_actions(env, self.name, continuous=True, squashed=True)
         actor = tanh_normal_actor(env, self.hidden, nn.Tanh)
         critic = ValueOperator(perceptron(observation_size(env), 1, self.hidden, nn.Tanh))
         loss = ClipPPOLoss(

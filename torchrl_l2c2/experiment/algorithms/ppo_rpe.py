@@ -105,7 +105,7 @@ class PPORPEConfig(OffPolicyConfig):
         from torchrl_l2c2.objectives import PPORPELoss
         from torchrl_l2c2.updaters import TSoftUpdate
 
-        check_actions(env, self.name, continuous=True)
+        check_actions(env, self.name, continuous=True, squashed=self.squash == "tanh")
         size = observation_size(env)
         actor = make_actor(
             size,

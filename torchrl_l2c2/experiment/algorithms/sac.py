@@ -62,7 +62,7 @@ class SACConfig(OffPolicyConfig):
             tanh_normal_actor,
         )
 
-        check_actions(env, self.name, continuous=True)
+        check_actions(env, self.name, continuous=True, squashed=True)
         actor = tanh_normal_actor(env, self.hidden, nn.ReLU)
         loss = SACLoss(
             actor,

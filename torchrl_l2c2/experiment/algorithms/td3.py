@@ -76,7 +76,7 @@ class TD3Config(OffPolicyConfig):
             sharing,
         )
 
-        check_actions(env, self.name, continuous=True)
+        check_actions(env, self.name, continuous=True, squashed=True)
         spec = env.action_spec
         network = perceptron(observation_size(env), spec.shape[-1], self.hidden, nn.ReLU)
         squash = TanhModule(in_keys=["action"], out_keys=["action"], spec=spec)

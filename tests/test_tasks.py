@@ -1,0 +1,286 @@
+"""Any task of Gymnasium: what it observes, takes and lasts."""
+
+import copy
+import json
+import math
+from collections import OrderedDict
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+
+from torchrl_l2c2.experiment import (
+    TASKS,
+    AdamConfig,
+    DQNConfig,
+    EpisodeCollector,
+    Experiment,
+    ExperimentConfig,
+    PPOConfig,
+    PPORPEConfig,
+    RolloutReplayConfig,
+    SACConfig,
+    TaskConfig,
+    TD3Config,
+    UniformReplayConfig,
+    make_env,
+)
+
+INF = float("inf")
+VECTOR = spaces.Box(-INF, INF, (2,), np.float32)
+ACTION = spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+
+class Still(gymnasium.Env):
+    """Shows the one observation that it is given, and keeps the actions that it gets."""
+
+    def __init__(self, space=VECTOR, seen=None, action=ACTION):
+        self.observation_space, self.action_space = space, action
+        self.seen = space.sample() if seen is None else seen
+        self.taken = []
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return copy.deepcopy(self.seen), {}
+
+    def step(self, action):
+        self.taken.append(action)
+        return copy.deepcopy(self.seen), float(self.np_random.normal()), False, False, {}
+
+
+gymnasium.register("Still-v0", Still)  # without a limit of its own
+
+
+def task(env_id="Still-v0", **settings):
+    return TaskConfig("task", env_id, **{"max_steps": 20, **settings})
+
+
+def still(monkeypatch, **arguments):
+    """Has the next tasks be made with these spaces."""
+    monkeypatch.setitem(gymnasium.registry["Still-v0"].kwargs, "space", VECTOR)
+    for name, value in arguments.items():
+        monkeypatch.setitem(gymnasium.registry["Still-v0"].kwargs, name, value)
+
+
+def observed(chosen):
+    """What the run's own collector shows of a task, which steps it without TorchRL's specs."""
+    env = make_env(chosen, 0)
+    policy = ExperimentConfig(algorithm=PPORPEConfig(squash="none")).make_agent(env).policy
+    episode = EpisodeCollector(env, policy, frames_per_batch=3).rollout()
+    assert env.observation_spec["observation"].dtype == torch.float32
+    assert episode["observation"].dtype == episode["next", "observation"].dtype == torch.float32
+    return episode["observation"][0].tolist()
+
+
+INTEGERS = spaces.Box(-9, 9, (3,), np.int64)
+PARTS = {
+    "velocity": spaces.Box(-INF, INF, (2,), np.float64),
+    "angle": spaces.Box(-INF, INF, (), np.float32),
+    "contact": spaces.MultiBinary(2),
+}
+SEEN = {"velocity": np.array([1.0, 2.0]), "angle": np.array(3.0, "f4"), "contact": [0, 1]}
+MATRIX = spaces.Box(-9.0, 9.0, (2, 2), np.float32)
+
+
+@pytest.mark.parametrize(
+    ("space", "seen", "expected"),
+    [
+        (spaces.Box(-INF, INF, (2,), np.float64), np.array([0.5, 2.0]), [0.5, 2.0]),
+        (INTEGERS, np.array([1, -2, 3]), [1.0, -2.0, 3.0]),
+        (spaces.MultiBinary(3), np.array([1, 0, 1], np.int8), [1.0, 0.0, 1.0]),
+        (spaces.Dict(PARTS), {**SEEN, "contact": np.array([0, 1], "i1")}, [3, 0, 1, 1, 2]),
+        (
+            spaces.Dict(OrderedDict(b=VECTOR, a=VECTOR)),
+            OrderedDict(b=np.array([1, 2], "f4"), a=np.array([3, 4], "f4")),
+            [3.0, 4.0, 1.0, 2.0],
+        ),
+    ],
+    ids=["float64", "integers", "binary", "several", "unsorted"],
+)
+def test_vectors_of_numbers_are_observed_as_one_of_float32(monkeypatch, space, seen, expected):
+    """Several are put together in the order of their names, not of the space."""
+    still(monkeypatch, space=space, seen=seen)
+    assert observed(task()) == expected
+
+
+@pytest.mark.parametrize(
+    ("space", "seen", "expected"),
+    [
+        (MATRIX, np.array([[1, 2], [3, 4]], "f4"), [1.0, 2.0, 3.0, 4.0]),
+        (spaces.Discrete(3), 1, [0.0, 1.0, 0.0]),
+        (
+            spaces.Dict({"m": MATRIX, "d": spaces.Dict({"label": spaces.Discrete(2)})}),
+            {"m": np.array([[1, 2], [3, 4]], "f4"), "d": {"label": 1}},
+            [0.0, 1.0, 1.0, 2.0, 3.0, 4.0],
+        ),
+    ],
+    ids=["matrix", "label", "nested"],
+)
+def test_matrices_labels_and_nested_entries_become_a_vector_on_request(
+    monkeypatch, space, seen, expected
+):
+    """And without it are refused in one line that says so."""
+    still(monkeypatch, space=space, seen=seen)
+    assert observed(task(flatten=True)) == expected
+    with pytest.raises(ValueError, match=r"not a vector of numbers: task\.flatten=true") as refused:
+        make_env(task(), 0)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("flatten", [False, True])
+@pytest.mark.parametrize(
+    "space", [spaces.Tuple([VECTOR, VECTOR]), spaces.Text(3), spaces.Dict(a=spaces.Text(3))]
+)
+def test_what_is_no_numbers_is_refused(monkeypatch, space, flatten):
+    """In one line that says what to do."""
+    still(monkeypatch, space=space)
+    with pytest.raises(ValueError, match=r"observes a (Tuple|Text|Dict).*vector") as refused:
+        make_env(task(flatten=flatten), 0)
+    assert "\n" not in str(refused.value)
+
+
+def test_images_are_refused_without_a_network_for_them(monkeypatch):
+    """They are no vector, but their pixels can be."""
+    still(monkeypatch, space=spaces.Box(0, 255, (8, 8, 3), np.uint8))
+    with pytest.raises(ValueError, match=r"no network for images.*task.flatten=true"):
+        make_env(task(), 0)
+
+
+ALGORITHMS = {
+    "ppo_rpe": (PPORPEConfig(hidden=(8,)), UniformReplayConfig(batch_size=16)),
+    "sac": (SACConfig(random_frames=10, hidden=(8,)), UniformReplayConfig(batch_size=16)),
+    "td3": (TD3Config(random_frames=10, hidden=(8,)), UniformReplayConfig(batch_size=16)),
+    "ppo": (PPOConfig(frames=30, epochs=2, hidden=(8,)), RolloutReplayConfig(batch_size=16)),
+    "dqn": (DQNConfig(random_frames=10, hidden=(8,)), UniformReplayConfig(batch_size=16)),
+}
+CONTINUOUS = [name for name in ALGORITHMS if name != "dqn"]
+
+
+def experiment(name, chosen, folder=None, **settings):
+    algorithm, replay = ALGORITHMS[name]
+    return Experiment(
+        ExperimentConfig(
+            **{
+                "task": chosen,
+                "algorithm": algorithm,
+                "replay": replay,
+                "optimizer": AdamConfig(lr=0.001),
+                "compile": False,
+                "test_episodes": 1,
+                "late_share": 0.0,
+                **settings,
+            }
+        ),
+        folder,
+    )
+
+
+def actions(run):
+    return np.array(run.player.collector._gymnasium.unwrapped.taken)
+
+
+@pytest.mark.parametrize("name", CONTINUOUS)
+def test_actions_fill_asymmetric_bounds_and_stay_within(monkeypatch, name):
+    """Of every algorithm, in the dtype that the task takes."""
+    low, high = np.array([-1.0, 2.0]), np.array([3.0, 2.5])
+    still(monkeypatch, action=spaces.Box(low, high, dtype=np.float64))
+    run = experiment(name, task(episodes=3))
+    run.train()
+    taken = actions(run)
+    assert taken.dtype == np.float64 and run.learner.updates > 0
+    assert (taken >= low).all() and (taken <= high).all()
+    middle = (low + high) / 2
+    assert (np.abs(taken.mean(0) - middle) < 0.5 * (high - low)).all()
+
+
+@pytest.mark.parametrize("low", [-INF, 0.0])
+@pytest.mark.parametrize("name", CONTINUOUS)
+def test_actions_without_bounds_are_refused_where_they_are_squashed(monkeypatch, name, low):
+    """Also where one side is open; the error says what takes them."""
+    still(monkeypatch, action=spaces.Box(low, INF, (1,), np.float32))
+    with pytest.raises(ValueError, match=r"squashes actions.*algorithm\.squash=none") as refused:
+        experiment(name, task())
+    assert "\n" not in str(refused.value)
+
+
+def test_ppo_rpe_acts_without_bounds_where_it_does_not_squash(monkeypatch):
+    """A normal's samples reach beyond 1, and training is finite."""
+    still(monkeypatch, action=spaces.Box(-INF, INF, (1,), np.float32))
+    run = experiment("ppo_rpe", task(episodes=3), algorithm=PPORPEConfig(squash="none"))
+    run.train()
+    assert run.learner.updates > 0 and np.abs(actions(run)).max() > 1.0
+
+
+def test_discrete_actions_that_start_elsewhere_are_those_of_the_task(monkeypatch):
+    """TorchRL counts from 0."""
+    still(monkeypatch, action=spaces.Discrete(3, start=5))
+    run = experiment("dqn", task(episodes=2))
+    run.train()
+    assert set(actions(run).tolist()) == {5, 6, 7}
+
+
+@pytest.mark.parametrize(
+    "action",
+    [spaces.MultiBinary(2), spaces.Box(0, 3, (2,), np.int64), MATRIX, spaces.Dict(a=ACTION)],
+)
+def test_actions_that_are_no_vector_are_refused(monkeypatch, action):
+    """In one line that says what may be."""
+    still(monkeypatch, action=action)
+    with pytest.raises(ValueError, match="actions must be one vector of floats or one Discrete"):
+        make_env(task(), 0)
+
+
+def test_an_episode_is_as_long_as_the_task_is_registered():
+    """Pendulum's 200 steps; the paper's tasks have their own; a setting goes before."""
+    assert TaskConfig("pendulum", "Pendulum-v1").time_limit == 200
+    limits = {name: chosen.time_limit for name, chosen in TASKS.items()}
+    assert limits == {"swingup": 1000, "reacher": 150, "hopper": 1000, "ant": 1000}
+    assert TaskConfig("pendulum", "Pendulum-v1", max_steps=7).time_limit == 7
+    run = experiment("td3", TaskConfig("pendulum", "Pendulum-v1", episodes=1))
+    assert run.train()[0]["length"] == 200 and run.test().lengths == [200]
+
+
+def test_a_task_without_a_limit_needs_one():
+    """In one line with the setting's name."""
+    with pytest.raises(ValueError, match=r"without a limit of its episodes: set task\.max_steps"):
+        make_env(task(max_steps=None), 0)
+
+
+def test_training_ends_with_the_first_episode_that_reaches_the_frames():
+    """And late tests are those of the frames' last share; as many again continue the run."""
+    run = experiment("td3", task(frames=70), late_share=0.5)
+    rows = run.train()
+    assert [row["frames"] for row in rows] == [20, 40, 60, 80]
+    assert [math.isnan(row["test_return"]) for row in rows] == [True, False, False, False]
+
+
+def test_a_run_continues_for_more_frames(tmp_path):
+    """Its numbers are those of one that was longer from the start."""
+    experiment("td3", task(frames=40), tmp_path / "a").train()
+    longer = experiment("td3", task(frames=70), tmp_path / "a").train()
+    at_once = experiment("td3", task(frames=70), tmp_path / "b").train()
+    assert [row["frames"] for row in longer] == [20, 40, 60, 80]
+    assert [row["return"] for row in longer] == [row["return"] for row in at_once]
+
+
+def test_a_checkpoint_of_before_a_setting_has_its_default(tmp_path):
+    """So that what came later does not end older runs."""
+    run = experiment("td3", task(episodes=1), tmp_path)
+    run.train()
+    state = run.state_dict()
+    saved = json.loads(state["config"])
+    del saved["task"]["flatten"], saved["task"]["frames"]
+    run.load_state_dict({**state, "config": json.dumps(saved)})
+    saved["task"]["flatten"] = True
+    with pytest.raises(ValueError, match=r"task\.flatten=True, not False"):
+        run.load_state_dict({**state, "config": json.dumps(saved)})
+
+
+def test_whole_floats_are_integers_on_a_command_line():
+    """1e6, which YAML and Hydra read as a float; a broken one is refused."""
+    config = ExperimentConfig.from_dict({"task": {"name": "swingup", "frames": 1e6}})
+    assert config.task.frames == 1_000_000 and isinstance(config.task.frames, int)
+    with pytest.raises(ValueError, match=r"task\.frames must be a valid integer, got 0\.5"):
+        ExperimentConfig.from_dict({"task": {"name": "swingup", "frames": 0.5}})

@@ -1,0 +1,239 @@
+"""A run that cannot be a result says so: not finite, untrained, or hardly regularized."""
+
+import json
+import warnings
+from dataclasses import replace
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.modules import MLP, Actor, ValueOperator
+from torchrl.objectives import DDPGLoss
+
+from torchrl_l2c2 import L2C2Loss, Neighborhood, NeighborTransform
+from torchrl_l2c2.experiment import (
+    AdamConfig,
+    CAPSConfig,
+    DQNConfig,
+    Experiment,
+    ExperimentConfig,
+    L2C2Config,
+    PPOConfig,
+    PPORPEConfig,
+    RolloutReplayConfig,
+    SACConfig,
+    TaskConfig,
+    TD3Config,
+    UniformReplayConfig,
+)
+from torchrl_l2c2.experiment.influence import gradient_shares
+
+PENDULUM = TaskConfig("pendulum", "Pendulum-v1", episodes=2, max_steps=40)
+ALGORITHMS = {
+    "ppo_rpe": PPORPEConfig(hidden=(8,)),
+    "sac": SACConfig(hidden=(8,), random_frames=10),
+    "td3": TD3Config(hidden=(8,), random_frames=10),
+    "ppo": PPOConfig(hidden=(8,), frames=30, epochs=2),
+    "dqn": DQNConfig(hidden=(8,), random_frames=10),
+}
+
+
+def make(name, folder=None, **settings):
+    replay = RolloutReplayConfig if name == "ppo" else UniformReplayConfig
+    task = replace(PENDULUM, env_id="CartPole-v1" if name == "dqn" else "Pendulum-v1")
+    values = {
+        "task": task,
+        "algorithm": ALGORITHMS[name],
+        "replay": replay(batch_size=8),
+        "optimizer": AdamConfig(),
+        "compile": False,
+        "test_episodes": 1,
+        **settings,
+    }
+    return Experiment(ExperimentConfig(**values), folder)
+
+
+def warned(make_it):
+    """The messages of what ``make_it`` warns of, those about results alone."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        make_it()
+    parts = ("neighbors are drawn", "regularizer's terms", "untrained")
+    return [str(w.message) for w in caught if any(part in str(w.message) for part in parts)]
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_a_parameter_that_is_not_finite_stops_every_algorithm(tmp_path, name):
+    """With its name, the update and the last checkpoint, whatever the loss has made of it."""
+    run = make(name, tmp_path)
+    run.train(1)
+    parameter_name, parameter = list(run.agent.loss.named_parameters())[-1]
+    step = run.agent.optimizer.step
+
+    def broken(*args, **kwargs):
+        step(*args, **kwargs)
+        # Overflown, as by a gradient of the last update: no loss has seen it yet.
+        if run.learner.updates == last - 1:
+            parameter.data.view(-1)[0] = float("inf")
+
+    last = make(name).train(2)[-1]["updates"]
+    run.agent.optimizer.step = broken
+    with pytest.raises(FloatingPointError, match=f"not finite after update {last}: ") as stopped:
+        run.train(2)
+    assert parameter_name in str(stopped.value)
+    assert "Last good checkpoint: " in str(stopped.value) and "1.pt" in str(stopped.value)
+
+
+@pytest.mark.parametrize("name", ["ppo_rpe", "sac", "td3", "ppo"])
+def test_an_action_that_is_not_finite_stops_every_algorithm(name):
+    """The policy's, with its frame."""
+    run = make(name)
+    for parameter in run.agent.policy.parameters():
+        parameter.data.fill_(float("nan"))
+    first = 10 if name in ("sac", "td3") else 0  # the first that is not random
+    message = rf"action is not finite at frame {first}: \[nan\]. The policy gave it"
+    with pytest.raises(FloatingPointError, match=message):
+        run.train()
+
+
+def test_a_run_without_an_update_says_so(tmp_path):
+    """At its end, in its metrics and beside its test episodes."""
+    run = make("sac", tmp_path, algorithm=SACConfig(hidden=(8,), random_frames=81))
+    (message,) = warned(run.train)
+    assert message.startswith("no update was made in 80 frames, the first 81 of which were random")
+    assert run.metrics[-1]["updates"] == 0
+    run.finish(run.test())
+    written = json.loads((tmp_path / "evaluation.json").read_text())["training"]
+    assert written == {"frames": 80, "updates": 0, "untrained": message}
+
+
+def test_a_run_of_random_actions_alone_says_so(tmp_path):
+    """Updates without a frame of the policy's own; one that has both says nothing."""
+    run = make("sac", algorithm=SACConfig(hidden=(8,), random_frames=80))
+    (message,) = warned(run.train)
+    assert message.startswith("the policy never acted in 80 frames")
+    trained = make("sac", tmp_path)
+    assert not warned(trained.train)
+    trained.finish(trained.test())
+    assert json.loads((tmp_path / "evaluation.json").read_text())["training"]["untrained"] is None
+
+
+def ddpg():
+    torch.manual_seed(0)
+    value = ValueOperator(MLP(in_features=4, out_features=1), in_keys=["observation", "action"])
+    return DDPGLoss(Actor(torch.nn.Linear(3, 1)), value)
+
+
+def ddpg_batch():
+    return TensorDict(
+        {
+            "observation": torch.randn(6, 3),
+            "action": torch.randn(6, 1),
+            "next": {
+                "observation": torch.randn(6, 3),
+                "reward": torch.randn(6, 1),
+                "done": torch.zeros(6, 1, dtype=torch.bool),
+                "terminated": torch.zeros(6, 1, dtype=torch.bool),
+            },
+        },
+        [6],
+    )
+
+
+@pytest.mark.parametrize(
+    ("neighborhood", "num_samples", "told"),
+    [
+        (Neighborhood(sigma=2.0), 1, "sigma 2 and 1, lambda_min 0.01 and 0.01"),
+        (Neighborhood(lambda_max=0.5), 1, "lambda_max 0.5 and 1"),
+        (Neighborhood(), 3, "num_samples 3 and 1"),
+        (Neighborhood(), 1, None),
+    ],
+)
+def test_a_transform_with_another_neighborhood_than_the_losss_is_told_once(
+    neighborhood, num_samples, told
+):
+    """At the first batch, with both numbers; the same one says nothing."""
+    loss = L2C2Loss(ddpg())
+    transform = NeighborTransform(neighborhood, num_samples=num_samples)
+    messages = warned(lambda: [loss(transform(ddpg_batch())) for _ in range(2)])
+    assert len(messages) == (told is not None)
+    assert told is None or told in messages[0]
+
+
+def test_neighbors_of_ones_own_making_are_not_compared():
+    """Without a word of their neighborhood, any are right."""
+    loss, batch = L2C2Loss(ddpg()), NeighborTransform(Neighborhood(sigma=2.0))(ddpg_batch())
+    del batch["neighbor", "neighborhood"]
+    assert not warned(lambda: loss(batch))
+
+
+def test_an_experiment_compares_before_anything_is_compiled(monkeypatch):
+    """A compiled loss looks at no values."""
+
+    def another(self, generator):
+        return NeighborTransform(Neighborhood(), generator=generator)
+
+    monkeypatch.setattr(L2C2Config, "transform", another)
+    (message,) = warned(lambda: make("td3", regularizer=L2C2Config(num_samples=2), compile=True))
+    assert "num_samples 1 and 2" in message
+
+
+def test_gradient_shares_are_the_quotients_of_the_norms():
+    """By hand, in the parameters of each term; they are proportional to the gain."""
+    loss, batch = L2C2Loss(ddpg(), beta=0.1), NeighborTransform(Neighborhood())(ddpg_batch())
+    expected = {}
+    for added, own, network in (
+        ("loss_l2c2_actor", "loss_actor", "actor_network_params"),
+        ("loss_l2c2_value", "loss_value", "value_network_params"),
+    ):
+        parameters = list(getattr(loss, network).values(True, True))
+        terms = loss(batch.copy())
+        norms = [
+            torch.cat([g.flatten() for g in torch.autograd.grad(terms[key], parameters, **KEEP)])
+            for key in (added, own)
+        ]
+        expected[added] = (norms[0].norm() / norms[1].norm()).item()
+    assert gradient_shares(loss, batch) == pytest.approx(expected, rel=1e-5)
+    loss.l2c2_coeff = 0.5
+    halves = {key: share / 2 for key, share in expected.items()}
+    assert gradient_shares(loss, batch) == pytest.approx(halves, rel=1e-5)
+    assert gradient_shares(ddpg(), batch) == {}
+
+
+KEEP = {"retain_graph": True}
+
+
+def many_updates(name, regularizer):
+    algorithm = replace(ALGORITHMS[name], **({"epochs": 15} if name == "ppo" else {}))
+    task = replace(PENDULUM, episodes=3)
+    if name == "ppo_rpe":
+        algorithm = replace(algorithm, updates=40)
+    return make(name, task=task, algorithm=algorithm, regularizer=regularizer)
+
+
+@pytest.mark.parametrize("name", ["ppo_rpe", "sac", "td3", "ppo"])
+def test_a_faint_regularizer_is_told_once_with_what_to_change(name):
+    """Of every algorithm; a strong one is not."""
+    faint, strong = (
+        CAPSConfig(lambda_temporal=1e-9, lambda_spatial=1e-9),
+        CAPSConfig(lambda_temporal=1.0, lambda_spatial=1.0),
+    )
+    (message,) = warned(many_updates(name, faint).train)
+    assert message.startswith("after 100 updates") and "loss_caps_spatial" in message
+    assert "raise the gains of the regularizer" in message
+    assert not warned(many_updates(name, strong).train)
+
+
+@pytest.mark.parametrize("name", ["ppo_rpe", "sac", "ppo"])
+def test_looking_for_a_faint_regularizer_changes_no_number(monkeypatch, name):
+    """Nor any random stream: every parameter is what it is without."""
+
+    def parameters():
+        run = many_updates(name, L2C2Config())
+        run.train()
+        assert run.learner.updates > 100
+        return torch.cat([p.detach().flatten() for p in run.agent.loss.state_dict().values()])
+
+    looked = parameters()
+    monkeypatch.setattr("torchrl_l2c2.experiment.learner.MEASURED_AFTER", 10**9)
+    assert torch.equal(looked, parameters())
