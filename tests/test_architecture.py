@@ -23,7 +23,7 @@ objectives.l2c2 objectives.caps objectives.ppo_rpe
 objectives.__init__
 trainers __init__
 experiment.settings experiment.compilation experiment.environments experiment.folder
-experiment.process experiment.progress experiment.signals experiment.optimizers
+experiment.lock experiment.process experiment.progress experiment.signals experiment.optimizers
 experiment.tasks experiment.replay experiment.collection experiment.reports
 experiment.regularizers.base
 experiment.regularizers.none experiment.regularizers.caps experiment.regularizers.l2c2

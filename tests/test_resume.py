@@ -134,14 +134,14 @@ def test_a_policy_needs_its_folder_alone(tmp_path):
     assert policy(td)["loc"].equal(loc)
 
 
-def start(folder, episodes, *extra):
+def start(folder, episodes, *extra, log=None):
     command = [
         sys.executable, str(ROOT / "train.py"), "compile=false", f"task.episodes={episodes}",
         "task.max_steps=50", "algorithm.updates=5", "test_episodes=1", "checkpoint_interval=0",
         f"hydra.run.dir={folder}", *extra,
     ]  # fmt: skip
     # Into a file: a pipe that nobody reads is full after some hundred lines of progress.
-    with open(messages(folder), "w") as output:
+    with open(messages(folder.with_name(log or folder.name)), "w") as output:
         return subprocess.Popen(
             command,
             cwd=folder.parent,
@@ -220,3 +220,18 @@ def test_signals_save_and_the_same_command_continues(tmp_path, number):
     again = start(folder, episodes + 1)
     assert again.wait(120) == 0, messages(folder).read_text()
     assert len(lines(folder)) == episodes + 1
+
+
+def test_a_second_process_is_refused_and_leaves_the_folder_as_it_is(tmp_path):
+    """It names the first one's process; the first goes on to its end."""
+    folder = tmp_path / "run"
+    first = start(folder, 2000, "checkpoint_interval=3600")
+    wait_for(lambda: (folder / "metrics.csv").exists() and len(lines(folder)) >= 1, first)
+    config = (folder / "config.json").stat().st_mtime_ns
+    second = start(folder, 2000, "checkpoint_interval=3600", log="second")
+    assert second.wait(60) == 1
+    refusal = messages(tmp_path / "second").read_text()
+    assert f"in use by process {first.pid} on" in refusal and "Traceback" not in refusal
+    assert (folder / "config.json").stat().st_mtime_ns == config and first.poll() is None
+    first.send_signal(signal.SIGTERM)
+    assert first.wait(30) == 128 + signal.SIGTERM

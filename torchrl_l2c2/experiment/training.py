@@ -29,6 +29,7 @@ from torchrl_l2c2.experiment.folder import (
     write_json,
 )
 from torchrl_l2c2.experiment.learner import Learner
+from torchrl_l2c2.experiment.lock import lock_folder
 from torchrl_l2c2.experiment.player import Episode, Player, SimulatorError
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.progress import Progress
@@ -63,6 +64,7 @@ class Experiment:
         ValueError: a setting that cannot be, or that differs from the checkpoint's.
         CheckpointError: there are checkpoints, but none can be read.
         OSError: a folder that cannot be written to.
+        FolderInUseError: another process writes the folder.
 
     Examples:
         >>> from torchrl_l2c2.experiment import Experiment, ExperimentConfig, TaskConfig
@@ -83,7 +85,7 @@ class Experiment:
         resume: str | Path | None = None,
     ) -> None:
         self.config = config = config or ExperimentConfig()
-        self.folder = None if folder is None else make_folder(folder)
+        self.folder = None if folder is None else Path(folder)
         self._compile = config.compile and compiler_available()
         self._process = ProcessState(config.seed, config.threads)
         with self._process:
@@ -101,11 +103,14 @@ class Experiment:
             self.player = Player(collector, self.agent, config.task.env_id)
         self.metrics: list[dict[str, float]] = []
         self._late_tests = LateTests(config.task, config.seed, self.agent.policy, self._compile)
-        self._log = MetricsLog(self.folder, tensorboard=config.logger.name == "tensorboard")
-        self._resume(resume)
+        # Only now, as what was refused above leaves no folder.
         if self.folder is not None:
-            write_json(self.folder / "config.json", config.to_dict())
-            write_json(self.folder / "versions.json", versions())
+            self._unlock = lock_folder(make_folder(self.folder), self)
+        try:
+            self._begin(resume)
+        except BaseException:
+            self.close()
+            raise
 
     def train(
         self, episodes: int | None = None, *, progress: bool = False
@@ -259,6 +264,15 @@ class Experiment:
         """Ends the processes of ``num_workers``; the experiment cannot train any further."""
         self.player.collector.shutdown()
         self._late_tests.close()
+        if self.folder is not None:
+            self._unlock()
+
+    def _begin(self, resume: str | Path | None) -> None:
+        self._log = MetricsLog(self.folder, tensorboard=self.config.logger.name == "tensorboard")
+        self._resume(resume)
+        if self.folder is not None:
+            write_json(self.folder / "config.json", self.config.to_dict())
+            write_json(self.folder / "versions.json", versions())
 
     def _resume(self, elsewhere: str | Path | None) -> None:
         # The folder's own checkpoint first: the same command again continues what it began.
