@@ -24,7 +24,7 @@ objectives.__init__
 trainers __init__
 experiment.settings experiment.compilation experiment.environments experiment.folder
 experiment.lock experiment.process experiment.progress experiment.signals experiment.optimizers
-experiment.tasks experiment.replay experiment.collection experiment.reports
+experiment.sweep experiment.tasks experiment.replay experiment.collection experiment.reports
 experiment.regularizers.base
 experiment.regularizers.none experiment.regularizers.caps experiment.regularizers.l2c2
 experiment.regularizers.__init__
@@ -33,7 +33,7 @@ experiment.algorithms.ppo_rpe experiment.algorithms.sac experiment.algorithms.td
 experiment.algorithms.dqn experiment.algorithms.ppo
 experiment.algorithms.__init__
 experiment.config
-experiment.workers
+experiment.naming experiment.continuation experiment.workers
 experiment.evaluate experiment.update experiment.player experiment.manual
 experiment.learner
 experiment.schedules

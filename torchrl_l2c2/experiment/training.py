@@ -6,21 +6,24 @@ import contextlib
 import json
 import sys
 import time
-import warnings
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from torchrl_l2c2.experiment.compilation import compiler_available
-from torchrl_l2c2.experiment.config import ExperimentConfig, check_same_settings
+from torchrl_l2c2.experiment.config import ExperimentConfig
+from torchrl_l2c2.experiment.continuation import (
+    check_continuable,
+    check_length,
+    check_same_settings,
+    find_checkpoint,
+)
 from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
 from torchrl_l2c2.experiment.evaluate import Evaluation, LateTests, evaluate_policy
 from torchrl_l2c2.experiment.folder import (
-    CheckpointError,
     MetricsLog,
     list_checkpoints,
-    load_newest,
     make_folder,
     save_checkpoint,
     save_policy,
@@ -53,6 +56,9 @@ class Experiment:
 
     Keyword Args:
         resume (str or Path, optional): another run's folder to continue from, in ``folder``.
+        allow_other_versions (bool): whether to continue, with a warning, what other versions of
+            PyTorch, TorchRL or a simulator began; the numbers may then differ from those of a run
+            in one go. Default ``False``.
 
     Attributes:
         agent: what learns.
@@ -83,6 +89,7 @@ class Experiment:
         folder: str | Path | None = None,
         *,
         resume: str | Path | None = None,
+        allow_other_versions: bool = False,
     ) -> None:
         self.config = config = config or ExperimentConfig()
         self.folder = None if folder is None else Path(folder)
@@ -107,7 +114,7 @@ class Experiment:
         if self.folder is not None:
             self._unlock = lock_folder(make_folder(self.folder), self)
         try:
-            self._begin(resume)
+            self._begin(resume, allow_other_versions)
         except BaseException:
             self.close()
             raise
@@ -131,9 +138,12 @@ class Experiment:
             FloatingPointError: NaN or infinity in what the environment gave, in a loss or in a
                 gradient; names the key and the step, and the last good checkpoint.
             SimulatorError: the environment failed; names the frame and the last good checkpoint.
+            OSError: the disk is full, for example; names the file and the last good checkpoint.
+            OtherRunError: fewer episodes than there are.
             Interrupted: a signal ended the training.
         """
         total = self.config.task.episodes if episodes is None else episodes
+        check_length(total, len(self.metrics))
         algorithm, saved = self.config.algorithm, time.monotonic()
         schedule = SCHEDULES[algorithm.schedule](self.player, self.learner, algorithm)
         compiles = self._compile and self.agent.compilable and not self.learner.updates
@@ -173,6 +183,7 @@ class Experiment:
         learner = self.learner
         return {
             "config": json.dumps(self.config.to_dict()),
+            "versions": json.dumps(versions()),
             "loss": self.agent.loss.state_dict(),
             "optimizer": self.agent.optimizer.state_dict(),
             "target_updater": _state_of(self.agent.target_updater),
@@ -189,7 +200,7 @@ class Experiment:
         """Restores what :meth:`state_dict` gave.
 
         Raises:
-            ValueError: the state is of a run with other settings.
+            OtherRunError: the state is of a run with other settings.
         """
         learner = self.learner
         check_same_settings(json.loads(state["config"]), self.config.to_dict())
@@ -267,28 +278,22 @@ class Experiment:
         if self.folder is not None:
             self._unlock()
 
-    def _begin(self, resume: str | Path | None) -> None:
+    def _begin(self, resume: str | Path | None, allow_other_versions: bool) -> None:
         self._log = MetricsLog(self.folder, tensorboard=self.config.logger.name == "tensorboard")
-        self._resume(resume)
+        self._resume(resume, allow_other_versions)
         if self.folder is not None:
             write_json(self.folder / "config.json", self.config.to_dict())
             write_json(self.folder / "versions.json", versions())
 
-    def _resume(self, elsewhere: str | Path | None) -> None:
-        # The folder's own checkpoint first: the same command again continues what it began.
-        found = None if self.folder is None else load_newest(self.folder)
-        if found is None and elsewhere is not None:
-            found = load_newest(elsewhere)
-            if found is None:
-                raise CheckpointError(f"resume={str(elsewhere)!r} holds no checkpoint_*.pt.")
-            if self.folder is not None:
-                log = (Path(elsewhere) / "metrics.csv").read_bytes()
-                write_atomically(self.folder / "metrics.csv", log)
+    def _resume(self, elsewhere: str | Path | None, allow_other_versions: bool) -> None:
+        found = find_checkpoint(self.folder, elsewhere)
         if found is None:
             return
-        path, state, damaged = found
-        for message in damaged:
-            warnings.warn(f"{message} The one before it is used.", stacklevel=3)
+        path, state = found
+        check_continuable(state, self.config, allow_other_versions=allow_other_versions)
+        if self.folder is not None and path.parent != self.folder:
+            log = (path.parent / "metrics.csv").read_bytes()
+            write_atomically(self.folder / "metrics.csv", log)
         self.load_state_dict(state)
         print(f"continuing after episode {len(self.metrics)} from {path}", file=sys.stderr)
 
@@ -321,6 +326,8 @@ class Experiment:
             raise FloatingPointError(f"{error} {self._last_checkpoint()}") from None
         except SimulatorError as error:
             raise SimulatorError(f"{error} {self._last_checkpoint()}") from error.__cause__
+        except OSError as error:
+            raise OSError(f"{error}. {self._last_checkpoint()}") from error
 
     def _last_checkpoint(self) -> str:
         paths = list_checkpoints(self.folder) if self.folder is not None else []
