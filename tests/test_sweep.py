@@ -26,7 +26,7 @@ def start(folder, *overrides):
     # Into a file: a pipe that nobody reads is full after some hundred lines of progress.
     with open(folder / "said", "w") as output:
         return subprocess.Popen(
-            [sys.executable, ROOT / "train.py", *SETTINGS, f"outputs={folder / 'o'}", *overrides],
+            [sys.executable, ROOT / "train.py", *overrides, *SETTINGS, f"outputs={folder / 'o'}"],
             stdout=output,
             stderr=output,
             start_new_session=True,
@@ -75,7 +75,7 @@ def begun(folder, least=1):
 @pytest.mark.parametrize("launcher", LAUNCHERS)
 def test_an_interrupted_sweep_saves_ends_and_is_continued(tmp_path, launcher, number):
     """Its running jobs save, no other one begins, no process stays; the same command goes on."""
-    length = ["task.episodes=3000", "-m", "seed=0,1,2", *LAUNCHERS[launcher], "compile=false"]
+    length = ["-m", "task.episodes=3000", "seed=0,1,2", *LAUNCHERS[launcher], "compile=false"]
     running = 2 if launcher == "joblib" else 1
     process = start(tmp_path, *length)
     wait_until(lambda: begun(tmp_path, running))
@@ -93,7 +93,7 @@ def test_an_interrupted_sweep_saves_ends_and_is_continued(tmp_path, launcher, nu
         newest = list_checkpoints(folder)[0]
         assert int(newest.stem.split("_")[1]) == episodes(folder)
     longest = max(saved.values()) + 1
-    again = start(tmp_path, f"task.episodes={longest}", *length[1:])
+    again = start(tmp_path, "-m", f"task.episodes={longest}", *length[2:])
     assert again.wait(200) == 0, said(tmp_path)
     assert {episodes(folder) for folder in runs(tmp_path).values()} == {longest}
     assert said(tmp_path).count("continuing after episode") == running
@@ -116,7 +116,7 @@ def test_ctrl_c_while_compiling_saves(tmp_path):
 def test_the_failed_jobs_of_a_sweep_are_named_at_its_end(tmp_path):
     """Each in a line with its reason, after everything else; the others are finished."""
     wrong = "regularizer.sigma=-1,1"
-    process = start(tmp_path, "task.episodes=2", "-m", wrong, *LAUNCHERS["joblib"], "compile=false")
+    process = start(tmp_path, "-m", "task.episodes=2", wrong, *LAUNCHERS["joblib"], "compile=false")
     assert process.wait(120) == 1, said(tmp_path)
     last = said(tmp_path).splitlines()[-1]
     assert last.startswith("failed: ") and "regularizer.sigma=-1" in last
@@ -134,8 +134,8 @@ def numbers(folder):
 def test_what_is_ended_at_random_times_ends_with_the_same_numbers(tmp_path, sweep):
     """Twenty SIGKILLs, SIGTERMs and Ctrl-Cs, and then the same command to the end."""
     choose = random.Random(0)
-    command = ["task.episodes=400", "checkpoint_interval=0.5", "compile=false"]
-    command += ["-m", "seed=0,1,2,3", *LAUNCHERS["joblib"]] if sweep else []
+    command = ["-m", "seed=0,1,2,3", *LAUNCHERS["joblib"]] if sweep else []
+    command += ["task.episodes=400", "checkpoint_interval=0.5", "compile=false"]
     undisturbed = start(tmp_path / "undisturbed", *command)
     assert undisturbed.wait(580) == 0, said(tmp_path / "undisturbed")
     folder = tmp_path / "ended"
