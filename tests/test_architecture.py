@@ -23,8 +23,8 @@ objectives.l2c2 objectives.caps objectives.ppo_rpe
 objectives.__init__
 trainers __init__
 experiment.settings experiment.compilation experiment.spaces experiment.folder
-experiment.environments
-experiment.process experiment.progress experiment.signals experiment.optimizers
+experiment.environments experiment.lock experiment.signals
+experiment.process experiment.progress experiment.sweep experiment.optimizers
 experiment.tasks experiment.replay experiment.collection
 experiment.regularizers.base
 experiment.regularizers.none experiment.regularizers.caps experiment.regularizers.l2c2
@@ -34,6 +34,7 @@ experiment.algorithms.ppo_rpe experiment.algorithms.sac experiment.algorithms.td
 experiment.algorithms.dqn experiment.algorithms.ppo
 experiment.algorithms.__init__
 experiment.config
+experiment.naming
 experiment.reports.statistics experiment.reports.paper experiment.reports.differences
 experiment.reports.records
 experiment.reports.runs experiment.reports.groups
@@ -48,7 +49,7 @@ experiment.workers
 experiment.evaluate experiment.update experiment.player experiment.manual
 experiment.influence
 experiment.learner
-experiment.schedules
+experiment.continuation experiment.schedules
 experiment.training
 experiment.command
 experiment.__init__

@@ -2,7 +2,10 @@
 
 import csv
 import hashlib
+import importlib.metadata
+import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -22,8 +25,10 @@ from torchrl_l2c2.experiment import (
     TaskConfig,
     UniformReplayConfig,
 )
+from torchrl_l2c2.experiment.config import GROUPS, OtherRunError
+from torchrl_l2c2.experiment.continuation import check_same_settings
 from torchrl_l2c2.experiment.evaluate import load_policy
-from torchrl_l2c2.experiment.folder import list_checkpoints, load_checkpoint
+from torchrl_l2c2.experiment.folder import list_checkpoints, load_checkpoint, save_checkpoint
 
 ROOT = Path(__file__).parent.parent
 SWINGUP = TaskConfig(episodes=6, max_steps=60)
@@ -134,14 +139,83 @@ def test_a_policy_needs_its_folder_alone(tmp_path):
     assert policy(td)["loc"].equal(loc)
 
 
-def start(folder, episodes, *extra):
+def of_other_versions(folder, **changed):
+    """Makes the newest checkpoint one that other versions wrote."""
+    newest = list_checkpoints(folder)[0]
+    state = load_checkpoint(newest)
+    state["versions"] = json.dumps(json.loads(state["versions"]) | changed)
+    save_checkpoint(folder, int(newest.stem.split("_")[1]), state, keep=1)
+
+
+def test_other_versions_are_refused_unless_they_are_allowed(tmp_path):
+    """The error names what differs, with both versions; a package only there now matters not."""
+    Experiment(small(), tmp_path).train()
+    of_other_versions(tmp_path, torch="1.0", box2d="2.3")
+    told = f"made with torch 1.0, now {importlib.metadata.version('torch')}: the numbers may differ"
+    with pytest.raises(OtherRunError, match=re.escape(told)):
+        Experiment(small(), tmp_path)
+    with pytest.warns(UserWarning, match=re.escape(told)):
+        again = Experiment(small(), tmp_path, allow_other_versions=True)
+    assert len(again.metrics) == 6
+
+
+def test_fewer_episodes_than_there_are_are_refused(tmp_path):
+    """Nothing is changed, and the run can be continued as it was or for longer."""
+    Experiment(small(), tmp_path).train()
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(OtherRunError, match=r"episodes=5 is fewer than the 6 .* already has"):
+        Experiment(small(task=replace(SWINGUP, episodes=5)), tmp_path)
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+    with pytest.raises(OtherRunError, match="episodes=5 is fewer than the 6"):
+        Experiment(small(), tmp_path).train(5)
+
+
+def test_what_changes_no_number_may_change(tmp_path):
+    """Where metrics go, which policies are tested and how often it is saved."""
+    Experiment(small(), tmp_path).train()
+    other = small(
+        logger=GROUPS["logger"]["tensorboard"], late_share=0.5, test_episodes=3, checkpoint_keep=5
+    )
+    assert len(Experiment(other, tmp_path).metrics) == 6
+
+
+def test_a_setting_that_a_checkpoint_does_not_know_is_named(tmp_path):
+    """One of an earlier release, before there was such a setting."""
+    saved = small().to_dict()
+    del saved["num_workers"]
+    with pytest.raises(OtherRunError, match=r"made with num_workers=none, as it is .*, not 1:"):
+        check_same_settings(saved, small().to_dict())
+
+
+@pytest.mark.parametrize("file", ["checkpoint_00000002.pt", "metrics.csv"])
+def test_a_full_disk_names_the_file_and_the_last_good_checkpoint(tmp_path, monkeypatch, file):
+    """And the run continues from there when there is room again."""
+    experiment = Experiment(small(), tmp_path)
+    experiment.train(1)
+    full = OSError(28, "No space left on device")
+
+    def no_room(path, *arguments, **options):
+        if Path(path).name.strip(".").startswith(file):
+            raise full
+        return open(path, *arguments, **options)
+
+    monkeypatch.setattr("torchrl_l2c2.experiment.folder.open", no_room, raising=False)
+    message = rf"No space left.*{file}'\. Last good checkpoint: .*checkpoint_00000001.pt"
+    with pytest.raises(OSError, match=message):
+        experiment.train()
+    experiment.close()
+    monkeypatch.undo()
+    assert len(Experiment(small(), tmp_path).train()) == 6
+
+
+def start(folder, episodes, *extra, log=None):
     command = [
         sys.executable, str(ROOT / "train.py"), "compile=false", f"task.episodes={episodes}",
         "task.max_steps=50", "algorithm.updates=5", "test_episodes=1", "checkpoint_interval=0",
         f"hydra.run.dir={folder}", *extra,
     ]  # fmt: skip
     # Into a file: a pipe that nobody reads is full after some hundred lines of progress.
-    with open(messages(folder), "w") as output:
+    with open(messages(folder.with_name(log or folder.name)), "w") as output:
         return subprocess.Popen(
             command,
             cwd=folder.parent,
@@ -220,3 +294,18 @@ def test_signals_save_and_the_same_command_continues(tmp_path, number):
     again = start(folder, episodes + 1)
     assert again.wait(120) == 0, messages(folder).read_text()
     assert len(lines(folder)) == episodes + 1
+
+
+def test_a_second_process_is_refused_and_leaves_the_folder_as_it_is(tmp_path):
+    """It names the first one's process; the first goes on to its end."""
+    folder = tmp_path / "run"
+    first = start(folder, 2000, "checkpoint_interval=3600")
+    wait_for(lambda: (folder / "metrics.csv").exists() and len(lines(folder)) >= 1, first)
+    config = (folder / "config.json").stat().st_mtime_ns
+    second = start(folder, 2000, "checkpoint_interval=3600", log="second")
+    assert second.wait(60) == 1
+    refusal = messages(tmp_path / "second").read_text()
+    assert f"in use by process {first.pid} on" in refusal and "Traceback" not in refusal
+    assert (folder / "config.json").stat().st_mtime_ns == config and first.poll() is None
+    first.send_signal(signal.SIGTERM)
+    assert first.wait(30) == 128 + signal.SIGTERM

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import signal
 import sys
+import traceback
 import warnings
 from contextlib import closing
 from pathlib import Path
@@ -21,11 +23,25 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_l2c2.experiment.config import GROUPS, ExperimentConfig, OtherRunError
 from torchrl_l2c2.experiment.manual import manual
+from torchrl_l2c2.experiment.naming import run_name
 from torchrl_l2c2.experiment.settings import SettingError, describe
+from torchrl_l2c2.experiment.signals import (
+    Interrupted,
+    Terminated,
+    keep_ctrl_c_from_children,
+    terminate,
+)
+from torchrl_l2c2.experiment.sweep import Sweep, begin_sweep
 
 PACKAGE = Path(__file__).parents[1]
 # Beside the package in a clone, within it when installed.
 CONF = next(folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if folder.is_dir())
+# What tells by itself what was wrong; anything else is a fault of the program.
+EXPECTED = (ValueError, OSError, RuntimeError, FloatingPointError)
+HINTS: dict[type[Exception], str] = {
+    SettingError: "--help lists every setting.",
+    OtherRunError: "In a shell: outputs=FOLDER, allow_other_versions=true, task.episodes=N.",
+}
 
 
 def register() -> None:
@@ -60,51 +76,114 @@ def _node(chosen: Any) -> dict[str, Any]:
 
 def main() -> None:
     """Runs what the command line says."""
+    keep_ctrl_c_from_children()
+    signal.signal(signal.SIGTERM, terminate)
     register()
-    _main()
+    if not {"-m", "--multirun", "hydra.mode=MULTIRUN"} & set(sys.argv):
+        _main()
+        return
+    with begin_sweep() as sweep:
+        try:
+            _main()
+        except KeyboardInterrupt:
+            sweep.stop(signal.SIGINT)
+        finally:
+            tell_end(sweep)
+        if sweep.stopped_by is not None:
+            sys.exit(128 + sweep.stopped_by)
+        sys.exit(bool(sweep.failures))
+
+
+def tell_end(sweep: Sweep) -> None:
+    """The last lines of a sweep: what failed, and how to go on."""
+    for job, reason in sweep.failures:
+        print(f"failed: {job}: {reason}", file=sys.stderr)
+    if sweep.stopped_by is not None:
+        name = signal.Signals(sweep.stopped_by).name
+        print(f"{name} ended the sweep; the same command continues it.", file=sys.stderr)
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
 def _main(values: DictConfig) -> None:
-    hints = {
-        SettingError: "--help lists every setting.",
-        OtherRunError: "outputs=FOLDER chooses another folder.",
-    }
+    plain: Any = OmegaConf.to_container(values, resolve=True)
+    if HydraConfig.get().mode == RunMode.MULTIRUN:
+        _run_job(plain, Sweep.of_this_job())
+        return
     try:
-        plain: Any = OmegaConf.to_container(values, resolve=True)
-        run(ExperimentConfig.from_dict(plain), values.resume)
-    except (ValueError, OSError, RuntimeError, FloatingPointError) as error:
-        print(f"error: {error} {hints.get(type(error), '')}".rstrip(), file=sys.stderr)
-        if HydraConfig.get().mode == RunMode.MULTIRUN:
-            raise  # Hydra counts it, goes on with the other jobs, and shows it again at the end.
+        run(plain)
+    except Interrupted as interruption:
+        print(interruption, file=sys.stderr)
+        sys.exit(128 + interruption.signal_number)
+    except KeyboardInterrupt as interruption:  # Not while training, or a second one.
+        print("interrupted; the same command continues.", file=sys.stderr)
+        sys.exit(128 + (signal.SIGTERM if isinstance(interruption, Terminated) else signal.SIGINT))
+    except EXPECTED as error:
+        _tell(error)
         sys.exit(1)
 
 
-def run(config: ExperimentConfig, resume: str | None) -> None:
-    """One run in the folder that Hydra chose, its progress and its result."""
+def _run_job(values: dict[str, Any], sweep: Sweep) -> None:
+    """A run that lets the sweep's other jobs go on when it fails."""
+    if sweep.stopped_by is not None:
+        return
+    try:
+        with sweep.job():
+            run(values)
+    except Interrupted as interruption:
+        print(interruption, file=sys.stderr)
+        sweep.stop(interruption.signal_number)
+    except KeyboardInterrupt:
+        sweep.stop(signal.SIGTERM)
+    except Exception as error:
+        if not isinstance(error, EXPECTED):
+            traceback.print_exc()
+        job = " ".join(HydraConfig.get().overrides.task)
+        sweep.add_failure(job, _tell(error).splitlines()[0])
+
+
+def _tell(error: Exception) -> str:
+    """Says what went wrong: of a user's own environment with where it did."""
+    if error.__cause__ is not None and type(error).__name__ == "SimulatorError":
+        traceback.print_exception(error.__cause__)
+    told = f"{error} {HINTS.get(type(error), '')}".strip()
+    print(f"error: {told}", file=sys.stderr)
+    return told
+
+
+def run_folder(config: ExperimentConfig, outputs: str) -> Path:
+    """The folder that Hydra was told, or one below ``outputs`` that is named by the settings."""
+    chosen = HydraConfig.get()
+    multirun = chosen.mode == RunMode.MULTIRUN
+    folder = chosen.sweep.subdir if multirun else chosen.run.dir
+    if folder == ".":
+        return Path(outputs) / run_name(config)
+    return Path(chosen.runtime.output_dir)
+
+
+def run(values: dict[str, Any]) -> None:
+    """One run in its folder, its progress and its result."""
+    config = ExperimentConfig.from_dict(values)
     # Here, as settings are checked before anything waits for torch.
+    from torchrl_l2c2.experiment.folder import save_policy
     from torchrl_l2c2.experiment.reports import compare_with_paper, finished_run
-    from torchrl_l2c2.experiment.signals import Interrupted
     from torchrl_l2c2.experiment.training import Experiment
 
     for chatty in ("torchrl", "matplotlib", "torch"):
         logging.getLogger(chatty).setLevel(logging.ERROR)
     warnings.simplefilter("ignore", FutureWarning)
-    folder = Path(HydraConfig.get().runtime.output_dir)
+    warnings.filterwarnings("ignore", "No target network updater")
+    folder = run_folder(config, values["outputs"])
     chosen = (config.task, config.algorithm, config.regularizer)
-    print(f"{', '.join(group.name for group in chosen)}, seed {config.seed}: {folder}")
-    try:
-        finished = finished_run(folder, config.to_dict())
-        if finished is None:
-            with closing(Experiment(config, folder, resume=resume)) as experiment:
-                experiment.train(progress=True)
-                tests = [experiment.test(sampled=s, progress=True) for s in (False, True)]
-                finished = experiment.finish(*tests)
-    except Interrupted as interruption:
-        print(interruption, file=sys.stderr)
-        sys.exit(interruption.exit_status)
-    except KeyboardInterrupt:  # While testing, which begins anew, or a second one while training.
-        print(f"interrupted; the same command continues from {folder}.", file=sys.stderr)
-        sys.exit(130)
+    print(f"{', '.join(group.name for group in chosen)}, seed {config.seed}: {folder}", flush=True)
+    finished = finished_run(folder, config.to_dict())
+    if finished is None:
+        going_on = {name: values[name] for name in ("resume", "allow_other_versions")}
+        with closing(Experiment(config, folder, **going_on)) as experiment:
+            experiment.train(progress=True)
+            if not config.test_episodes:
+                save_policy(experiment.agent.policy, folder / "policy.pt")
+                return
+            tests = [experiment.test(sampled=s, progress=True) for s in (False, True)]
+            finished = experiment.finish(*tests)
     print(compare_with_paper(finished))
-    print(f"picture: {folder / 'learning_curves.png'}")
+    print(f"picture: {folder / 'learning_curves.png'}", flush=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
@@ -43,7 +42,7 @@ GROUPS: dict[str, Mapping[str, Any]] = {
     "logger": LOGGERS,
 }
 # What steers where and how often runs happen, and is no setting of a run.
-STEERING = {"outputs", "experiment", "resume"}
+STEERING = {"outputs", "experiment", "resume", "allow_other_versions"}
 
 
 @settings
@@ -88,7 +87,10 @@ class ExperimentConfig:
         "counted)",
     )
     test_episodes: int = Field(
-        default=100, ge=1, description="episodes played with the policy's mean after training"
+        default=100,
+        ge=0,
+        description="episodes played with the policy's mean after training; 0: none, and no "
+        "evaluation.json",
     )
     late_share: float = Field(
         default=0.1,
@@ -118,8 +120,9 @@ class ExperimentConfig:
         """Reads nested mappings, such as a resolved Hydra configuration.
 
         Args:
-            values (Mapping): by group and name; ``outputs``, ``resume`` and ``experiment``, which
-                steer where and how often runs happen, are passed over.
+            values (Mapping): by group and name; ``outputs``, ``resume``, ``experiment`` and
+                ``allow_other_versions``, which steer where, whether and how often runs happen, are
+                passed over.
 
         Raises:
             SettingError: an unknown key, an unknown name, or a value outside its range.
@@ -195,6 +198,7 @@ class OtherRunError(ValueError):
 
 # What may differ between a run and its continuation: it changes none of the numbers.
 FREE_SETTINGS = {
+    "logger",
     "test_episodes",
     "late_share",
     "threads",
@@ -202,30 +206,4 @@ FREE_SETTINGS = {
     "checkpoint_keep",
 }
 # More episodes or frames are a longer run of the same kind.
-FREE_TASK_SETTINGS = {"episodes", "frames", "solved_at"}
-
-
-def check_same_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Refuses to continue a run with settings that would change its numbers.
-
-    Settings that were not there yet when a run was saved have their defaults in it.
-
-    Raises:
-        OtherRunError: names the first setting that differs, with both values.
-    """
-    for group in sorted((saved.keys() | now.keys()) - FREE_SETTINGS):
-        was, is_now = saved.get(group), now.get(group)
-        pairs = {group: (was, is_now)}
-        if isinstance(was, Mapping) and isinstance(is_now, Mapping):
-            names = (was.keys() | is_now.keys()) - (
-                FREE_TASK_SETTINGS if group == "task" else set()
-            )
-            pairs = {f"{group}.{n}": (was.get(n), is_now.get(n)) for n in sorted(names)}
-        for name, values in pairs.items():
-            # As JSON, where a tuple and a list are the same.
-            before, after = map(json.dumps, values)
-            if before != after:
-                raise OtherRunError(
-                    f"this folder's checkpoint was made with {name}={values[0]}, not {values[1]}: "
-                    "choose another folder, or delete this one. Nothing was changed."
-                )
+FREE_TASK_SETTINGS = {"name", "episodes", "frames", "solved_at"}

@@ -11,6 +11,7 @@ Checkpoints are a short header (magic, format version, SHA-256 of the rest) and 
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import hashlib
 import io
@@ -20,7 +21,7 @@ import pickle
 import struct
 import subprocess
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
@@ -28,7 +29,10 @@ from typing import Any, Literal
 import torch
 from torchrl.record.loggers.tensorboard import TensorboardLogger
 
-VERSIONED = ("torchrl-l2c2", "torch", "torchrl", "tensordict", "gymnasium", "pybullet", "numpy")
+VERSIONED = (
+    *("torchrl-l2c2", "torch", "torchrl", "tensordict", "numpy", "gymnasium"),
+    *("pybullet", "pybullet-envs-gymnasium", "mujoco"),
+)
 MAGIC = b"torchrl_l2c2\n"
 FORMAT_VERSION = 1
 HEADER = struct.Struct(f"<{len(MAGIC)}sI32s")
@@ -40,13 +44,11 @@ class CheckpointError(RuntimeError):
 
 
 def versions() -> dict[str, str]:
-    """Versions of the packages that decide the numbers."""
+    """Versions of the packages that decide the numbers, as far as they are installed."""
     found = {}
     for name in VERSIONED:
-        try:
+        with contextlib.suppress(PackageNotFoundError):
             found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
     return found
 
 
@@ -85,17 +87,33 @@ def make_folder(path: str | Path) -> Path:
 
 
 def write_atomically(path: str | Path, content: bytes) -> None:
-    """Writes a file whole or not at all: a temporary file, flushed to the disk, then renamed."""
+    """Writes a file whole or not at all: a temporary file, flushed to the disk, then renamed.
+
+    Raises:
+        OSError: names the file; what was there before is untouched.
+    """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.partial")
+    with _named(path):
+        try:
+            with open(temporary, "wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """A full disk says no name by itself."""
     try:
-        with open(temporary, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+        yield
+    except OSError as error:
+        raise OSError(
+            error.errno, f"{error.strerror or error}: this could not be written", str(path)
+        ) from error
 
 
 def write_json(path: str | Path, value: Any) -> None:
@@ -261,5 +279,5 @@ def _append(path: Path, cells: Iterable[object], mode: Literal["wb", "ab"]) -> N
     line = io.StringIO()
     csv.writer(line, lineterminator="\n").writerow(cells)
     # Unbuffered: one call of the system writes the whole line.
-    with open(path, mode, buffering=0) as file:
+    with _named(path), open(path, mode, buffering=0) as file:
         file.write(line.getvalue().encode())

@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import signal
+import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
+
+# Terminals and launchers send one signal to a process several times: to it, and to its group.
+SAME_SIGNAL_SECONDS = 1.0
+FINISHING = "finishing the episode, then saving"
 
 
 class Interrupted(Exception):
@@ -19,7 +25,16 @@ class Interrupted(Exception):
             f"{name} ended the training after episode {episode}; the same command continues it "
             f"from {folder}."
         )
-        self.exit_status = 128 + signal_number
+        self.signal_number = signal_number
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, where it ends what is being done as Ctrl-C does."""
+
+
+def terminate(number: int, frame: Any) -> NoReturn:
+    """A handler that lets what is being done end in order."""
+    raise Terminated
 
 
 @contextlib.contextmanager
@@ -29,10 +44,17 @@ def stop_on_signals() -> Iterator[list[int]]:
     if threading.current_thread() is not threading.main_thread():
         yield received
         return
+    first = 0.0
 
     def receive(number: int, frame: Any) -> None:
-        received.append(number)
-        restore()
+        nonlocal first
+        if not received:
+            first = time.monotonic()
+            received.append(number)
+            print(f"\n{FINISHING}; once more: at once", file=sys.stderr, flush=True)
+        elif time.monotonic() - first > SAME_SIGNAL_SECONDS:
+            restore()
+            signal.raise_signal(number)
 
     previous = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
 
@@ -46,3 +68,31 @@ def stop_on_signals() -> Iterator[list[int]]:
         yield received
     finally:
         restore()
+
+
+def keep_ctrl_c_from_children() -> None:
+    """Has this process alone hear Ctrl-C, which a terminal sends to all processes that it started.
+
+    Compilers, workers and jobs that are born from now on are deaf to it: they end their work, and
+    this process ends them. For a command's first lines, before there are other threads.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        return
+    main = threading.main_thread().ident
+    assert main is not None
+
+    def as_ctrl_c(number: int, frame: Any) -> None:
+        handler = signal.getsignal(signal.SIGINT)
+        if callable(handler):
+            handler(signal.SIGINT, frame)
+
+    def listen() -> None:
+        while True:
+            signal.sigwait({signal.SIGINT})
+            # Another signal, which wakes the main thread even while it waits for a compiler.
+            signal.pthread_kill(main, signal.SIGUSR1)
+
+    signal.signal(signal.SIGUSR1, as_ctrl_c)
+    # What is blocked here is blocked in every thread and process that comes from here.
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    threading.Thread(target=listen, daemon=True).start()

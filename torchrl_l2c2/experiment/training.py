@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import sys
 import time
 import warnings
-from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from torchrl_l2c2.experiment.compilation import compiler_available
-from torchrl_l2c2.experiment.config import ExperimentConfig, check_same_settings
+from torchrl_l2c2.experiment.config import ExperimentConfig
+from torchrl_l2c2.experiment.continuation import (
+    check_continuable,
+    check_length,
+    check_same_settings,
+    checkpoint_named,
+    find_checkpoint,
+)
 from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
 from torchrl_l2c2.experiment.evaluate import Evaluation, LateTests, evaluate_policy
 from torchrl_l2c2.experiment.folder import (
-    CheckpointError,
     MetricsLog,
     code_commit,
-    list_checkpoints,
-    load_newest,
     make_folder,
     save_checkpoint,
     save_policy,
@@ -30,7 +32,8 @@ from torchrl_l2c2.experiment.folder import (
     write_json,
 )
 from torchrl_l2c2.experiment.learner import Learner, untrained
-from torchrl_l2c2.experiment.player import Episode, Player, SimulatorError
+from torchrl_l2c2.experiment.lock import lock_folder
+from torchrl_l2c2.experiment.player import Episode, Player
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.progress import Progress
 from torchrl_l2c2.experiment.replay import load_replay_state, replay_state
@@ -54,6 +57,9 @@ class Experiment:
 
     Keyword Args:
         resume (str or Path, optional): another run's folder to continue from, in ``folder``.
+        allow_other_versions (bool): whether to continue, with a warning, what other versions of
+            PyTorch, TorchRL or a simulator began; the numbers may then differ from those of a run
+            in one go. Default ``False``.
 
     Attributes:
         agent: what learns.
@@ -65,6 +71,7 @@ class Experiment:
         ValueError: a setting that cannot be, or that differs from the checkpoint's.
         CheckpointError: there are checkpoints, but none can be read.
         OSError: a folder that cannot be written to.
+        FolderInUseError: another process writes the folder.
 
     Examples:
         >>> from torchrl_l2c2.experiment import Experiment, ExperimentConfig, TaskConfig
@@ -83,9 +90,10 @@ class Experiment:
         folder: str | Path | None = None,
         *,
         resume: str | Path | None = None,
+        allow_other_versions: bool = False,
     ) -> None:
         self.config = config = config or ExperimentConfig()
-        self.folder = None if folder is None else make_folder(folder)
+        self.folder = None if folder is None else Path(folder)
         self._compile = config.compile and compiler_available()
         self._process = ProcessState(config.seed, config.threads)
         with self._process:
@@ -103,11 +111,14 @@ class Experiment:
             self.player = Player(collector, self.agent, config.task.env_id)
         self.metrics: list[dict[str, float]] = []
         self._late_tests = LateTests(config.task, config.seed, self.agent.policy, self._compile)
-        self._log = MetricsLog(self.folder, tensorboard=config.logger.name == "tensorboard")
-        self._resume(resume)
+        # Only now, as what was refused above leaves no folder.
         if self.folder is not None:
-            write_json(self.folder / "config.json", config.to_dict())
-            write_json(self.folder / "versions.json", {**versions(), "commit": code_commit()})
+            self._unlock = lock_folder(make_folder(self.folder), self)
+        try:
+            self._begin(resume, allow_other_versions)
+        except BaseException:
+            self.close()
+            raise
 
     def train(
         self, episodes: int | None = None, *, progress: bool = False
@@ -129,6 +140,8 @@ class Experiment:
             FloatingPointError: NaN or infinity in what the environment or the policy gave, in a
                 loss or in a parameter; names the key and the step, and the last good checkpoint.
             SimulatorError: the environment failed; names the frame and the last good checkpoint.
+            OSError: the disk is full, for example; names the file and the last good checkpoint.
+            OtherRunError: fewer episodes than there are.
             Interrupted: a signal ended the training.
 
         Warns:
@@ -136,6 +149,7 @@ class Experiment:
                 or a regularizer's terms are too small to matter.
         """
         budget = self.config.task.budget if episodes is None else Budget(episodes)
+        check_length(budget, len(self.metrics))
         algorithm, saved = self.config.algorithm, time.monotonic()
         schedule = SCHEDULES[algorithm.schedule](self.player, self.learner, algorithm)
         compiles = self._compile and self.agent.compilable and not self.learner.updates
@@ -148,7 +162,7 @@ class Experiment:
             unit=budget.unit,
         )
         ended = self._spent(budget) >= budget.total
-        with self._process, bar, stop_on_signals() as signals, self._checkpoint_named():
+        with self._process, bar, stop_on_signals() as signals, checkpoint_named(self.folder):
             while not ended:
                 episode = next(schedule)
                 self._write(self._row(episode, budget), bar)
@@ -179,6 +193,7 @@ class Experiment:
         learner = self.learner
         return {
             "config": json.dumps(self.config.to_dict()),
+            "versions": json.dumps(versions()),
             "loss": self.agent.loss.state_dict(),
             "optimizer": self.agent.optimizer.state_dict(),
             "target_updater": _state_of(self.agent.target_updater),
@@ -195,11 +210,10 @@ class Experiment:
         """Restores what :meth:`state_dict` gave.
 
         Raises:
-            ValueError: the state is of a run with other settings.
+            OtherRunError: the state is of a run with other settings.
         """
         learner = self.learner
-        saved = ExperimentConfig.from_dict(json.loads(state["config"]))
-        check_same_settings(saved.to_dict(), self.config.to_dict())
+        check_same_settings(json.loads(state["config"]), self.config.to_dict())
         self.agent.loss.load_state_dict(state["loss"])
         self.agent.optimizer.load_state_dict(state["optimizer"])
         for part in ("target_updater", "exploration"):
@@ -276,22 +290,25 @@ class Experiment:
         """Ends the processes of ``num_workers``; the experiment cannot train any further."""
         self.player.collector.shutdown()
         self._late_tests.close()
+        if self.folder is not None:
+            self._unlock()
 
-    def _resume(self, elsewhere: str | Path | None) -> None:
-        # The folder's own checkpoint first: the same command again continues what it began.
-        found = None if self.folder is None else load_newest(self.folder)
-        if found is None and elsewhere is not None:
-            found = load_newest(elsewhere)
-            if found is None:
-                raise CheckpointError(f"resume={str(elsewhere)!r} holds no checkpoint_*.pt.")
-            if self.folder is not None:
-                log = (Path(elsewhere) / "metrics.csv").read_bytes()
-                write_atomically(self.folder / "metrics.csv", log)
+    def _begin(self, resume: str | Path | None, allow_other_versions: bool) -> None:
+        self._log = MetricsLog(self.folder, tensorboard=self.config.logger.name == "tensorboard")
+        self._resume(resume, allow_other_versions)
+        if self.folder is not None:
+            write_json(self.folder / "config.json", self.config.to_dict())
+            write_json(self.folder / "versions.json", {**versions(), "commit": code_commit()})
+
+    def _resume(self, elsewhere: str | Path | None, allow_other_versions: bool) -> None:
+        found = find_checkpoint(self.folder, elsewhere)
         if found is None:
             return
-        path, state, damaged = found
-        for message in damaged:
-            warnings.warn(f"{message} The one before it is used.", stacklevel=3)
+        path, state = found
+        check_continuable(state, self.config, allow_other_versions=allow_other_versions)
+        if self.folder is not None and path.parent != self.folder:
+            log = (path.parent / "metrics.csv").read_bytes()
+            write_atomically(self.folder / "metrics.csv", log)
         self.load_state_dict(state)
         print(f"continuing after episode {len(self.metrics)} from {path}", file=sys.stderr)
 
@@ -320,20 +337,6 @@ class Experiment:
         self.metrics.append(row)
         self._log.write(row)
         bar.show(self.metrics, self.learner.first_update_seconds)
-
-    @contextlib.contextmanager
-    def _checkpoint_named(self) -> Iterator[None]:
-        """Errors that end a training say from where it can go on."""
-        try:
-            yield
-        except FloatingPointError as error:
-            raise FloatingPointError(f"{error} {self._last_checkpoint()}") from None
-        except SimulatorError as error:
-            raise SimulatorError(f"{error} {self._last_checkpoint()}") from error.__cause__
-
-    def _last_checkpoint(self) -> str:
-        paths = list_checkpoints(self.folder) if self.folder is not None else []
-        return f"Last good checkpoint: {paths[0] if paths else 'none was written yet'}."
 
 
 def _state_of(part: Any) -> dict[str, Any] | None:

@@ -1,0 +1,83 @@
+"""The names of runs' folders: the same for the same settings, and taken as they are everywhere."""
+
+import shlex
+from dataclasses import replace
+
+import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hypothesis import given
+from hypothesis import strategies as st
+
+from torchrl_l2c2.experiment import (
+    ExperimentConfig,
+    L2C2Config,
+    NoRegularizerConfig,
+    PPORPEConfig,
+    SACConfig,
+    TaskConfig,
+    UniformReplayConfig,
+)
+from torchrl_l2c2.experiment.config import GROUPS
+from torchrl_l2c2.experiment.naming import LONGEST, run_name
+
+SWINGUP = GROUPS["task"]["swingup"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "name"),
+    [
+        ({}, "swingup/ppo_rpe/l2c2/seed_0"),
+        ({"regularizer": NoRegularizerConfig(), "seed": 7}, "swingup/ppo_rpe/none/seed_7"),
+        ({"regularizer": L2C2Config(beta=0.2)}, "swingup/ppo_rpe/l2c2/beta-0.2/seed_0"),
+        # The algorithm, the replay buffer and the optimizer have a beta of their own.
+        ({"algorithm": PPORPEConfig(beta=0.2)}, "swingup/ppo_rpe/l2c2/algorithm.beta-0.2/seed_0"),
+        ({"compile": False, "num_workers": 2}, "swingup/ppo_rpe/l2c2/compile-false_num_workers-2"),
+        ({"algorithm": SACConfig(hidden=(8, 9))}, "swingup/sac/l2c2/hidden-8x9/seed_0"),
+        ({"replay": UniformReplayConfig()}, "swingup/ppo_rpe/l2c2/replay-uniform/seed_0"),
+        ({"task": TaskConfig("A:B/C v1", "A:B/C v1")}, "A-B-C-v1/ppo_rpe/l2c2/seed_0"),
+        ({"task": replace(SWINGUP, max_steps=9)}, "swingup/ppo_rpe/l2c2/max_steps-9/seed_0"),
+    ],
+)
+def test_a_name_has_what_is_not_usual(settings, name):
+    """Task, algorithm, regularizer, then settings other than usual, then the seed."""
+    assert run_name(ExperimentConfig(**settings)).startswith(name)
+
+
+def test_what_changes_no_number_changes_no_name():
+    """The same command with more episodes goes on in the same folder."""
+    other = ExperimentConfig(
+        task=replace(SWINGUP, episodes=400, solved_at=1.0),
+        logger=GROUPS["logger"]["tensorboard"],
+        test_episodes=3,
+        late_share=0.5,
+        threads=2,
+    )
+    assert run_name(other) == run_name(ExperimentConfig())
+
+
+@given(
+    beta=st.floats(0, 1e6),
+    env_id=st.text(min_size=1, max_size=200),
+    hidden=st.lists(st.integers(1, 999), min_size=1, max_size=40),
+)
+def test_shells_hydra_and_every_file_system_take_a_name_as_it_is(beta, env_id, hidden):
+    """Not quoted, not escaped, no longer than a file's name may be."""
+    name = run_name(
+        ExperimentConfig(
+            task=TaskConfig(env_id, env_id),
+            regularizer=L2C2Config(beta=beta),
+            algorithm=PPORPEConfig(hidden=tuple(hidden)),
+        )
+    )
+    assert shlex.quote(name) == name
+    (override,) = OverridesParser.create().parse_overrides([f"resume=outputs/{name}"])
+    assert override.value() == f"outputs/{name}" and not override.is_sweep_override()
+    for part in name.split("/"):
+        assert 0 < len(part) <= LONGEST and not part.endswith(".")
+
+
+def test_long_names_of_different_settings_differ():
+    """A hash of the whole stands for what is cut off."""
+    long = [tuple(range(100, 130)), (*range(100, 129), 7)]
+    names = {run_name(ExperimentConfig(algorithm=PPORPEConfig(hidden=h))) for h in long}
+    assert len(names) == 2

@@ -1,0 +1,156 @@
+"""Sweeps, stopped and continued: real processes, real signals."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from torchrl_l2c2.experiment.folder import list_checkpoints, load_checkpoint
+
+ROOT = Path(__file__).parent.parent
+SETTINGS = (
+    "task=gymnasium", "task.env_id=Pendulum-v1", "task.max_steps=50", "algorithm.updates=4",
+    "test_episodes=1", "checkpoint_interval=3600",
+)  # fmt: skip
+LAUNCHERS = {"basic": [], "joblib": ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]}
+
+
+def start(folder, *overrides):
+    """The command in a session of its own, as a terminal has one."""
+    folder.mkdir(exist_ok=True)
+    # Into a file: a pipe that nobody reads is full after some hundred lines of progress.
+    with open(folder / "said", "w") as output:
+        return subprocess.Popen(
+            [sys.executable, ROOT / "train.py", *overrides, *SETTINGS, f"outputs={folder / 'o'}"],
+            stdout=output,
+            stderr=output,
+            start_new_session=True,
+            env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)},
+        )
+
+
+def said(folder):
+    return (folder / "said").read_text()
+
+
+def wait_until(condition, seconds=120.0):
+    ends = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < ends, "it did not happen"
+        time.sleep(0.05)
+
+
+def alive(session):
+    """Processes of a session that are not yet gone."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = path.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(fields[3]) == session and fields[0] != "Z":
+            found.append(int(path.parent.name))
+    return found
+
+
+def runs(folder):
+    return {path.parent.name: path.parent for path in (folder / "o").rglob("config.json")}
+
+
+def episodes(folder):
+    return len((folder / "metrics.csv").read_text().splitlines()) - 1
+
+
+def begun(folder, least=1):
+    files = list((folder / "o").rglob("metrics.csv"))
+    return len(files) >= least and all(episodes(file.parent) >= 2 for file in files)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("launcher", LAUNCHERS)
+def test_an_interrupted_sweep_saves_ends_and_is_continued(tmp_path, launcher, number):
+    """Its running jobs save, no other one begins, no process stays; the same command goes on."""
+    length = ["-m", "task.episodes=3000", "seed=0,1,2", *LAUNCHERS[launcher], "compile=false"]
+    running = 2 if launcher == "joblib" else 1
+    process = start(tmp_path, *length)
+    wait_until(lambda: begun(tmp_path, running))
+    # Ctrl-C reaches all processes of the terminal.
+    send = os.killpg if number == signal.SIGINT else os.kill
+    send(process.pid, number)
+    wait_until(lambda: "finishing the episode, then saving" in said(tmp_path), 1.5)
+    assert process.wait(30) == 128 + number, said(tmp_path)
+    wait_until(lambda: not alive(process.pid), 5)
+    assert "Traceback" not in said(tmp_path)
+    assert f"{number.name} ended the sweep; the same command continues it." in said(tmp_path)
+    saved = {name: episodes(folder) for name, folder in runs(tmp_path).items()}
+    assert len(saved) == running
+    for folder in runs(tmp_path).values():
+        newest = list_checkpoints(folder)[0]
+        assert int(newest.stem.split("_")[1]) == episodes(folder)
+    longest = max(saved.values()) + 1
+    again = start(tmp_path, "-m", f"task.episodes={longest}", *length[2:])
+    assert again.wait(200) == 0, said(tmp_path)
+    assert {episodes(folder) for folder in runs(tmp_path).values()} == {longest}
+    assert said(tmp_path).count("continuing after episode") == running
+
+
+def test_ctrl_c_while_compiling_saves(tmp_path):
+    """The compiler does not hear it; the episode ends with its updates, and is saved."""
+    process = start(tmp_path, "task.episodes=100", "seed=9", f"algorithm.kappa={random.random()}")
+    wait_until(lambda: "compiling" in said(tmp_path) and len(alive(process.pid)) > 1)
+    time.sleep(1)
+    os.killpg(process.pid, signal.SIGINT)
+    wait_until(lambda: "finishing the episode, then saving" in said(tmp_path), 3)
+    assert process.wait(200) == 128 + signal.SIGINT, said(tmp_path)
+    assert "SIGINT ended the training after episode" in said(tmp_path)
+    (folder,) = runs(tmp_path).values()
+    assert list_checkpoints(folder)
+    wait_until(lambda: not alive(process.pid), 10)
+
+
+def test_the_failed_jobs_of_a_sweep_are_named_at_its_end(tmp_path):
+    """Each in a line with its reason, after everything else; the others are finished."""
+    wrong = "regularizer.sigma=-1,1"
+    process = start(tmp_path, "-m", "task.episodes=2", wrong, *LAUNCHERS["joblib"], "compile=false")
+    assert process.wait(120) == 1, said(tmp_path)
+    last = said(tmp_path).splitlines()[-1]
+    assert last.startswith("failed: ") and "regularizer.sigma=-1" in last
+    assert "sigma must be greater than 0, got -1" in last and "Traceback" not in said(tmp_path)
+    assert len(list((tmp_path / "o").rglob("evaluation.json"))) == 1
+
+
+def numbers(folder):
+    state = load_checkpoint(list_checkpoints(folder)[0])["loss"]
+    return {name: value.tolist() for name, value in state.items() if hasattr(value, "tolist")}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sweep", [False, True], ids=("single", "joblib"))
+def test_what_is_ended_at_random_times_ends_with_the_same_numbers(tmp_path, sweep):
+    """Twenty SIGKILLs, SIGTERMs and Ctrl-Cs, and then the same command to the end."""
+    choose = random.Random(0)
+    command = ["-m", "seed=0,1,2,3", *LAUNCHERS["joblib"]] if sweep else []
+    command += ["task.episodes=400", "checkpoint_interval=0.5", "compile=false"]
+    undisturbed = start(tmp_path / "undisturbed", *command)
+    assert undisturbed.wait(580) == 0, said(tmp_path / "undisturbed")
+    folder = tmp_path / "ended"
+    for _ in range(20):
+        process = start(folder, *command)
+        time.sleep(choose.uniform(1, 14))
+        number = choose.choice((signal.SIGKILL, signal.SIGTERM, signal.SIGINT))
+        if number == signal.SIGINT:
+            os.killpg(process.pid, number)
+        else:
+            process.send_signal(number)
+        process.wait(60)
+        wait_until(lambda pid=process.pid: not alive(pid), 20)
+    assert start(folder, *command).wait(580) == 0, said(folder)
+    ours, theirs = runs(folder), runs(tmp_path / "undisturbed")
+    assert ours.keys() == theirs.keys() and len(ours) == (4 if sweep else 1)
+    for seed, run in ours.items():
+        assert numbers(run) == numbers(theirs[seed]), seed

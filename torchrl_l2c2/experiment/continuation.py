@@ -1,0 +1,135 @@
+"""Whether a run goes on from a checkpoint, and from which."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import warnings
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from torchrl_l2c2.experiment.config import (
+    FREE_SETTINGS,
+    FREE_TASK_SETTINGS,
+    ExperimentConfig,
+    OtherRunError,
+)
+from torchrl_l2c2.experiment.folder import CheckpointError, list_checkpoints, load_newest, versions
+from torchrl_l2c2.experiment.player import SimulatorError
+from torchrl_l2c2.experiment.tasks import Budget
+
+MISSING = "none, as it is a setting since"
+
+
+def check_same_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Refuses to continue a run with settings that would change its numbers.
+
+    Raises:
+        OtherRunError: names the first setting that differs, with both values.
+    """
+    for group in sorted((saved.keys() | now.keys()) - FREE_SETTINGS):
+        was, is_now = saved.get(group, MISSING), now.get(group, MISSING)
+        pairs = {group: (was, is_now)}
+        if isinstance(was, Mapping) and isinstance(is_now, Mapping):
+            free = FREE_TASK_SETTINGS if group == "task" else set()
+            names = sorted((was.keys() | is_now.keys()) - free)
+            pairs = {f"{group}.{n}": (was.get(n, MISSING), is_now.get(n, MISSING)) for n in names}
+        for name, (before, after) in pairs.items():
+            # As JSON, where a tuple and a list are the same.
+            if json.dumps(before) != json.dumps(after):
+                raise OtherRunError(
+                    f"this folder's checkpoint was made with {name}={before}, not {after}: "
+                    "choose another folder, or delete this one. Nothing was changed."
+                )
+
+
+def check_same_versions(saved: Mapping[str, str], now: Mapping[str, str]) -> None:
+    """Refuses to continue a run with versions of packages that may give other numbers.
+
+    A package that is there only now or was there only then is passed over: what a run needs of it
+    fails without it.
+
+    Raises:
+        OtherRunError: names all that differ, with both versions.
+    """
+    differing = [f"{n} {saved[n]}, now {now[n]}" for n in now if saved.get(n, now[n]) != now[n]]
+    if differing:
+        raise OtherRunError(
+            f"this folder's checkpoint was made with {'; '.join(differing)}: the numbers may "
+            "differ from those of a run in one go. allow_other_versions=True continues all the "
+            "same. Nothing was changed."
+        )
+
+
+def check_length(asked: Budget, played: int) -> None:
+    """Refuses to be asked for fewer episodes than a run already has.
+
+    Raises:
+        OtherRunError: with both numbers.
+    """
+    if asked.unit == "episode" and asked.total < played:
+        raise OtherRunError(
+            f"episodes={asked.total} is fewer than the {played} that this run already has: ask for "
+            "as many or more, or choose another folder. Nothing was changed."
+        )
+
+
+def find_checkpoint(
+    folder: Path | None, elsewhere: str | Path | None
+) -> tuple[Path, dict[str, Any]] | None:
+    """The checkpoint that a run in a folder goes on from, with its path.
+
+    The folder's own comes first: the same command again continues what it began.
+
+    Raises:
+        CheckpointError: there are checkpoints, but none can be read; none is where it was to be.
+    """
+    found = None if folder is None else load_newest(folder)
+    if found is None and elsewhere is not None:
+        found = load_newest(elsewhere)
+        if found is None:
+            raise CheckpointError(f"resume={str(elsewhere)!r} holds no checkpoint_*.pt.")
+    if found is None:
+        return None
+    path, state, damaged = found
+    for message in damaged:
+        warnings.warn(f"{message} The one before it is used.", stacklevel=5)
+    return path, state
+
+
+def check_continuable(
+    state: Mapping[str, Any], config: ExperimentConfig, *, allow_other_versions: bool
+) -> None:
+    """Refuses a checkpoint that a run with these settings, here and now, cannot go on from.
+
+    Raises:
+        OtherRunError: other settings, fewer episodes than there are, or other versions.
+    """
+    check_same_settings(json.loads(state["config"]), config.to_dict())
+    check_length(config.task.budget, len(json.loads(state["metrics"])))
+    try:
+        # Checkpoints of earlier releases do not say.
+        check_same_versions(json.loads(state.get("versions", "{}")), versions())
+    except OtherRunError as error:
+        if not allow_other_versions:
+            raise
+        warnings.warn(str(error), stacklevel=5)
+
+
+@contextlib.contextmanager
+def checkpoint_named(folder: Path | None) -> Iterator[None]:
+    """Errors that end a training say from where it can go on."""
+    try:
+        yield
+    except FloatingPointError as error:
+        raise FloatingPointError(f"{error} {_last_checkpoint(folder)}") from None
+    except SimulatorError as error:
+        raise SimulatorError(f"{error} {_last_checkpoint(folder)}") from error.__cause__
+    except OSError as error:
+        raise OSError(f"{error}. {_last_checkpoint(folder)}") from error
+
+
+def _last_checkpoint(folder: Path | None) -> str:
+    paths = list_checkpoints(folder) if folder is not None else []
+    return f"Last good checkpoint: {paths[0] if paths else 'none was written yet'}."

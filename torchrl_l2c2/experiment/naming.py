@@ -1,0 +1,90 @@
+"""What a run's folder is called: its task, algorithm and regularizer, then what is not usual in it.
+
+Names are taken as they are by shells, Hydra's command line and every file system, and are the same
+for single runs and sweeps. The whole of the settings is in the folder's ``config.json``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import PurePosixPath
+from typing import Any
+
+from torchrl_l2c2.experiment.config import (
+    FREE_SETTINGS,
+    FREE_TASK_SETTINGS,
+    GROUPS,
+    ExperimentConfig,
+)
+from torchrl_l2c2.experiment.tasks import TaskConfig
+
+LONGEST = 64
+
+
+def run_name(config: ExperimentConfig) -> str:
+    """The path of a run's folder below ``outputs``.
+
+    Args:
+        config (ExperimentConfig): its settings.
+
+    Returns:
+        str: ``task/algorithm/regularizer/setting-value_setting-value/seed_0``, of letters, digits
+        and ``.+-_`` alone; without the fourth part where every setting is the usual one. Too long
+        a part is cut, and a hash of the whole stands for the rest.
+
+    Examples:
+        >>> from torchrl_l2c2.experiment import ExperimentConfig, L2C2Config
+        >>> run_name(ExperimentConfig(regularizer=L2C2Config(beta=0.2, sigma=2.0), seed=3))
+        'swingup/ppo_rpe/l2c2/sigma-2.0_beta-0.2/seed_3'
+    """
+    chosen = [getattr(config, group).name for group in ("task", "algorithm", "regularizer")]
+    unusual = [f"{_plain(name)}-{_plain(value)}" for name, value in _unusual(config)]
+    parts = [*map(_plain, chosen), *(["_".join(unusual)] if unusual else []), f"seed_{config.seed}"]
+    return str(PurePosixPath(*map(_short, parts)))
+
+
+def _unusual(config: ExperimentConfig) -> Iterator[tuple[str, Any]]:
+    """The settings that change a run's numbers and are not those of its choices."""
+    usual_names = {
+        "replay": config.algorithm.usual_replay,
+        "optimizer": config.algorithm.usual_optimizer,
+    }
+    names = Counter(name for group in GROUPS for name in vars(getattr(config, group)))
+    for group in sorted(GROUPS.keys() - FREE_SETTINGS):
+        chosen = getattr(config, group)
+        if chosen.name != usual_names.get(group, chosen.name):
+            yield group, chosen.name
+        usual = _usual(group, chosen)
+        for name, value in vars(chosen).items():
+            free = name == "name" or (group == "task" and name in FREE_TASK_SETTINGS)
+            if not free and value != getattr(usual, name):
+                alone = group == "regularizer" or names[name] == 1
+                yield name if alone else f"{group}.{name}", value
+    usual = ExperimentConfig()
+    for name in sorted(vars(config).keys() - GROUPS.keys() - FREE_SETTINGS - {"seed"}):
+        if getattr(config, name) != getattr(usual, name):
+            yield name, getattr(config, name)
+
+
+def _usual(group: str, chosen: Any) -> Any:
+    """What ``group=name`` chooses; for a task of one's own, its id with nothing else set."""
+    if group == "task" and chosen.name not in GROUPS[group]:
+        return TaskConfig(chosen.name, chosen.env_id)
+    return GROUPS[group][chosen.name]
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, tuple):
+        return "x".join(map(_plain, value))
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    return re.sub(r"[^A-Za-z0-9.+_-]+", "-", str(value)).rstrip(".")
+
+
+def _short(part: str) -> str:
+    if len(part) <= LONGEST:
+        return part
+    return f"{part[: LONGEST - 9]}_{hashlib.sha256(part.encode()).hexdigest()[:8]}"

@@ -1,0 +1,129 @@
+"""What the jobs of a sweep and the process that began it tell each other.
+
+A folder in the system's temporary one holds it: whether the sweep is to stop, and what failed.
+"""
+
+from __future__ import annotations
+
+import _thread
+import contextlib
+import json
+import os
+import signal
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from torchrl_l2c2.experiment.signals import FINISHING, SAME_SIGNAL_SECONDS, terminate
+
+VARIABLE = "TORCHRL_L2C2_SWEEP"  # of the environment, which a launcher's processes inherit
+POLL_SECONDS = 0.2
+
+
+class Sweep:
+    """A sweep, as the process that began it and its jobs see it.
+
+    Attributes:
+        begun_by: the process that began it.
+        job_is_here: whether a job runs in this process, which began the sweep.
+    """
+
+    job_is_here = False
+
+    def __init__(self, folder: Path, begun_by: int) -> None:
+        self._folder, self.begun_by = folder, begun_by
+
+    @classmethod
+    def of_this_job(cls) -> Sweep:
+        """The sweep that this job belongs to."""
+        folder, begun_by = json.loads(os.environ[VARIABLE])
+        return cls(Path(folder), begun_by)
+
+    @property
+    def stopped_by(self) -> int | None:
+        """The signal that stopped it; ``None`` where it goes on."""
+        path = self._folder / "stopped"
+        return int(path.read_text()) if path.exists() else None
+
+    def stop(self, signal_number: int) -> None:
+        """No job is to begin any more; those that train are to save and end."""
+        if self.stopped_by is not None:
+            return
+        partial = self._folder / f"stopped.{os.getpid()}"
+        partial.write_text(str(signal_number))
+        partial.replace(self._folder / "stopped")
+
+    def add_failure(self, job: str, reason: str) -> None:
+        """Keeps why a job failed until the sweep's end."""
+        with open(self._folder / "failed", "a") as file:
+            file.write(json.dumps([job, reason]) + "\n")
+
+    @property
+    def failures(self) -> list[tuple[str, str]]:
+        """Jobs that failed, with the reason in one line."""
+        path = self._folder / "failed"
+        lines = path.read_text().splitlines() if path.exists() else []
+        return [(job, reason) for job, reason in map(json.loads, lines)]
+
+    @contextlib.contextmanager
+    def job(self) -> Iterator[None]:
+        """A job of the sweep runs within it: a stop ends it in order, wherever it is."""
+        if os.getpid() != self.begun_by:
+            with self._followed():
+                yield
+            return
+        Sweep.job_is_here = True
+        try:
+            yield
+        finally:
+            Sweep.job_is_here = False
+
+    @contextlib.contextmanager
+    def _followed(self) -> Iterator[None]:
+        """A stop reaches this process as SIGTERM, and it dies with the one that began the sweep."""
+        signal.signal(signal.SIGTERM, terminate)
+        ended = threading.Event()
+
+        def follow() -> None:
+            told = False
+            while not ended.wait(POLL_SECONDS):
+                if os.getppid() != self.begun_by:
+                    os._exit(1)
+                if not told and self.stopped_by is not None:
+                    told = True
+                    _thread.interrupt_main(signal.SIGTERM)
+
+        follower = threading.Thread(target=follow, daemon=True)
+        follower.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            follower.join()
+
+
+@contextlib.contextmanager
+def begin_sweep() -> Iterator[Sweep]:
+    """Begins a sweep in this process: the first Ctrl-C or SIGTERM stops it in order."""
+    with tempfile.TemporaryDirectory(prefix="torchrl_l2c2_") as folder:
+        sweep, first = Sweep(Path(folder), os.getpid()), 0.0
+
+        def receive(number: int, frame: Any) -> None:
+            nonlocal first
+            if sweep.stopped_by is None:
+                first = time.monotonic()
+                sweep.stop(number)
+                if Sweep.job_is_here:  # and not training, where it has a handler of its own
+                    terminate(number, frame)
+                print(f"\n{FINISHING}; once more: at once", file=sys.stderr, flush=True)
+            elif time.monotonic() - first > SAME_SIGNAL_SECONDS:
+                terminate(number, frame)
+
+        os.environ[VARIABLE] = json.dumps([folder, os.getpid()])
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, receive)
+        yield sweep
