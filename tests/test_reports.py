@@ -214,6 +214,16 @@ class TestGroups:
         _, last = results_tables(groups)
         assert any("runs of 10 episodes and of 20 episodes are rows" in note for note in last.notes)
 
+    def test_runs_of_several_versions_are_pooled_and_told(self, records):
+        """Their numbers may differ for no other reason."""
+        ours = [r for r in records if (r.task, r.method) == ("swingup", "caps")]
+        groups = group_records([*ours[:-1], replace(ours[-1], commit="")])
+        (group,) = groups
+        assert group.seeds == [0, 1, 2, 3, 4]
+        _, last = results_tables(groups)
+        told = "swingup, ppo_rpe, CAPS: runs of more than one commit (abc, unknown) are pooled."
+        assert told in last.notes
+
     def test_unfinished_failed_and_damaged_folders_are_counted_and_named(self, tmp_path):
         """None is passed over in silence, and none stops the others from being read."""
         make_run(tmp_path / "good", make_config(), 1.0, 0.1)

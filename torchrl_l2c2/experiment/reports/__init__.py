@@ -5,8 +5,9 @@ their tables and writes a report; ``--help`` says what else it does.
 """
 
 from torchrl_l2c2.experiment.reports.figures import draw_learning_curves, draw_plane
+from torchrl_l2c2.experiment.reports.groups import Group, group_records
 from torchrl_l2c2.experiment.reports.page import write_report
-from torchrl_l2c2.experiment.reports.paper import PAPER
+from torchrl_l2c2.experiment.reports.paper import PAPER, Published
 from torchrl_l2c2.experiment.reports.records import (
     FIGURES,
     QUANTITIES,
@@ -33,12 +34,15 @@ __all__ = [
     "QUANTITIES",
     "FinishedRun",
     "Found",
+    "Group",
+    "Published",
     "Record",
     "compare_with_paper",
     "draw_learning_curves",
     "draw_plane",
     "find_runs",
     "finished_run",
+    "group_records",
     "read_records",
     "read_runs",
     "sweep_summary",

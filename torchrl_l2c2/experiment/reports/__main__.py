@@ -65,21 +65,21 @@ def _parser() -> argparse.ArgumentParser:
 
 def _report(chosen: argparse.Namespace) -> None:
     records, runs, notes = _read(chosen)
-    if chosen.score:
-        print(score_table(readings(group_records(records))).markdown())
-    elif records:
-        tables = results_tables(group_records(records))
-        print("\n\n".join([*(table.markdown() for table in tables), *notes]))
+    written = []
     if chosen.csv:
         write_records(chosen.csv, merge(read_records(chosen.csv), records))
-        print(f"\nrecords: {chosen.csv}")
+        written.append(f"records: {chosen.csv}")
     if chosen.readme:
         fill_readme(chosen.readme, records)
-        print(f"\nresults: {chosen.readme}")
+        written.append(f"results: {chosen.readme}")
     alone = not (chosen.records or chosen.csv or chosen.score or chosen.readme)
     if chosen.output or alone:
         folder = Path(chosen.output or Path(chosen.folders[0]) / "report")
-        print(f"\nreport: {write_report(folder, records, runs, notes)}")
+        written.append(f"report: {write_report(folder, records, runs, notes)}")
+    groups = group_records(records)
+    tables = [score_table(readings(groups))] if chosen.score else results_tables(groups)
+    # Last: who reads but the first lines of it has the files all the same.
+    print("\n\n".join([*(table.markdown() for table in tables), *notes, *written]))
 
 
 def _read(

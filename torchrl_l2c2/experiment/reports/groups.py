@@ -80,15 +80,30 @@ def baseline_of(group: Group, groups: Iterable[Group]) -> Group | None:
 
 def differing_lengths(groups: Sequence[Group]) -> list[str]:
     """A line for every kind of run that was trained for different lengths, which is not pooled."""
-    lengths: dict[tuple[str, str], list[Group]] = defaultdict(list)
+    lengths: dict[tuple[str, ...], list[Group]] = defaultdict(list)
     for group in groups:
-        lengths[group.first.method, group.first.settings].append(group)
+        # A run's identity without its length and seed.
+        lengths[tuple(map(str, group.first.identity[:-2]))].append(group)
     return [
         f"{same[0].first.task}, {same[0].first.algorithm}, {method_name(same[0].first.method)}: "
         f"runs of {' and of '.join(group.first.length for group in same)} are rows of their own"
         for same in lengths.values()
         if len(same) > 1
     ]
+
+
+def differing_versions(groups: Sequence[Group]) -> list[str]:
+    """A line for every group whose runs were made by several versions, which are pooled."""
+    lines = []
+    for group in groups:
+        for name in ("torch", "torchrl", "commit"):
+            found = sorted({str(getattr(r, name)) or "unknown" for r in group.records})
+            if len(found) > 1:
+                what = f"{group.first.task}, {group.first.algorithm}, {group.name}"
+                lines.append(
+                    f"{what}: runs of more than one {name} ({', '.join(found)}) are pooled"
+                )
+    return lines
 
 
 def common_settings(groups: Sequence[Group]) -> dict[str, str]:

@@ -8,7 +8,12 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from torchrl_l2c2.experiment.reports.groups import Group, common_settings, differing_lengths
+from torchrl_l2c2.experiment.reports.groups import (
+    Group,
+    common_settings,
+    differing_lengths,
+    differing_versions,
+)
 from torchrl_l2c2.experiment.reports.paper import method_name
 from torchrl_l2c2.experiment.reports.records import FIGURES, QUANTITIES, Record
 from torchrl_l2c2.experiment.reports.score import COMPARED, Reading
@@ -93,7 +98,7 @@ def _results(
 
 
 def settings_notes(groups: Sequence[Group]) -> list[str]:
-    """What the runs' settings are beyond the defaults, and which lengths were not pooled."""
+    """What the runs' settings are beyond the defaults, and which lengths and versions they have."""
     notes = []
     for task, algorithm in dict.fromkeys((g.first.task, g.first.algorithm) for g in groups):
         together = [g for g in groups if (g.first.task, g.first.algorithm) == (task, algorithm)]
@@ -101,7 +106,8 @@ def settings_notes(groups: Sequence[Group]) -> list[str]:
         if shared:
             settings = ", ".join(f"`{name}={value}`" for name, value in shared.items())
             notes.append(f"{task}, {algorithm}, other than the defaults in every row: {settings}.")
-    return notes + [f"{line}." for line in differing_lengths(groups)]
+    told = [*differing_lengths(groups), *differing_versions(groups)]
+    return notes + [f"{line}." for line in told]
 
 
 def runs_table(records: Sequence[Record]) -> Table:
