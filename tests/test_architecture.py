@@ -35,12 +35,12 @@ experiment.algorithms.__init__
 experiment.config
 experiment.naming experiment.continuation experiment.workers
 experiment.evaluate experiment.update experiment.player experiment.manual
-experiment.learner
+experiment.learner experiment.best_policy
 experiment.schedules
 experiment.training
 experiment.command
 experiment.__init__
-experiment.__main__
+experiment.__main__ __main__
 """.strip().splitlines()
 RANK = {module: rank for rank, line in enumerate(LAYERS) for module in line.split()}
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import json
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from torchrl_l2c2.experiment.best_policy import BestPolicy
 from torchrl_l2c2.experiment.compilation import compiler_available
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.continuation import (
@@ -22,6 +22,7 @@ from torchrl_l2c2.experiment.continuation import (
 from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
 from torchrl_l2c2.experiment.evaluate import Evaluation, LateTests, evaluate_policy
 from torchrl_l2c2.experiment.folder import (
+    README,
     MetricsLog,
     list_checkpoints,
     make_folder,
@@ -35,7 +36,7 @@ from torchrl_l2c2.experiment.learner import Learner
 from torchrl_l2c2.experiment.lock import lock_folder
 from torchrl_l2c2.experiment.player import Episode, Player, SimulatorError
 from torchrl_l2c2.experiment.process import ProcessState
-from torchrl_l2c2.experiment.progress import Progress
+from torchrl_l2c2.experiment.progress import Progress, say
 from torchrl_l2c2.experiment.replay import load_replay_state, replay_state
 from torchrl_l2c2.experiment.reports import FinishedRun, write_results
 from torchrl_l2c2.experiment.schedules import SCHEDULES
@@ -110,6 +111,7 @@ class Experiment:
             self.player = Player(collector, self.agent, config.task.env_id)
         self.metrics: list[dict[str, float]] = []
         self._late_tests = LateTests(config.task, config.seed, self.agent.policy, self._compile)
+        self._best_policy = BestPolicy(config, self.agent.policy, self.folder)
         # Only now, as what was refused above leaves no folder.
         if self.folder is not None:
             self._unlock = lock_folder(make_folder(self.folder), self)
@@ -147,13 +149,13 @@ class Experiment:
         algorithm, saved = self.config.algorithm, time.monotonic()
         schedule = SCHEDULES[algorithm.schedule](self.player, self.learner, algorithm)
         compiles = self._compile and self.agent.compilable and not self.learner.updates
-        bar = Progress(
-            total, len(self.metrics), self.player.frames, shown=progress, compiles=compiles
-        )
+        done, frames = len(self.metrics), self.player.frames
+        bar = Progress(total, done, frames, shown=progress, compiles=compiles, folder=self.folder)
         with self._process, bar, stop_on_signals() as signals, self._checkpoint_named():
             while len(self.metrics) < total:
                 episode = next(schedule)
                 self._write(self._row(episode, total), bar)
+                self._best_policy.after(len(self.metrics))
                 if not episode.ends_round:
                     continue
                 ended = len(self.metrics) >= total
@@ -193,6 +195,7 @@ class Experiment:
             "global_rng": self._process.state_dict(),
             "counters": [self.player.frames, learner.updates, learner.skipped_updates],
             "metrics": json.dumps(self.metrics),
+            "best_policy": self._best_policy.state_dict(),
             "metrics_log": self._log.state_dict(),
         }
 
@@ -214,6 +217,8 @@ class Experiment:
         self.player.frames, learner.updates, learner.skipped_updates = state["counters"]
         self.metrics = json.loads(state["metrics"])
         self._log.load_state_dict(state["metrics_log"])
+        if "best_policy" in state:  # Checkpoints of earlier releases have none.
+            self._best_policy.load_state_dict(state["best_policy"])
         # Some of the tensors that a compiled update was made for are others now.
         learner.renew()
         # Last: making and loading the above may have drawn from the global generators.
@@ -284,6 +289,7 @@ class Experiment:
         if self.folder is not None:
             write_json(self.folder / "config.json", self.config.to_dict())
             write_json(self.folder / "versions.json", versions())
+            (self.folder / "README.txt").write_text(README)
 
     def _resume(self, elsewhere: str | Path | None, allow_other_versions: bool) -> None:
         found = find_checkpoint(self.folder, elsewhere)
@@ -295,7 +301,7 @@ class Experiment:
             log = (path.parent / "metrics.csv").read_bytes()
             write_atomically(self.folder / "metrics.csv", log)
         self.load_state_dict(state)
-        print(f"continuing after episode {len(self.metrics)} from {path}", file=sys.stderr)
+        say(self.folder, f"continuing after episode {len(self.metrics)} from {path}")
 
     def _row(self, episode: Episode, total: int) -> dict[str, float]:
         number = len(self.metrics) + 1
