@@ -47,13 +47,13 @@ experiment.reports.__init__
 experiment.reports.__main__
 experiment.workers
 experiment.evaluate experiment.update experiment.player experiment.manual
-experiment.influence
+experiment.influence experiment.best_policy
 experiment.learner
 experiment.continuation experiment.schedules
 experiment.training
 experiment.command
 experiment.__init__
-experiment.__main__
+experiment.__main__ __main__
 """.strip().splitlines()
 RANK = {module: rank for rank, line in enumerate(LAYERS) for module in line.split()}
 

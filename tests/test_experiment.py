@@ -359,6 +359,9 @@ def test_a_run_from_the_command_line_leaves_everything_behind(tmp_path):
         rows = list(csv.DictReader(file))
     assert [row["frames"] for row in rows] == ["50", "100", "150"]
     assert {"return", "action_variation", "loss_l2c2_actor", "l2c2_gain"} <= set(rows[0])
+    assert run.folder.relative_to(tmp_path).as_posix() == (
+        "Pendulum-v1/ppo_rpe/l2c2/max_steps-50_compile-false/seed_0"
+    )
     assert "torchrl" in json.loads((run.folder / "versions.json").read_text())
     config = json.loads((run.folder / "config.json").read_text())
     assert ExperimentConfig.from_dict(config).task.env_id == "Pendulum-v1"
@@ -366,6 +369,53 @@ def test_a_run_from_the_command_line_leaves_everything_behind(tmp_path):
     assert list((run.folder / "tensorboard").glob("events*"))
     policy = torch.load(run.folder / "policy.pt", weights_only=True)
     make_actor(3, make_env(PENDULUM, 0).action_spec).load_state_dict(policy)
+
+
+def test_without_a_terminal_there_are_a_few_plain_lines(tmp_path):
+    """At each tenth, each once; train.log has them as well, and nothing of a refused command."""
+    overrides = [o for o in PENDULUM_OVERRIDES if not o.startswith("task.episodes")]
+    overrides += ["task.episodes=40", "algorithm.updates=1", "test_episodes=0"]
+    done = run_train(*overrides, folder=tmp_path)
+    shown = [line for line in done.stderr.splitlines() if line.startswith("episode ")]
+    assert [line.split(":")[0] for line in shown] == [f"episode {n} of 40" for n in range(4, 41, 4)]
+    assert "\r" not in done.stderr
+    (log,) = tmp_path.rglob("train.log")
+    for line in shown:
+        assert line in log.read_text()
+    # Without test episodes there is a policy, and no result.
+    assert (log.parent / "policy.pt").exists() and not (log.parent / "evaluation.json").exists()
+    written = log.read_bytes()
+    failed = run_train(*overrides, "task.episodes=20", folder=tmp_path, check=False)
+    assert failed.returncode == 1 and "episodes=20 is fewer than the 40" in failed.stderr
+    assert log.read_bytes() == written
+
+
+BROKEN_TASK = """
+import gymnasium
+from gymnasium.envs.classic_control.pendulum import PendulumEnv
+class Broken(PendulumEnv):
+    steps = 0
+    def step(self, action):
+        self.steps += 1
+        if self.steps == 60:
+            self.lower_the_boom()
+        return super().step(action)
+    def lower_the_boom(self):
+        raise KeyError("boom")
+gymnasium.register("Broken-v0", entry_point=Broken)
+"""
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_an_error_of_the_users_own_task_is_shown_with_its_lines(tmp_path, monkeypatch, workers):
+    """Also where it happened in another process."""
+    (tmp_path / "broken_task.py").write_text(BROKEN_TASK)
+    monkeypatch.setenv("PYTHONPATH", f"{ROOT}{os.pathsep}{tmp_path}")
+    settings = ["task.env_id=broken_task:Broken-v0", "task.episodes=4", f"num_workers={workers}"]
+    done = run_train(*PENDULUM_OVERRIDES, *settings, folder=tmp_path, check=False)
+    assert done.returncode == 1
+    assert 'broken_task.py", line 9, in step' in done.stderr and "lower_the_boom" in done.stderr
+    assert "boom" in done.stderr.splitlines()[-1] and done.stderr.splitlines()[-1].startswith("err")
 
 
 def test_a_sweep_gives_one_table(tmp_path):
@@ -410,7 +460,7 @@ def test_a_wrong_setting_ends_with_one_clear_line(tmp_path, overrides, message):
     assert "Traceback" not in failed.stderr
     assert failed.stderr.strip().splitlines()[-1].startswith("error: ")
     assert message in failed.stderr
-    assert not list(tmp_path.rglob("metrics.csv"))
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,10 @@
 """The package as a whole: its style, what importing it needs, and what it says of itself."""
 
+import re
 import subprocess
 import sys
 import tomllib
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -38,6 +40,24 @@ def test_importing_the_components_needs_nothing_of_the_experiment():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_the_package_says_what_there_is_without_torch():
+    """Commands that exist."""
+    code = "import runpy, sys; runpy.run_module('torchrl_l2c2'); print('torch' in sys.modules)"
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            code.replace("'torchrl_l2c2'", "'torchrl_l2c2', run_name='__main__'"),
+        ],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.endswith("False\n")
+    for command in re.findall(r"python -m (\S+)", done.stdout):
+        assert find_spec(command), command
 
 
 def test_importing_the_package_puts_off_what_it_exports():

@@ -11,7 +11,8 @@ import signal
 import sys
 import traceback
 import warnings
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl_l2c2.experiment.config import GROUPS, ExperimentConfig, OtherRunError
 from torchrl_l2c2.experiment.manual import manual
 from torchrl_l2c2.experiment.naming import run_name
+from torchrl_l2c2.experiment.progress import log
 from torchrl_l2c2.experiment.settings import SettingError, describe
 from torchrl_l2c2.experiment.signals import (
     Interrupted,
@@ -178,12 +180,26 @@ def run(values: dict[str, Any]) -> None:
     finished = finished_run(folder, config.to_dict())
     if finished is None:
         going_on = {name: values[name] for name in ("resume", "allow_other_versions")}
-        with closing(Experiment(config, folder, **going_on)) as experiment:
+        with closing(Experiment(config, folder, **going_on)) as experiment, _end_logged(folder):
             experiment.train(progress=True)
             if not config.test_episodes:
                 save_policy(experiment.agent.policy, folder / "policy.pt")
                 return
             tests = [experiment.test(sampled=s, progress=True) for s in (False, True)]
             finished = experiment.finish(*tests)
+            log(folder, f"finished:\n{compare_with_paper(finished)}")
     print(compare_with_paper(finished))
     print(f"picture: {folder / 'learning_curves.png'}", flush=True)
+
+
+@contextmanager
+def _end_logged(folder: Path) -> Iterator[None]:
+    """What ends a run early is in its ``train.log`` too."""
+    try:
+        yield
+    except (Interrupted, KeyboardInterrupt) as interruption:
+        log(folder, str(interruption) or "interrupted")
+        raise
+    except Exception as error:
+        log(folder, "".join(traceback.format_exception(error)))
+        raise

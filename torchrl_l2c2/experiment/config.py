@@ -92,6 +92,12 @@ class ExperimentConfig:
         description="episodes played with the policy's mean after training; 0: none, and no "
         "evaluation.json",
     )
+    evaluate_every: int = Field(
+        default=0,
+        ge=0,
+        description="episodes of training from one test to the next, of 10 episodes; "
+        "policy_best.pt is the best one's policy; 0: none",
+    )
     late_share: float = Field(
         default=0.1,
         ge=0,
@@ -201,6 +207,7 @@ FREE_SETTINGS = {
     "logger",
     "test_episodes",
     "late_share",
+    "evaluate_every",
     "threads",
     "checkpoint_interval",
     "checkpoint_keep",

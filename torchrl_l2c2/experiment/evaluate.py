@@ -11,7 +11,7 @@ import math
 import statistics
 import sys
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
@@ -23,7 +23,7 @@ from tqdm import tqdm
 from torchrl_l2c2.experiment.collection import EpisodeCollector
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
-from torchrl_l2c2.experiment.folder import load_newest
+from torchrl_l2c2.experiment.folder import load_newest, write_json
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.tasks import TaskConfig
 from torchrl_l2c2.metrics import action_variation
@@ -102,7 +102,9 @@ def evaluate_policy(
         exploration_type=ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC,
     )
     name = "test, sampled" if sampled else "test"
-    bar = tqdm(range(episodes), name, unit="episode", disable=not progress, leave=False)
+    bar = tqdm(
+        range(episodes), name, unit="episode", disable=None if progress else True, leave=False
+    )
     for _ in bar:
         episode = collector.rollout()
         actions = mean_actions(policy, episode) if sampled else episode["action"]
@@ -177,27 +179,61 @@ def _variation(actions: torch.Tensor) -> float:
     return action_variation(actions.float()).item() if actions.shape[-2] > 1 else 0.0
 
 
-def load_policy(folder: str | Path) -> tuple[TensorDictModule, EnvBase, int]:
+def load_policy(
+    folder: str | Path,
+    *,
+    seed: int | None = None,
+    noise_scale: float | None = None,
+    best: bool = False,
+) -> tuple[TensorDictModule, EnvBase, int]:
     """A run's acting policy and a fresh environment of its task, from its folder alone.
+
+    The policy is a TorchRL actor: it reads ``"observation"`` and writes ``"action"``, the mean
+    under ``set_exploration_type(ExplorationType.DETERMINISTIC)`` and a sample otherwise.
 
     Args:
         folder (str or Path): of a run, finished or not.
+
+    Keyword Args:
+        seed (int, optional): of the environment and its noise. Default: that of the run's test.
+        noise_scale (float, optional): of the environment's noise; larger values are harder.
+            Default: the task's.
+        best (bool): whether to take the best policy of the tests during training, where
+            ``evaluate_every`` had some, instead of the last. Default ``False``.
 
     Returns:
         The policy, the environment and the longest episode.
 
     Raises:
-        FileNotFoundError: the folder is not a run's, or holds neither a policy nor a checkpoint.
+        FileNotFoundError: the folder is not a run's, or holds no such policy nor a checkpoint.
         CheckpointError: its checkpoints are damaged.
+        SettingError: a scale of noise below zero.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_l2c2.experiment import Experiment, ExperimentConfig, TaskConfig
+        >>> task = TaskConfig("pendulum", "Pendulum-v1", episodes=1, max_steps=20)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     experiment = Experiment(ExperimentConfig(task=task, compile=False), folder)
+        ...     _ = experiment.train()
+        ...     policy, env, max_steps = load_policy(folder, seed=1)
+        ...     experiment.close()
+        >>> env.rollout(max_steps, policy)["action"].shape
+        torch.Size([20, 1])
     """
     folder = Path(folder)
     if not (folder / "config.json").exists():
         raise FileNotFoundError(f"{str(folder)!r} is not the folder of a run: no config.json.")
     config = ExperimentConfig.from_dict(json.loads((folder / "config.json").read_text()))
-    env = make_env(config.task, config.seed + TEST_SEED)
+    noise = config.task.noise_scale if noise_scale is None else noise_scale
+    task = replace(config.task, noise_scale=noise)
+    env = make_env(task, config.seed + TEST_SEED if seed is None else seed)
     agent = config.make_agent(env)
-    if (folder / "policy.pt").exists():
-        agent.policy.load_state_dict(torch.load(folder / "policy.pt", weights_only=True))
+    saved = folder / ("policy_best.pt" if best else "policy.pt")
+    if saved.exists():
+        agent.policy.load_state_dict(torch.load(saved, weights_only=True))
+    elif best:
+        raise FileNotFoundError(f"{str(saved)!r} does not exist; evaluate_every=N makes it.")
     elif newest := load_newest(folder):
         agent.loss.load_state_dict(newest[1]["loss"])
     else:
@@ -212,18 +248,28 @@ def main(arguments: Iterable[str] | None = None) -> None:
     )
     parser.add_argument("folder", help="a run's folder, finished or not")
     parser.add_argument("--episodes", type=int, default=100, help="how many (default: 100)")
+    parser.add_argument("--seed", type=int, help="of all randomness (default: the test's own)")
+    parser.add_argument("--noise", type=float, help="on observations (default: the task's)")
     parser.add_argument("--sampled", action="store_true", help="act with samples, as in training")
+    parser.add_argument("--best", action="store_true", help="policy_best.pt instead of policy.pt")
+    parser.add_argument("--output", help="a JSON file for the summary and every episode")
     chosen = parser.parse_args(arguments)
     try:
-        policy, env, max_steps = load_policy(chosen.folder)
-        result = evaluate_policy(
-            policy,
-            env,
-            chosen.episodes,
-            max_steps=max_steps,
-            sampled=chosen.sampled,
-            progress=True,
+        policy, env, max_steps = load_policy(
+            chosen.folder, seed=chosen.seed, noise_scale=chosen.noise, best=chosen.best
         )
+        with ProcessState(chosen.seed or 0):
+            result = evaluate_policy(
+                policy,
+                env,
+                chosen.episodes,
+                max_steps=max_steps,
+                sampled=chosen.sampled,
+                progress=True,
+            )
+        if chosen.output:
+            played = {"arguments": vars(chosen), "summary": result.summary()}
+            write_json(chosen.output, {**played, "episodes": asdict(result)})
     except (ValueError, OSError, RuntimeError) as error:
         sys.exit(f"error: {error}")
     print(json.dumps(result.summary(), indent=2))

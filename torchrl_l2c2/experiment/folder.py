@@ -37,6 +37,30 @@ MAGIC = b"torchrl_l2c2\n"
 FORMAT_VERSION = 1
 HEADER = struct.Struct(f"<{len(MAGIC)}sI32s")
 PATTERN = "checkpoint_*.pt"
+README = """\
+A run of torchrl_l2c2.
+
+config.json           every setting
+versions.json         of the packages that decide the numbers
+metrics.csv           a line per training episode
+train.log             what the run said
+checkpoint_*.pt       what it continues from: the same command again, or resume=FOLDER
+policy.pt             the acting policy at the end of training, a state_dict
+policy_best.pt        the best one of evaluations.json, likewise (evaluate_every)
+evaluations.json      tests during training (evaluate_every)
+evaluation.json       test episodes at the end
+learning_curves.png   a picture of metrics.csv
+
+To load the policy, a TorchRL actor, with an environment of its task:
+
+    from torchrl_l2c2.experiment import load_policy
+    policy, env, max_steps = load_policy("path of this folder")
+    rollout = env.rollout(max_steps, policy)
+
+To play test episodes with it:
+
+    python -m torchrl_l2c2.experiment.evaluate FOLDER --episodes 100
+"""
 
 
 class CheckpointError(RuntimeError):
@@ -216,6 +240,13 @@ def save_policy(policy: torch.nn.Module, path: str | Path) -> None:
     content = io.BytesIO()
     torch.save({k: v.detach().clone() for k, v in policy.state_dict().items()}, content)
     write_atomically(path, content.getvalue())
+
+
+def write_settings(folder: Path, settings: Mapping[str, Any]) -> None:
+    """Writes what a run begins with: its settings, its versions, and what its files are."""
+    write_json(folder / "config.json", settings)
+    write_json(folder / "versions.json", {**versions(), "commit": code_commit()})
+    (folder / "README.txt").write_text(README)
 
 
 class MetricsLog:

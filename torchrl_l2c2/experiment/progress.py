@@ -1,4 +1,4 @@
-"""What a run shows while it trains."""
+"""What a run shows while it trains, and keeps in ``train.log``."""
 
 from __future__ import annotations
 
@@ -6,13 +6,33 @@ import statistics
 import sys
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from types import TracebackType
 
 from tqdm import tqdm
 
+LINE_SECONDS = 60.0
+
+
+def log(folder: Path | None, line: str) -> None:
+    """Adds a line, with the time, to the ``train.log`` of a run's folder."""
+    if folder is not None and folder.is_dir():
+        with open(folder / "train.log", "a", encoding="utf-8") as file:
+            file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {line}\n")
+
+
+def say(folder: Path | None, line: str) -> None:
+    """Shows a line, above a bar where there is one, and logs it."""
+    tqdm.write(line, file=sys.stderr)
+    sys.stderr.flush()
+    log(folder, line)
+
 
 class Progress:
     """A bar over the episodes or frames of a run, with what episodes were like lately.
+
+    Where there is no terminal it is lines, at each tenth of the run or a minute after the last one;
+    ``train.log`` has them in any case.
 
     Args:
         total (int): episodes or frames in all.
@@ -20,9 +40,10 @@ class Progress:
         frames (int): frames of an earlier call.
 
     Keyword Args:
-        shown (bool): whether there is a bar.
+        shown (bool): whether there is a bar, or lines.
         compiles (bool): whether the first updates wait for a compiler.
         unit (str): what is counted, ``"episode"`` or ``"frame"``. Default ``"episode"``.
+        folder (Path, optional): of the run.
     """
 
     def __init__(
@@ -34,14 +55,18 @@ class Progress:
         shown: bool,
         compiles: bool,
         unit: str = "episode",
+        folder: Path | None = None,
     ) -> None:
+        self._total, self._folder, self._shown, self._unit = total, folder, shown, unit
         self._started, self._first_frame = time.monotonic(), frames
-        self._waiting = shown and compiles
-        self._bar = tqdm(total=total, initial=done, unit=unit, disable=not shown)
+        self._last_line = self._started
+        self._waiting = compiles
+        # tqdm leaves the bar out where there is no terminal.
+        self._bar = tqdm(total=total, initial=done, unit=unit, disable=None if shown else True)
         self._column = {"episode": "episode", "frame": "frames"}[unit]
         self._done: float = done
         if self._waiting:
-            self._bar.set_postfix_str("compiling at the first updates, up to two minutes")
+            self._say("compiling at the first updates, up to two minutes")
 
     def __enter__(self) -> Progress:
         return self
@@ -60,14 +85,26 @@ class Progress:
 
     def show(self, rows: Sequence[dict[str, float]], first_update_seconds: float | None) -> None:
         """Counts an episode; its metrics are the last row."""
-        self._bar.update(rows[-1][self._column] - self._done)
-        self._done = rows[-1][self._column]
+        before, self._done = self._done, rows[-1][self._column]
+        self._bar.update(self._done - before)
         if self._waiting and first_update_seconds is not None:
             self._waiting = False
-            self._bar.write(f"compiled within {first_update_seconds:.0f} s", sys.stderr)
+            self._say(f"compiled within {first_update_seconds:.0f} s")
         lately = rows[-10:]
         means = [statistics.fmean(r[key] for r in lately) for key in ("return", "action_variation")]
-        self._bar.set_postfix_str(
+        state = (
             f"return {means[0]:.1f}, action variation {means[1]:.3f}, "
             f"{rows[-1]['frames_per_second']:.0f} frames/s"
         )
+        self._bar.set_postfix_str(state)
+        tenth = self._done * 10 // self._total > before * 10 // self._total
+        if tenth or time.monotonic() - self._last_line > LINE_SECONDS:
+            self._last_line = time.monotonic()
+            line = f"{self._unit} {self._done:g} of {self._total}: {state}"
+            if self._bar.disable:
+                self._say(line)
+            else:
+                log(self._folder, line)
+
+    def _say(self, line: str) -> None:
+        (say if self._shown else log)(self._folder, line)

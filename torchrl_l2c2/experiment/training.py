@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import sys
 import time
 import warnings
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from torchrl_l2c2.experiment.best_policy import BestPolicy
 from torchrl_l2c2.experiment.compilation import compiler_available
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.continuation import (
@@ -23,19 +23,18 @@ from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
 from torchrl_l2c2.experiment.evaluate import Evaluation, LateTests, evaluate_policy
 from torchrl_l2c2.experiment.folder import (
     MetricsLog,
-    code_commit,
     make_folder,
     save_checkpoint,
     save_policy,
     versions,
     write_atomically,
-    write_json,
+    write_settings,
 )
 from torchrl_l2c2.experiment.learner import Learner, untrained
 from torchrl_l2c2.experiment.lock import lock_folder
 from torchrl_l2c2.experiment.player import Episode, Player
 from torchrl_l2c2.experiment.process import ProcessState
-from torchrl_l2c2.experiment.progress import Progress
+from torchrl_l2c2.experiment.progress import Progress, say
 from torchrl_l2c2.experiment.replay import load_replay_state, replay_state
 from torchrl_l2c2.experiment.reports import FinishedRun, write_results
 from torchrl_l2c2.experiment.schedules import SCHEDULES
@@ -111,6 +110,7 @@ class Experiment:
             self.player = Player(collector, self.agent, config.task.env_id)
         self.metrics: list[dict[str, float]] = []
         self._late_tests = LateTests(config.task, config.seed, self.agent.policy, self._compile)
+        self._best_policy = BestPolicy(config, self.agent.policy, self.folder)
         # Only now, as what was refused above leaves no folder.
         if self.folder is not None:
             self._unlock = lock_folder(make_folder(self.folder), self)
@@ -160,12 +160,14 @@ class Experiment:
             shown=progress,
             compiles=compiles,
             unit=budget.unit,
+            folder=self.folder,
         )
         ended = self._spent(budget) >= budget.total
         with self._process, bar, stop_on_signals() as signals, checkpoint_named(self.folder):
             while not ended:
                 episode = next(schedule)
                 self._write(self._row(episode, budget), bar)
+                self._best_policy.after(len(self.metrics))
                 if not episode.ends_round:
                     continue
                 ended = self._spent(budget) >= budget.total
@@ -203,6 +205,7 @@ class Experiment:
             "global_rng": self._process.state_dict(),
             "counters": [self.player.frames, learner.updates, learner.skipped_updates],
             "metrics": json.dumps(self.metrics),
+            "best_policy": self._best_policy.state_dict(),
             "metrics_log": self._log.state_dict(),
         }
 
@@ -224,6 +227,8 @@ class Experiment:
         self.player.frames, learner.updates, learner.skipped_updates = state["counters"]
         self.metrics = json.loads(state["metrics"])
         self._log.load_state_dict(state["metrics_log"])
+        if "best_policy" in state:  # Checkpoints of earlier releases have none.
+            self._best_policy.load_state_dict(state["best_policy"])
         # Some of the tensors that a compiled update was made for are others now.
         learner.renew()
         # Last: making and loading the above may have drawn from the global generators.
@@ -297,8 +302,7 @@ class Experiment:
         self._log = MetricsLog(self.folder, tensorboard=self.config.logger.name == "tensorboard")
         self._resume(resume, allow_other_versions)
         if self.folder is not None:
-            write_json(self.folder / "config.json", self.config.to_dict())
-            write_json(self.folder / "versions.json", {**versions(), "commit": code_commit()})
+            write_settings(self.folder, self.config.to_dict())
 
     def _resume(self, elsewhere: str | Path | None, allow_other_versions: bool) -> None:
         found = find_checkpoint(self.folder, elsewhere)
@@ -310,7 +314,7 @@ class Experiment:
             log = (path.parent / "metrics.csv").read_bytes()
             write_atomically(self.folder / "metrics.csv", log)
         self.load_state_dict(state)
-        print(f"continuing after episode {len(self.metrics)} from {path}", file=sys.stderr)
+        say(self.folder, f"continuing after episode {len(self.metrics)} from {path}")
 
     def _untrained(self) -> str | None:
         random_frames = getattr(self.config.algorithm, "random_frames", 0)

@@ -1,0 +1,115 @@
+"""Tests during training, and evaluate: the policy that was best, and the figures of any."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchrl_l2c2.experiment import Experiment, ExperimentConfig, TaskConfig, load_policy
+from torchrl_l2c2.experiment.evaluate import main
+
+TASK = TaskConfig("pendulum", "Pendulum-v1", episodes=6, max_steps=40)
+
+
+def run(folder, **settings):
+    chosen = {"task": TASK, "compile": False, "test_episodes": 2, "checkpoint_interval": 0.0}
+    experiment = Experiment(ExperimentConfig(**chosen | settings), folder)
+    experiment.train()
+    experiment.finish(experiment.test())
+    experiment.close()
+    return experiment
+
+
+def without_clock(experiment):
+    return [
+        {k: repr(v) for k, v in row.items() if k != "frames_per_second"}
+        for row in experiment.metrics
+    ]
+
+
+def test_the_best_policy_of_the_tests_during_training_is_kept(tmp_path):
+    """It plays the tests' episodes as it did when it was the best one; training is as without."""
+    experiment = run(tmp_path / "with", evaluate_every=2)
+    tests = json.loads((tmp_path / "with" / "evaluations.json").read_text())
+    assert [test["episode"] for test in tests] == [2, 4, 6]
+    best = max(tests, key=lambda test: test["return_mean"])
+    kept = torch.load(tmp_path / "with" / "policy_best.pt", weights_only=True)
+    only = run(tmp_path / "till_then", task=replace(TASK, episodes=best["episode"]))
+    assert all(kept[k].equal(v) for k, v in only.agent.policy.state_dict().items())
+    without = run(tmp_path / "without")
+    assert without_clock(experiment) == without_clock(without)
+    assert not (tmp_path / "without" / "evaluations.json").exists()
+
+
+def test_tests_during_training_are_continued_with_the_run(tmp_path):
+    """None is lost and none comes twice."""
+    whole = run(tmp_path / "whole", evaluate_every=2)
+    run(tmp_path / "parts", evaluate_every=2, task=replace(TASK, episodes=3))
+    parts = run(tmp_path / "parts", evaluate_every=2)
+    written = [(tmp_path / name / "evaluations.json").read_text() for name in ("whole", "parts")]
+    assert written[0] == written[1]
+    assert whole._best_policy.tests == parts._best_policy.tests
+
+
+def test_a_run_without_tests_plays_none():
+    """And a test of none is asked for in vain."""
+    experiment = Experiment(ExperimentConfig(task=TASK, compile=False, test_episodes=0))
+    with pytest.raises(ValueError, match="episodes must be at least 1, got 0"):
+        experiment.test()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("run")
+    run(path, evaluate_every=3)
+    return path
+
+
+def evaluated(folder, *arguments):
+    main([str(folder), "--episodes", "3", "--output", str(folder / "result.json"), *arguments])
+    return json.loads((folder / "result.json").read_text())
+
+
+def test_evaluate_plays_as_it_is_told(folder):
+    """Number, seed, noise and samples change the figures; the same arguments give the same."""
+    first = evaluated(folder, "--seed", "5")
+    assert len(first["episodes"]["returns"]) == first["summary"]["episodes"] == 3
+    assert first == evaluated(folder, "--seed", "5")
+    for other in (["--seed", "6"], ["--noise", "0.5"], ["--sampled"]):
+        # The last of two seeds counts.
+        differs = evaluated(folder, "--seed", "5", *other)["episodes"]["action_variations"]
+        assert differs != first["episodes"]["action_variations"]
+
+
+def test_evaluate_refuses_what_cannot_be(folder, tmp_path):
+    """In one line."""
+    with pytest.raises(
+        SystemExit, match=r"error: .*noise_scale must be greater than or equal to 0"
+    ):
+        evaluated(folder, "--noise", "-1")
+    with pytest.raises(SystemExit, match="is not the folder of a run"):
+        main([str(tmp_path)])
+
+
+def test_the_folder_says_how_to_load_its_policy(folder):
+    """Its own lines run, and name every file."""
+    text = (folder / "README.txt").read_text()
+    lines = [line.strip() for line in text.splitlines() if line.startswith("    ")]
+    code = [line for line in lines if not line.startswith("python")]
+    names = {"__name__": "readme"}
+    exec("\n".join(code).replace("path of this folder", str(folder)), names)
+    assert names["rollout"]["action"].shape == (40, 1)
+    for path in folder.iterdir():
+        if not path.name.startswith((".", "checkpoint", "result", "README")):
+            assert path.name in text
+
+
+def test_the_best_policy_is_loaded_where_there_is_one(folder, tmp_path):
+    """And missed where there is none."""
+    kept = torch.load(folder / "policy_best.pt", weights_only=True)
+    policy = load_policy(folder, best=True)[0]
+    assert all(kept[k].equal(v) for k, v in policy.state_dict().items())
+    run(tmp_path)
+    with pytest.raises(FileNotFoundError, match="evaluate_every=N makes it"):
+        load_policy(tmp_path, best=True)
