@@ -280,7 +280,22 @@ class TestSettings:
         free = make_config(seed=9, episodes=7, threads=2, test_episodes=3, late_share=0.5)
         assert fingerprint(free.to_dict()) == plain
         assert fingerprint(make_config(compile=False).to_dict()) != plain
+        ratio = make_config(algorithm=PPORPEConfig(replay_ratio=5))
+        assert fingerprint(ratio.to_dict()) != plain
         assert fingerprint(make_config(regularizer="caps").to_dict()) != plain
+
+    def test_a_setting_that_is_off_leaves_the_fingerprint(self, monkeypatch):
+        """So the codes of older runs stay when it is added."""
+        config = make_config().to_dict()
+        older = {k: v for k, v in config["task"].items() if v is not None and v is not False}
+        newer = {**config["task"], "added": False, "also_added": None}
+        codes = []
+        for task in (older, newer):
+            monkeypatch.setattr(
+                ExperimentConfig, "to_dict", lambda _, t=task: {**config, "task": t}
+            )
+            codes.append(fingerprint(config))
+        assert codes[0] == codes[1]
 
     def test_differences_are_from_the_defaults_of_what_is_chosen_by_name(self):
         """Another replay's own defaults are none; a task of one's own is its id."""

@@ -15,6 +15,8 @@ from torchrl_l2c2.experiment.config import (
 )
 from torchrl_l2c2.experiment.tasks import TASKS
 
+# How long a run is trained, of which a longer one is another.
+BUDGETS = ("task.episodes", "task.frames")
 # Chosen by name; what else these groups have are settings of what was chosen.
 _COMPARED = ("task", "algorithm", "regularizer")
 
@@ -22,8 +24,9 @@ _COMPARED = ("task", "algorithm", "regularizer")
 def fingerprint(config: Mapping[str, Any]) -> str:
     """Ten hexadecimal digits that two runs share if, and only if, they may be pooled.
 
-    They stand for every setting but the seed, the logger, and those that change none of the
-    numbers or only the length of the training.
+    They stand for every setting but the seed, the logger, the task's name, and those that change
+    none of the numbers or only the length of the training. A setting that is off (null or false)
+    does not count: one that is added later, off by default, leaves the codes of older runs.
 
     Args:
         config (Mapping): of ``config.json``; settings that it lacks have their defaults.
@@ -31,7 +34,11 @@ def fingerprint(config: Mapping[str, Any]) -> str:
     Raises:
         SettingError: a setting that is not known.
     """
-    compared = {k: v for k, v in _flat(ExperimentConfig.from_dict(config)).items() if _counts(k)}
+    compared = {
+        name: value
+        for name, value in _flat(ExperimentConfig.from_dict(config)).items()
+        if _counts(name) and name != "task.name" and value is not None and value is not False
+    }
     return hashlib.sha256(json.dumps(compared, sort_keys=True).encode()).hexdigest()[:10]
 
 
@@ -57,11 +64,10 @@ def differences(config: Mapping[str, Any]) -> dict[str, str]:
     own = _flat(ExperimentConfig.from_dict(config))
     usual = _flat(ExperimentConfig.from_dict(_names(config, _COMPARED)))
     chosen = _flat(ExperimentConfig.from_dict(_names(config, GROUPS)))
-    budgets = {f"task.{name}" for name in FREE_TASK_SETTINGS - {"solved_at"}}
     return {
         name: _word(value)
         for name, value in sorted(own.items())
-        if (_counts(name) or name in budgets)
+        if (_counts(name) or name in BUDGETS)
         and value != (usual if name.endswith(".name") else chosen)[name]
     }
 
@@ -95,8 +101,7 @@ def _counts(name: str) -> bool:
     group, _, setting = name.partition(".")
     return (
         name != "seed"
-        and group != "logger"
-        and name not in FREE_SETTINGS
+        and group not in {"logger", *FREE_SETTINGS}
         and not (group == "task" and setting in FREE_TASK_SETTINGS)
     )
 

@@ -10,12 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_l2c2.experiment.reports.differences import BUDGETS
 from torchrl_l2c2.experiment.reports.paper import method_name
 from torchrl_l2c2.experiment.reports.records import Record
 from torchrl_l2c2.experiment.reports.statistics import Scores
-
-# In the records' length, not in their names.
-_BUDGETS = ("task.episodes", "task.frames")
 
 
 @dataclass(frozen=True)
@@ -146,7 +144,7 @@ def _differing(group: Group, groups: Sequence[Group]) -> dict[str, str]:
             if not own_kind or other.first.method == group.first.method
         }
 
-    return {k: v for k, v in _without(group.first, *_BUDGETS).items() if len(others_have(k)) > 1}
+    return {k: v for k, v in _without(group.first, *BUDGETS).items() if len(others_have(k)) > 1}
 
 
 def _shortest(key: str, keys: set[str]) -> str:
