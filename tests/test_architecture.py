@@ -22,9 +22,10 @@ objectives.regularized
 objectives.l2c2 objectives.caps objectives.ppo_rpe
 objectives.__init__
 trainers __init__
-experiment.settings experiment.compilation experiment.environments experiment.folder
-experiment.lock experiment.process experiment.progress experiment.signals experiment.optimizers
-experiment.sweep experiment.tasks experiment.replay experiment.collection experiment.reports
+experiment.settings experiment.compilation experiment.environments experiment.loggers
+experiment.folder experiment.lock experiment.process experiment.progress experiment.signals
+experiment.optimizers experiment.sweep experiment.tasks experiment.replay experiment.collection
+experiment.reports
 experiment.regularizers.base
 experiment.regularizers.none experiment.regularizers.caps experiment.regularizers.l2c2
 experiment.regularizers.__init__
