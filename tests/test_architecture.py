@@ -22,7 +22,8 @@ objectives.regularized
 objectives.l2c2 objectives.caps objectives.ppo_rpe
 objectives.__init__
 trainers __init__
-experiment.settings experiment.compilation experiment.environments experiment.loggers
+experiment.settings experiment.compilation experiment.environments
+experiment.loggers
 experiment.folder experiment.lock experiment.process experiment.progress experiment.signals
 experiment.optimizers experiment.sweep experiment.tasks experiment.replay experiment.collection
 experiment.reports

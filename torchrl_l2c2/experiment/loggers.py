@@ -59,6 +59,8 @@ def make_logger(name: str, folder: Path) -> Logger | None:
     if name == "mlflow":
         from torchrl.record.loggers.mlflow import MLFlowLogger
 
+        # MLflow asks for this before it writes files that need no database.
+        os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")
         inside = (folder.absolute() / "mlruns").as_uri()
         return MLFlowLogger(run, os.environ.get("MLFLOW_TRACKING_URI", inside))
     return None
