@@ -215,7 +215,7 @@ def run_rows(effort: Effort) -> Iterable[Row]:
         parts_episode = play_episode(parts)
         parts_episode()
         learner, row = parts.learner.update, parts.metrics[-1]
-        log = MetricsLog(Path(folder) / "parts", tensorboard=False)
+        log = MetricsLog(Path(folder) / "parts")
         draw = learner.draw()
         priority = torch.rand(len(draw.rows))
         episode = parts.player.collector.rollout()

@@ -415,7 +415,8 @@ def test_an_error_of_the_users_own_task_is_shown_with_its_lines(tmp_path, monkey
     done = run_train(*PENDULUM_OVERRIDES, *settings, folder=tmp_path, check=False)
     assert done.returncode == 1
     assert 'broken_task.py", line 9, in step' in done.stderr and "lower_the_boom" in done.stderr
-    assert "boom" in done.stderr.splitlines()[-1] and done.stderr.splitlines()[-1].startswith("err")
+    assert "KeyError: 'boom'" in done.stderr
+    assert done.stderr.splitlines()[-1].startswith("error: broken_task:Broken-v0 failed after")
 
 
 def test_a_sweep_gives_one_table(tmp_path):

@@ -25,12 +25,17 @@ if TYPE_CHECKING:
 
 @settings
 class LoggerConfig:
-    """Where metrics go: metrics.csv, a line per episode; ``tensorboard`` writes events as well."""
+    """Where metrics go: metrics.csv, a line per episode; the others get them as well."""
 
-    name: Literal["csv", "tensorboard"] = "csv"
+    name: Literal["csv", "tensorboard", "wandb", "mlflow"] = "csv"
 
 
-LOGGERS = {name: LoggerConfig(name) for name in ("csv", "tensorboard")}
+LOGGERS = {
+    "csv": LoggerConfig("csv"),
+    "tensorboard": LoggerConfig("tensorboard"),
+    "wandb": LoggerConfig("wandb"),
+    "mlflow": LoggerConfig("mlflow"),
+}
 
 # group -> name -> the settings that `group=name` chooses.
 GROUPS: dict[str, Mapping[str, Any]] = {

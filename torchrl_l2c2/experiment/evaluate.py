@@ -97,8 +97,7 @@ def evaluate_policy(
         env,
         policy,
         frames_per_batch=max_steps,
-        # Modules that only explore take decisions that cannot be compiled.
-        compile_policy=compile_policy and not sampled,
+        compile_policy=compile_policy,
         exploration_type=ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC,
     )
     name = "test, sampled" if sampled else "test"

@@ -27,7 +27,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from torchrl.record.loggers.tensorboard import TensorboardLogger
+
+from torchrl_l2c2.experiment.loggers import close_logger, make_logger
 
 VERSIONED = (
     *("torchrl-l2c2", "torch", "torchrl", "tensordict", "numpy", "gymnasium"),
@@ -253,17 +254,22 @@ class MetricsLog:
     """Writes rows of numbers; a killed process leaves no half of a line.
 
     Args:
-        folder (Path, optional): where ``metrics.csv`` (and the ``tensorboard`` folder) go;
-            ``None`` writes nothing.
-        tensorboard (bool): whether to write TensorBoard events as well.
+        folder (Path, optional): where ``metrics.csv`` goes, and what the logger writes; ``None``
+            writes nothing.
+        logger (str): one of :func:`~torchrl_l2c2.experiment.loggers.make_logger`.
     """
 
-    def __init__(self, folder: Path | None, *, tensorboard: bool) -> None:
+    def __init__(self, folder: Path | None, *, logger: str = "csv") -> None:
         self.path = None if folder is None else folder / "metrics.csv"
         self.columns: list[str] | None = None
-        self._tensorboard = None
-        if folder is not None and tensorboard:
-            self._tensorboard = TensorboardLogger("tensorboard", log_dir=str(folder))
+        self._name = logger
+        self._logger = None if folder is None else make_logger(logger, folder)
+
+    def close(self) -> None:
+        """Ends what the logger has open."""
+        if self._logger is not None:
+            self._logger = None
+            close_logger(self._name)
 
     def write(self, row: Mapping[str, float]) -> None:
         """Adds one line; the first line fixes the columns.
@@ -279,9 +285,9 @@ class MetricsLog:
         if list(row) != self.columns:
             raise ValueError(f"the metrics changed from {self.columns} to {list(row)}.")
         _append(self.path, row.values(), "ab")
-        if self._tensorboard is not None:
+        if self._logger is not None:
             for name, value in row.items():
-                self._tensorboard.log_scalar(name, value, step=int(row["frames"]))
+                self._logger.log_scalar(name, value, step=int(row["frames"]))
 
     def state_dict(self) -> dict[str, Any]:
         """How far the file goes."""

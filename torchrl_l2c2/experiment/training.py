@@ -32,6 +32,7 @@ from torchrl_l2c2.experiment.folder import (
 )
 from torchrl_l2c2.experiment.learner import Learner, untrained
 from torchrl_l2c2.experiment.lock import lock_folder
+from torchrl_l2c2.experiment.loggers import check_installed
 from torchrl_l2c2.experiment.player import Episode, Player
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.progress import Progress, say
@@ -93,6 +94,8 @@ class Experiment:
     ) -> None:
         self.config = config = config or ExperimentConfig()
         self.folder = None if folder is None else Path(folder)
+        check_installed(config.logger.name)
+        self._log = MetricsLog(None)  # till the folder is there
         self._compile = config.compile and compiler_available()
         self._process = ProcessState(config.seed, config.threads)
         with self._process:
@@ -256,7 +259,8 @@ class Experiment:
                 episodes or config.test_episodes,
                 max_steps=config.task.time_limit,
                 sampled=sampled,
-                compile_policy=self._compile,
+                # Modules that only explore take decisions that cannot be compiled.
+                compile_policy=self._compile and not (sampled and self.agent.exploration),
                 progress=progress,
             )
             env.close()
@@ -295,11 +299,12 @@ class Experiment:
         """Ends the processes of ``num_workers``; the experiment cannot train any further."""
         self.player.collector.shutdown()
         self._late_tests.close()
+        self._log.close()
         if self.folder is not None:
             self._unlock()
 
     def _begin(self, resume: str | Path | None, allow_other_versions: bool) -> None:
-        self._log = MetricsLog(self.folder, tensorboard=self.config.logger.name == "tensorboard")
+        self._log = MetricsLog(self.folder, logger=self.config.logger.name)
         self._resume(resume, allow_other_versions)
         if self.folder is not None:
             write_settings(self.folder, self.config.to_dict())

@@ -1,0 +1,209 @@
+"""Wrong settings, as the command line gives them: each a line, and none of them starts."""
+
+import dataclasses
+import math
+from typing import Annotated, get_type_hints
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from hydra.errors import HydraException
+from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import strategies as st
+from omegaconf import OmegaConf
+from pydantic import TypeAdapter
+
+from torchrl_l2c2.experiment import Experiment, ExperimentConfig
+from torchrl_l2c2.experiment.command import CONF, register
+from torchrl_l2c2.experiment.config import GROUPS
+from torchrl_l2c2.experiment.settings import SettingError, describe
+
+
+@pytest.fixture(scope="module")
+def settings_of():
+    """What the command makes of its overrides; other tests store TorchRL's nodes as well."""
+    store = ConfigStore.instance()
+    stored = store.repo
+    store.repo = {name: nodes for name, nodes in stored.items() if name not in GROUPS}
+    register()
+
+    def read(line):
+        plain = OmegaConf.to_container(compose("config", line.split()), resolve=True)
+        return ExperimentConfig.from_dict(plain)
+
+    try:
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            yield read
+    finally:
+        store.repo = stored
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("seed=-1", "seed must be greater than or equal to 0, got -1."),
+        ("seed=zero", "seed must be a valid integer, got 'zero'."),
+        ("seed=1.5", "seed must be a valid integer, got 1.5."),
+        ("threads=0", "threads must be greater than or equal to 1, got 0."),
+        ("num_workers=0", "num_workers must be greater than or equal to 1, got 0."),
+        ("num_workers=7", "task.episodes must be a multiple of num_workers=7"),
+        ("num_workers=2 algorithm.schedule=step", "num_workers must be 1 with algorithm.schedule"),
+        ("compile=maybe", "compile must be a valid boolean, got 'maybe'."),
+        ("on_nonfinite=continue", "on_nonfinite must be 'stop' or 'skip', got 'continue'."),
+        ("test_episodes=-1", "test_episodes must be greater than or equal to 0, got -1."),
+        ("evaluate_every=-5", "evaluate_every must be greater than or equal to 0, got -5."),
+        ("late_share=1.1", "late_share must be less than or equal to 1, got 1.1."),
+        ("checkpoint_interval=-1", "checkpoint_interval must be greater than or equal to 0"),
+        ("checkpoint_interval=inf", "checkpoint_interval must be a finite number, got inf."),
+        ("checkpoint_keep=0", "checkpoint_keep must be greater than or equal to 1, got 0."),
+        ("task.episodes=0", "task.episodes must be greater than or equal to 1, got 0."),
+        ("task.max_steps=-3", "task.max_steps must be greater than or equal to 1, got -3."),
+        ("task.noise_scale=-0.1", "task.noise_scale must be greater than or equal to 0, got -0.1."),
+        ("task.noise_scale=nan", "task.noise_scale must be a finite number, got nan."),
+        ("task=gymnasium", "task.name must be a valid string, got None."),
+        ("regularizer.sigma=0", "regularizer.sigma must be greater than 0, got 0."),
+        ("regularizer.beta=-1", "regularizer.beta must be greater than or equal to 0, got -1."),
+        ("regularizer.lambda_min=low", "regularizer.lambda_min must be a valid number, got 'low'."),
+        ("regularizer.num_samples=0", "regularizer.num_samples must be greater than or equal to 1"),
+        ("regularizer=caps regularizer.mean=mode", "regularizer.mean must be 'loc' or 'action'"),
+        ("algorithm.gamma=1", "algorithm.gamma must be less than 1, got 1."),
+        ("algorithm.hidden=100", "algorithm.hidden must be a list, got 100."),
+        ("algorithm.hidden=[0]", "algorithm.hidden must be greater than or equal to 1, got 0."),
+        ("algorithm.replay_ratio=1 algorithm.updates=1", "replay_ratio and updates both say"),
+        ("replay.batch_size=0", "replay.batch_size must be greater than or equal to 1, got 0."),
+        ("replay.capacity=8", "replay.capacity must be at least the batch_size (32), got 8."),
+        ("optimizer.lr=-1", "optimizer.lr must be greater than or equal to 0, got -1."),
+        ("algorithm=ppo replay=uniform", "'uniform' is nothing that algorithm 'ppo' can learn"),
+        ("replay=rollout", "'rollout' is nothing that algorithm 'ppo_rpe' can learn from"),
+    ],
+)
+def test_a_wrong_setting_gives_its_line(settings_of, line, message):
+    """It names the setting, what was given and what is allowed."""
+    with pytest.raises(SettingError) as refused:
+        settings_of(line)
+    assert message in str(refused.value) and "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("regularizer=lipsnet", "Could not find 'regularizer/lipsnet'"),
+        ("sed=1", "Could not override 'sed'"),
+        ("regularizer.sgma=1", "Could not override 'regularizer.sgma'"),
+    ],
+)
+def test_a_wrong_name_is_hydras_to_refuse(settings_of, line, message):
+    """And its line says which."""
+    with pytest.raises(HydraException, match=message):
+        settings_of(line)
+
+
+def kinds_of_settings():
+    """Every number that is set, with the schema that says its range."""
+    for group, choices in {"": {"": ExperimentConfig()}, **GROUPS}.items():
+        for name, chosen in choices.items():
+            hints = get_type_hints(type(chosen))
+            for field in dataclasses.fields(chosen):
+                if field.name in describe(type(chosen)):
+                    schema = TypeAdapter(Annotated[hints[field.name], field.default]).json_schema()
+                    for kind in schema.get("anyOf", [schema]):
+                        if kind.get("type") in ("integer", "number"):
+                            yield group, name, field.name, kind
+
+
+NUMBERS = list(kinds_of_settings())
+
+
+def limits(kind):
+    lowest = kind.get("minimum", kind.get("exclusiveMinimum", -math.inf))
+    highest = kind.get("maximum", kind.get("exclusiveMaximum", math.inf))
+    return lowest, highest
+
+
+def values(kind, inside):
+    """Numbers of a kind, within its range or beyond."""
+    lowest, highest = limits(kind)
+    open_ends = (kind.get("exclusiveMinimum"), kind.get("exclusiveMaximum"))
+    least, most = max(lowest, -1e6), min(highest, 1e6)
+    integer = kind["type"] == "integer"
+    if inside and integer:
+        return st.integers(math.ceil(least), math.floor(most))
+    if inside:
+        return st.floats(least, most).filter(lambda value: value not in open_ends)
+    step = 1 if integer else 1e-3
+    beyond = [st.just(end) for end in open_ends if end is not None]
+    beyond += [st.just(lowest - step)] if lowest > -math.inf else []
+    beyond += [st.just(highest + step)] if highest < math.inf else []
+    beyond += [] if integer else [st.sampled_from([math.nan, math.inf])]
+    made = st.one_of(*beyond)
+    return made.map(int) if integer else made
+
+
+def settings_with(group, choice, name, value):
+    if not group:
+        return {name: value}
+    # What a group's choice goes with; the rest is as usual.
+    rest = {"algorithm": {"name": "ppo"}} if choice == "rollout" else {}
+    return {**rest, group: {"name": choice, name: value}}
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.data())
+def test_no_number_beyond_its_range_is_taken(data):
+    """Just beyond an end, at an open one, not a number, infinite."""
+    group, choice, name, kind = data.draw(st.sampled_from(NUMBERS))
+    bounded = limits(kind) != (-math.inf, math.inf)
+    assume(bounded or kind["type"] == "number")
+    value = data.draw(values(kind, inside=False))
+    with pytest.raises(SettingError) as refused:
+        ExperimentConfig.from_dict(settings_with(group, choice, name, value))
+    assert name in str(refused.value) and "\n" not in str(refused.value)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.data())
+def test_every_number_within_its_range_is_taken_or_refused_in_a_line(data):
+    """Refused where it does not go together with the others."""
+    group, choice, name, kind = data.draw(st.sampled_from(NUMBERS))
+    value = data.draw(values(kind, inside=True))
+    try:
+        config = ExperimentConfig.from_dict(settings_with(group, choice, name, value))
+    except SettingError as refused:
+        assert "\n" not in str(refused)
+    else:
+        assert getattr(getattr(config, group) if group else config, name) == value
+
+
+SMALL = {
+    "task": {"name": "Pendulum-v1", "env_id": "Pendulum-v1", "episodes": 1, "max_steps": 40},
+    "compile": False,
+    "late_share": 0.0,
+}
+OF_COMPONENTS = [
+    (group, choice, name, kind)
+    for group, choice, name, kind in NUMBERS
+    if (group, choice) in {("algorithm", "ppo_rpe"), ("regularizer", "l2c2"),
+                           ("regularizer", "caps"), ("optimizer", "adaterm")}
+    # How much there is of it, which takes long and cannot fail.
+    and name not in {"updates", "replay_ratio", "num_heads", "num_samples"}
+]  # fmt: skip
+
+
+@settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck))
+@given(st.data())
+def test_what_is_taken_begins_to_learn_or_is_refused_by_its_component(data):
+    """No other error before the first update; numbers that are not finite there are told."""
+    group, choice, name, kind = data.draw(st.sampled_from(OF_COMPONENTS))
+    value = data.draw(values(kind, inside=True))
+    chosen = SMALL | {group: {"name": choice, name: value}}
+    try:
+        experiment = Experiment(ExperimentConfig.from_dict(chosen))
+    except ValueError as refused:
+        assert "\n" not in str(refused)
+        return
+    try:
+        experiment.train()
+    except FloatingPointError as told:
+        assert "update" in str(told)
+    else:
+        assert experiment.learner.updates == 1
