@@ -234,7 +234,6 @@ class Experiment:
             self._best_policy.load_state_dict(state["best_policy"])
         # Some of the tensors that a compiled update was made for are others now.
         learner.renew()
-        # Last: making and loading the above may have drawn from the global generators.
         self._process.load_state_dict(state["global_rng"])
 
     def test(
@@ -259,8 +258,7 @@ class Experiment:
                 episodes or config.test_episodes,
                 max_steps=config.task.time_limit,
                 sampled=sampled,
-                # Modules that only explore take decisions that cannot be compiled.
-                compile_policy=self._compile and not (sampled and self.agent.exploration),
+                compile_policy=self._compile and (not sampled or self.agent.policy_compiles),
                 progress=progress,
             )
             env.close()

@@ -28,8 +28,7 @@ def make_collector(
 ) -> EpisodeCollector | MultiEpisodeCollector:
     """What plays a run's episodes: this process, or as many others as the settings say."""
     options: dict[str, Any] = {
-        # Modules that only explore take decisions that cannot be compiled.
-        "compile_policy": compile and agent.exploration is None,
+        "compile_policy": compile and agent.policy_compiles,
         "random_frames": getattr(config.algorithm, "random_frames", 0),
     }
     if config.num_workers == 1:

@@ -43,3 +43,8 @@ class Agent:
 
     def __post_init__(self) -> None:
         self.policy_terms |= getattr(self.loss, "policy_terms", frozenset())
+
+    @property
+    def policy_compiles(self) -> bool:
+        """Whether the policy compiles: modules that only explore take decisions that do not."""
+        return self.exploration is None

@@ -46,5 +46,5 @@ def fill_readme(path: str | Path, records: Sequence[Record]) -> None:
     path = Path(path)
     text = fill(path.read_text(), records)
     if records:
-        draw_plane(group_records(records), "late_mean", path.parent / PICTURE)
+        draw_plane(group_records(records), "late_sampled", path.parent / PICTURE)
     write_atomically(path, text.encode())
