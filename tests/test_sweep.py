@@ -15,7 +15,7 @@ from torchrl_l2c2.experiment.folder import list_checkpoints, load_checkpoint
 ROOT = Path(__file__).parent.parent
 SETTINGS = (
     "task=gymnasium", "task.env_id=Pendulum-v1", "task.max_steps=50", "algorithm.updates=4",
-    "test_episodes=1", "checkpoint_interval=3600",
+    "test_episodes=1",
 )  # fmt: skip
 LAUNCHERS = {"basic": [], "joblib": ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]}
 
@@ -75,7 +75,14 @@ def begun(folder, least=1):
 @pytest.mark.parametrize("launcher", LAUNCHERS)
 def test_an_interrupted_sweep_saves_ends_and_is_continued(tmp_path, launcher, number):
     """Its running jobs save, no other one begins, no process stays; the same command goes on."""
-    length = ["-m", "task.episodes=3000", "seed=0,1,2", *LAUNCHERS[launcher], "compile=false"]
+    length = [
+        "-m",
+        "task.episodes=3000",
+        "seed=0,1,2",
+        *LAUNCHERS[launcher],
+        "compile=false",
+        "checkpoint_interval=3600",
+    ]
     running = 2 if launcher == "joblib" else 1
     process = start(tmp_path, *length)
     wait_until(lambda: begun(tmp_path, running))
@@ -135,7 +142,7 @@ def test_what_is_ended_at_random_times_ends_with_the_same_numbers(tmp_path, swee
     """Twenty SIGKILLs, SIGTERMs and Ctrl-Cs, and then the same command to the end."""
     choose = random.Random(0)
     command = ["-m", "seed=0,1,2,3", *LAUNCHERS["joblib"]] if sweep else []
-    command += ["task.episodes=400", "checkpoint_interval=0.5", "compile=false"]
+    command += ["task.episodes=150", "checkpoint_interval=0.5", "compile=false"]
     undisturbed = start(tmp_path / "undisturbed", *command)
     assert undisturbed.wait(580) == 0, said(tmp_path / "undisturbed")
     folder = tmp_path / "ended"

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from torchrl.record.loggers import Logger
 
 PROJECT = "torchrl_l2c2"
+# As the user has it: MLflow itself sets the variable to what it was told last.
+TRACKING_URI = os.environ.get("MLFLOW_TRACKING_URI")
 # What is no part of the experiment extra.
 PACKAGES = {"wandb": "wandb", "mlflow": "mlflow"}
 
@@ -62,7 +64,7 @@ def make_logger(name: str, folder: Path) -> Logger | None:
         # MLflow asks for this before it writes files that need no database.
         os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")
         inside = (folder.absolute() / "mlruns").as_uri()
-        return MLFlowLogger(run, os.environ.get("MLFLOW_TRACKING_URI", inside))
+        return MLFlowLogger(run, TRACKING_URI or inside)
     return None
 
 

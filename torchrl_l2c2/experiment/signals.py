@@ -13,6 +13,8 @@ from typing import Any, NoReturn
 
 # Terminals and launchers send one signal to a process several times: to it, and to its group.
 SAME_SIGNAL_SECONDS = 1.0
+# What ended, or was to end, what went before a training: libraries swallow exceptions in places.
+_heard: list[int] = []
 FINISHING = "finishing the episode, then saving"
 
 
@@ -34,13 +36,14 @@ class Terminated(KeyboardInterrupt):
 
 def terminate(number: int, frame: Any) -> NoReturn:
     """A handler that lets what is being done end in order."""
+    _heard.append(number)
     raise Terminated
 
 
 @contextlib.contextmanager
 def stop_on_signals() -> Iterator[list[int]]:
     """Collects SIGTERM and SIGINT in a list instead of dying; a second one acts as usual."""
-    received: list[int] = []
+    received = list(_heard)
     if threading.current_thread() is not threading.main_thread():
         yield received
         return
@@ -83,6 +86,8 @@ def keep_ctrl_c_from_children() -> None:
 
     def as_ctrl_c(number: int, frame: Any) -> None:
         handler = signal.getsignal(signal.SIGINT)
+        if handler is signal.default_int_handler:
+            _heard.append(signal.SIGINT)
         if callable(handler):
             handler(signal.SIGINT, frame)
 
