@@ -240,7 +240,7 @@ class TestGroups:
             ("1 unreadable", "cut"),
         ):
             assert sum(n.startswith(start) and str(tmp_path / name) in n for n in found.notes) == 1
-        summary = sweep_summary(tmp_path)
+        summary = sweep_summary([tmp_path])
         assert "| vanilla | 0 |" in summary and all(note in summary for note in found.notes)
 
     def test_names_tell_what_differs_and_only_that(self, tmp_path):

@@ -97,7 +97,11 @@ def main() -> None:
 
 
 def tell_end(sweep: Sweep) -> None:
-    """The last lines of a sweep: what failed, and how to go on."""
+    """The last lines of a sweep: a table of its runs, what failed, and how to go on."""
+    if sweep.finished:
+        from torchrl_l2c2.experiment.reports import sweep_summary
+
+        print(sweep_summary(sweep.finished), flush=True)
     for job, reason in sweep.failures:
         print(f"failed: {job}: {reason}", file=sys.stderr)
     if sweep.stopped_by is not None:
@@ -130,7 +134,8 @@ def _run_job(values: dict[str, Any], sweep: Sweep) -> None:
         return
     try:
         with sweep.job():
-            run(values)
+            if (finished := run(values)) is not None:
+                sweep.add_finished(finished)
     except Interrupted as interruption:
         print(interruption, file=sys.stderr)
         sweep.stop(interruption.signal_number)
@@ -162,8 +167,8 @@ def run_folder(config: ExperimentConfig, outputs: str) -> Path:
     return Path(chosen.runtime.output_dir)
 
 
-def run(values: dict[str, Any]) -> None:
-    """One run in its folder, its progress and its result."""
+def run(values: dict[str, Any]) -> Path | None:
+    """One run in its folder, its progress and its result; the folder, if there is a result."""
     config = ExperimentConfig.from_dict(values)
     # Here, as settings are checked before anything waits for torch.
     from torchrl_l2c2.experiment.folder import save_policy
@@ -184,12 +189,13 @@ def run(values: dict[str, Any]) -> None:
             experiment.train(progress=True)
             if not config.test_episodes:
                 save_policy(experiment.agent.policy, folder / "policy.pt")
-                return
+                return None
             tests = [experiment.test(sampled=s, progress=True) for s in (False, True)]
             finished = experiment.finish(*tests)
             log(folder, f"finished:\n{compare_with_paper(finished)}")
     print(compare_with_paper(finished))
     print(f"picture: {folder / 'learning_curves.png'}", flush=True)
+    return folder
 
 
 @contextmanager

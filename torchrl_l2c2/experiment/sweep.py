@@ -69,6 +69,18 @@ class Sweep:
         lines = path.read_text().splitlines() if path.exists() else []
         return [(job, reason) for job, reason in map(json.loads, lines)]
 
+    def add_finished(self, folder: Path) -> None:
+        """Keeps where a finished run lies until the sweep's end."""
+        with open(self._folder / "finished", "a") as file:
+            file.write(json.dumps(str(folder)) + "\n")
+
+    @property
+    def finished(self) -> list[Path]:
+        """Folders of the runs that are finished, by this sweep or before."""
+        path = self._folder / "finished"
+        lines = path.read_text().splitlines() if path.exists() else []
+        return [Path(json.loads(line)) for line in lines]
+
     @contextlib.contextmanager
     def job(self) -> Iterator[None]:
         """A job of the sweep runs within it: a stop ends it in order, wherever it is."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -50,18 +51,18 @@ def compare_with_paper(run: FinishedRun) -> str:
     return "\n".join(lines)
 
 
-def sweep_summary(folder: str | Path) -> str:
-    """The end of a sweep: tables of all runs below a folder, and what did not finish.
+def sweep_summary(folders: Sequence[str | Path]) -> str:
+    """The end of a sweep: tables of all runs below its folders, and what did not finish.
 
     Args:
-        folder (str or Path): of the sweep; runs of earlier ones in it are counted in.
+        folders (sequence of str or Path): of its runs, or that hold them.
 
     Returns:
         str: Markdown; no error where nothing finished.
     """
-    found = find_runs([folder])
+    found = find_runs(folders)
     tables = results_tables(group_records(run.record for run in found.runs)) if found.runs else []
-    none = [] if found.runs else [f"No finished run below {folder}."]
+    none = [] if found.runs else [f"No finished run below {', '.join(map(str, folders))}."]
     return "\n\n".join([*(table.markdown() for table in tables), *none, *found.notes])
 
 
