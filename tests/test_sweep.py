@@ -72,7 +72,11 @@ def begun(folder, least=1):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("launcher", LAUNCHERS)
+@pytest.mark.parametrize(
+    "launcher",
+    # Two processes beside those of the tests take minutes.
+    ["basic", pytest.param("joblib", marks=pytest.mark.slow)],
+)
 def test_an_interrupted_sweep_saves_ends_and_is_continued(tmp_path, launcher, number):
     """Its running jobs save, no other one begins, no process stays; the same command goes on."""
     length = [

@@ -36,8 +36,10 @@ def check_same_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> Non
             names = sorted((was.keys() | is_now.keys()) - free)
             pairs = {f"{group}.{n}": (was.get(n, MISSING), is_now.get(n, MISSING)) for n in names}
         for name, (before, after) in pairs.items():
-            # As JSON, where a tuple and a list are the same.
-            if json.dumps(before) != json.dumps(after):
+            # What is off now and was no setting then has changed nothing.
+            since = before == MISSING and after in (None, False)
+            # As JSON, where a tuple and a list are the same; 10 and 10.0 are, too.
+            if not since and json.loads(json.dumps(before)) != json.loads(json.dumps(after)):
                 raise OtherRunError(
                     f"this folder's checkpoint was made with {name}={before}, not {after}: "
                     "choose another folder, or delete this one. Nothing was changed."
