@@ -206,4 +206,4 @@ def test_what_is_taken_begins_to_learn_or_is_refused_by_its_component(data):
     except FloatingPointError as told:
         assert "update" in str(told)
     else:
-        assert experiment.learner.updates == 1
+        assert experiment.learner.updates > 0
