@@ -245,10 +245,10 @@ class TestGroups:
 
     def test_names_tell_what_differs_and_only_that(self, tmp_path):
         """What all have in common is a note; what CAPS does not have does not name it."""
-        chosen = {"algorithm": PPORPEConfig(replay_ratio=10, critic_weighting="none")}
+        chosen = {"algorithm": PPORPEConfig(replay_ratio=10, critic_weighting="ratio")}
         for name, config in {
             "a": make_config(**chosen),
-            "b": make_config(algorithm=PPORPEConfig(replay_ratio=5, critic_weighting="none")),
+            "b": make_config(algorithm=PPORPEConfig(replay_ratio=5, critic_weighting="ratio")),
             "c": make_config(regularizer="caps", **chosen),
             "d": make_config(regularizer=L2C2Config(beta=0.0), **chosen),
             "e": make_config(regularizer=L2C2Config(), **chosen),
@@ -263,7 +263,7 @@ class TestGroups:
             "L2C2",
         }
         _, last = results_tables(groups)
-        assert any("`algorithm.critic_weighting=none`" in note for note in last.notes)
+        assert any("`algorithm.critic_weighting=ratio`" in note for note in last.notes)
 
 
 class TestSettings:
