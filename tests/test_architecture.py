@@ -22,7 +22,8 @@ objectives.regularized
 objectives.l2c2 objectives.caps objectives.ppo_rpe
 objectives.__init__
 trainers __init__
-experiment.settings experiment.compilation experiment.spaces experiment.loggers
+experiment.settings experiment.compilation experiment.spaces
+experiment.loggers
 experiment.folder
 experiment.environments experiment.lock experiment.signals
 experiment.process experiment.progress experiment.sweep experiment.optimizers
