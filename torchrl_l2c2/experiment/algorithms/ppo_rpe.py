@@ -98,6 +98,7 @@ class PPORPEConfig(OffPolicyConfig):
         from torchrl_l2c2.experiment.algorithms.agent import Agent
         from torchrl_l2c2.experiment.algorithms.networks import (
             check_actions,
+            image_encoder,
             observation_size,
             sharing,
         )
@@ -113,9 +114,14 @@ class PPORPEConfig(OffPolicyConfig):
             hidden=self.hidden,
             squash=self.squash,
             squish_b=self.squish_b,
+            encoder=image_encoder(env),
         )
         critic = make_critic(
-            size, num_heads=self.num_heads, hidden=self.hidden, squish_b=self.squish_b
+            size,
+            num_heads=self.num_heads,
+            hidden=self.hidden,
+            squish_b=self.squish_b,
+            encoder=image_encoder(env),
         )
         loss = PPORPELoss(
             actor,

@@ -71,14 +71,13 @@ class TD3Config(OffPolicyConfig):
         from torchrl_l2c2.experiment.algorithms.networks import (
             action_value,
             check_actions,
-            observation_size,
             perceptron,
             sharing,
         )
 
         check_actions(env, self.name, continuous=True, squashed=True)
         spec = env.action_spec
-        network = perceptron(observation_size(env), spec.shape[-1], self.hidden, nn.ReLU)
+        network = perceptron(env, spec.shape[-1], self.hidden, nn.ReLU)
         squash = TanhModule(in_keys=["action"], out_keys=["action"], spec=spec)
         actor = TensorDictSequential(Actor(network, out_keys=["action"]), squash)
         half_range = ((spec.space.high - spec.space.low) / 2).max().item()
