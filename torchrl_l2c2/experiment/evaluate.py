@@ -224,6 +224,7 @@ def load_policy(
     if not (folder / "config.json").exists():
         raise FileNotFoundError(f"{str(folder)!r} is not the folder of a run: no config.json.")
     config = ExperimentConfig.from_dict(json.loads((folder / "config.json").read_text()))
+    config = replace(config, device="cpu")
     noise = config.task.noise_scale if noise_scale is None else noise_scale
     task = replace(config.task, noise_scale=noise)
     env = make_env(task, config.seed + TEST_SEED if seed is None else seed)

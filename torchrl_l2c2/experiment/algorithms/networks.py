@@ -5,6 +5,7 @@ from __future__ import annotations
 from copy import deepcopy
 from math import ceil
 
+import torch
 from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictParams
 from torch import nn
 from torchrl.data import Bounded, TensorSpec
@@ -105,7 +106,7 @@ def tanh_normal_actor(
     env: EnvBase, hidden: tuple[int, ...], activation: type[nn.Module]
 ) -> TensorDictModule:
     """A tanh-squashed diagonal normal."""
-    spec = env.action_spec
+    spec = env.action_spec.to(torch.get_default_device())
     network = nn.Sequential(
         perceptron(env, 2 * spec.shape[-1], hidden, activation),
         NormalParamExtractor(),

@@ -95,6 +95,8 @@ class PPORPEConfig(OffPolicyConfig):
     def make_agent(
         self, env: EnvBase, regularizer: RegularizerConfig, optimizer: OptimizerConfig
     ) -> Agent:
+        import torch
+
         from torchrl_l2c2.experiment.algorithms.agent import Agent
         from torchrl_l2c2.experiment.algorithms.networks import (
             check_actions,
@@ -110,7 +112,7 @@ class PPORPEConfig(OffPolicyConfig):
         size = observation_size(env)
         actor = make_actor(
             size,
-            env.action_spec,
+            env.action_spec.to(torch.get_default_device()),
             hidden=self.hidden,
             squash=self.squash,
             squish_b=self.squish_b,

@@ -62,6 +62,7 @@ class TD3Config(OffPolicyConfig):
     def make_agent(
         self, env: EnvBase, regularizer: RegularizerConfig, optimizer: OptimizerConfig
     ) -> Agent:
+        import torch
         from tensordict.nn import TensorDictSequential
         from torch import nn
         from torchrl.modules import Actor, AdditiveGaussianModule, TanhModule
@@ -78,7 +79,8 @@ class TD3Config(OffPolicyConfig):
         check_actions(env, self.name, continuous=True, squashed=True)
         spec = env.action_spec
         network = perceptron(env, spec.shape[-1], self.hidden, nn.ReLU)
-        squash = TanhModule(in_keys=["action"], out_keys=["action"], spec=spec)
+        bounds = spec.to(torch.get_default_device())
+        squash = TanhModule(in_keys=["action"], out_keys=["action"], spec=bounds)
         actor = TensorDictSequential(Actor(network, out_keys=["action"]), squash)
         half_range = ((spec.space.high - spec.space.low) / 2).max().item()
         loss = TD3Loss(
