@@ -27,7 +27,7 @@ ALGORITHMS = {
 CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 
 
-REPLAYS = dict.fromkeys(("sac", "td3", "dqn"), UniformReplayConfig(batch_size=16))
+SMALL = {"replay": UniformReplayConfig(batch_size=16)}
 
 
 def config(name, **settings):
@@ -36,7 +36,7 @@ def config(name, **settings):
         **{
             "task": TaskConfig("task", env_id, episodes=4, max_steps=30),
             "algorithm": ALGORITHMS[name],
-            "replay": REPLAYS.get(name),
+            **(SMALL if name in ("sac", "td3", "dqn") else {}),
             "optimizer": AdamConfig(lr=0.001),
             "compile": False,
             "test_episodes": 2,
