@@ -160,7 +160,8 @@ def test_what_is_ended_at_random_times_ends_with_the_same_numbers(tmp_path, swee
         else:
             process.send_signal(number)
         process.wait(60)
-        wait_until(lambda pid=process.pid: not alive(pid), 20)
+        # Those of a killed process look for it, once they are there themselves.
+        wait_until(lambda pid=process.pid: not alive(pid), 60)
     assert start(folder, *command).wait(580) == 0, said(folder)
     ours, theirs = runs(folder), runs(tmp_path / "undisturbed")
     assert ours.keys() == theirs.keys() and len(ours) == (4 if sweep else 1)

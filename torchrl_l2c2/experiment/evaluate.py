@@ -20,7 +20,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 from tqdm import tqdm
 
-from torchrl_l2c2.experiment.collection import EpisodeCollector
+from torchrl_l2c2.experiment.collection import EpisodeCollector, check_finite
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
 from torchrl_l2c2.experiment.folder import load_newest, write_json
@@ -78,6 +78,8 @@ def evaluate_policy(
         progress (bool): whether to show a progress bar.
 
     Raises:
+        FloatingPointError: NaN or infinity in what the environment or the policy gave; names the
+            key and the frame.
         ValueError: fewer than one episode.
 
     Examples:
@@ -106,6 +108,7 @@ def evaluate_policy(
     )
     for _ in bar:
         episode = collector.rollout()
+        check_finite(episode, sum(lengths))
         actions = mean_actions(policy, episode) if sampled else episode["action"]
         returns.append(episode["next", "reward"].sum().item())
         variations.append(_variation(actions))
@@ -144,13 +147,18 @@ class LateTests:
         self._collector: EpisodeCollector | None = None
 
     def play(self, number: int) -> dict[str, float]:
-        """The figures of the test episode that belongs to a training episode's number."""
+        """The figures of the test episode that belongs to a training episode's number.
+
+        Raises:
+            FloatingPointError: as in :func:`evaluate_policy`.
+        """
         with ProcessState(self._seed, torch.get_num_threads()):
             # Late, as most calls of a short training need none.
             if self._collector is None:
                 self._collector = self._make_collector()
             self._collector.set_seed(self._seed + number)
             episode = self._collector.rollout()
+        check_finite(episode, 0)
         total = episode["next", "reward"].sum().item()
         return {"test_return": total, "test_action_variation": _variation(episode["action"])}
 

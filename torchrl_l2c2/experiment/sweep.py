@@ -29,10 +29,11 @@ class Sweep:
 
     Attributes:
         begun_by: the process that began it.
-        job_is_here: whether a job runs in this process, which began the sweep.
+        job_is_here: whether a job runs in this process.
     """
 
     job_is_here = False
+    _following = False
 
     def __init__(self, folder: Path, begun_by: int) -> None:
         self._folder, self.begun_by = folder, begun_by
@@ -85,37 +86,34 @@ class Sweep:
     def job(self) -> Iterator[None]:
         """A job of the sweep runs within it: a stop ends it in order, wherever it is."""
         if os.getpid() != self.begun_by:
-            with self._followed():
-                yield
-            return
+            self._follow()
         Sweep.job_is_here = True
         try:
             yield
         finally:
             Sweep.job_is_here = False
 
-    @contextlib.contextmanager
-    def _followed(self) -> Iterator[None]:
-        """A stop reaches this process as SIGTERM, and it dies with the one that began the sweep."""
+    def _follow(self) -> None:
+        """A stop reaches this process as SIGTERM, and it dies with the one that began the sweep.
+
+        Also between two jobs, when it waits for one that will never come.
+        """
         signal.signal(signal.SIGTERM, terminate)
-        ended = threading.Event()
+        if Sweep._following:
+            return
+        Sweep._following = True
 
         def follow() -> None:
             told = False
-            while not ended.wait(POLL_SECONDS):
+            while True:
+                time.sleep(POLL_SECONDS)
                 if os.getppid() != self.begun_by:
                     os._exit(1)
-                if not told and self.stopped_by is not None:
+                if not told and Sweep.job_is_here and self.stopped_by is not None:
                     told = True
                     _thread.interrupt_main(signal.SIGTERM)
 
-        follower = threading.Thread(target=follow, daemon=True)
-        follower.start()
-        try:
-            yield
-        finally:
-            ended.set()
-            follower.join()
+        threading.Thread(target=follow, daemon=True).start()
 
 
 @contextlib.contextmanager
