@@ -464,6 +464,10 @@ def test_a_sweep_gives_one_table(tmp_path):
         ("l2c2", 0),
         ("l2c2", 1),
     ]
+    # Each says where the sweep stands, and how long the rest takes by those before.
+    assert "run 1 of 4: Pendulum-v1, ppo_rpe, none, seed 0" in done.stdout
+    assert "run 4 of 4, about 1 min left: Pendulum-v1, ppo_rpe, l2c2, seed 1" in done.stdout
+    assert "run 4 of 4, about 1 min left; episode 3 of 3" in done.stderr
     # At the end of the sweep, of its own runs.
     late, last = done.stdout.split("picture:")[-1].split("**Last policy**")
     for rows in (late, last):

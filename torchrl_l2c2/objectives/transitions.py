@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import (
     DreamerActorLoss,
@@ -100,7 +100,8 @@ def find_transitions(
 
 def next_key(key: NestedKey) -> NestedKey:
     """Where the successor of an entry lies."""
-    return unravel_key(("next", key))
+    # Not by unravel_key, which Dynamo leaves out.
+    return ("next", *key) if isinstance(key, tuple) else ("next", key)
 
 
 def _is_floating_point(value: object) -> bool:
