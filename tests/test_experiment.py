@@ -396,6 +396,9 @@ def test_a_run_from_the_command_line_leaves_everything_behind(tmp_path):
     assert run.folder.relative_to(tmp_path).as_posix() == (
         "Pendulum-v1/ppo_rpe/l2c2/max_steps-50_compile-false/seed_0"
     )
+    # The field's measures, of the means and of the samples that were played.
+    assert 0 < run.evaluation["summary"]["roughness_mean"] < 0.5
+    assert len(run.evaluation["sampled"]["episodes"]["measures"]["sampled_sm_asap"]) == 2
     assert "torchrl" in json.loads((run.folder / "versions.json").read_text())
     config = json.loads((run.folder / "config.json").read_text())
     assert ExperimentConfig.from_dict(config).task.env_id == "Pendulum-v1"
