@@ -23,7 +23,7 @@ objectives.regularized
 objectives.l2c2 objectives.caps objectives.ppo_rpe
 objectives.__init__
 trainers __init__
-experiment.settings experiment.compilation experiment.spaces
+experiment.settings experiment.compilation experiment.spaces experiment.guard
 experiment.loggers
 experiment.folder
 experiment.environments experiment.lock experiment.signals
@@ -50,7 +50,7 @@ experiment.reports.__init__
 experiment.reports.__main__
 experiment.workers
 experiment.evaluate experiment.update experiment.player experiment.manual
-experiment.influence experiment.best_policy
+experiment.influence experiment.best_policy experiment.export
 experiment.learner
 experiment.continuation experiment.schedules
 experiment.training

@@ -137,6 +137,29 @@ def test_the_failed_jobs_of_a_sweep_are_named_at_its_end(tmp_path):
     assert len(list((tmp_path / "o").rglob("evaluation.json"))) == 1
 
 
+def test_a_process_that_waits_for_a_job_ends_with_its_sweep(tmp_path):
+    """A launcher's worker that never got one, after the sweep was killed."""
+    begin = (
+        "import subprocess, sys, time\n"
+        "from torchrl_l2c2.experiment.sweep import begin_sweep\n"
+        "with begin_sweep():\n"
+        "    subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(600)'])\n"
+        "    print('begun', flush=True)\n"
+        "    time.sleep(600)\n"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", begin],
+        stdout=subprocess.PIPE,
+        start_new_session=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+    assert process.stdout.readline() == b"begun\n"
+    assert len(alive(process.pid)) == 3  # with the guard
+    process.kill()
+    process.wait()
+    wait_until(lambda: not alive(process.pid), 20)
+
+
 def test_a_sweep_says_how_much_of_it_is_left():
     """By the mean of what is finished: 15 of 18 runs at 40 minutes, two at once."""
     with begin_sweep(["-m", "seed=0,1,2", "~logger"]) as begun:

@@ -80,6 +80,30 @@ def time_limit(task: TaskConfig) -> int:
     return registered
 
 
+def control_rate(env: EnvBase) -> float | None:
+    """Actions per second of simulated time; ``None`` where the simulator does not say.
+
+    Args:
+        env (EnvBase): of :func:`make_env`, reset at least once.
+
+    Examples:
+        >>> from torchrl.envs import GymEnv
+        >>> control_rate(GymEnv("Pendulum-v1"))
+        20.0
+    """
+    simulator = getattr(env, "base_env", env).unwrapped
+    # MuJoCo's and the classic tasks; Bullet's; the cart pole.
+    for owner, name in (
+        (simulator, "dt"),
+        (getattr(simulator, "scene", None), "dt"),
+        (simulator, "tau"),
+    ):
+        if seconds := getattr(owner, name, None):
+            return round(1.0 / float(seconds), 6)
+    frames: float | None = simulator.metadata.get("render_fps")
+    return frames
+
+
 def _make(task: TaskConfig) -> Env:
     limit = time_limit(task)
     with _explained(task), quiet_output():

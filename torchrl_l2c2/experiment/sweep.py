@@ -6,12 +6,14 @@ A folder in the system's temporary one holds it: whether the sweep is to stop, a
 from __future__ import annotations
 
 import _thread
+import atexit
 import contextlib
 import json
 import math
 import os
 import signal
 import statistics
+import subprocess
 import sys
 import tempfile
 import threading
@@ -26,6 +28,7 @@ from torchrl_l2c2.experiment.signals import FINISHING, SAME_SIGNAL_SECONDS, term
 
 VARIABLE = "TORCHRL_L2C2_SWEEP"  # of the environment, which a launcher's processes inherit
 POLL_SECONDS = 0.2
+GUARD = Path(__file__).with_name("guard.py")
 
 
 class Sweep:
@@ -118,10 +121,7 @@ class Sweep:
             Sweep.job_is_here = False
 
     def _follow(self) -> None:
-        """A stop reaches this process as SIGTERM, and it dies with the one that began the sweep.
-
-        Also between two jobs, when it waits for one that will never come.
-        """
+        """A stop reaches this process as SIGTERM, and it dies with the one that began the sweep."""
         signal.signal(signal.SIGTERM, terminate)
         if Sweep._following:
             return
@@ -138,6 +138,17 @@ class Sweep:
                     _thread.interrupt_main(signal.SIGTERM)
 
         threading.Thread(target=follow, daemon=True).start()
+
+
+def _start_guard(mark: str) -> None:
+    """Starts what ends the processes with this mark in their environment when this one is gone."""
+    if not Path("/proc/self/environ").exists():
+        return
+    command = [sys.executable, "-I", "-S", str(GUARD), mark]
+    guard = subprocess.Popen(command, stdin=subprocess.PIPE)
+    assert guard.stdin is not None
+    # Before the launcher registers anything, hence after it at the end.
+    atexit.register(guard.stdin.close)
 
 
 def count_jobs(overrides: Sequence[str], params: Mapping[str, str]) -> int:
@@ -184,6 +195,7 @@ def begin_sweep(overrides: Sequence[str] = ()) -> Iterator[Sweep]:
             elif time.monotonic() - first > SAME_SIGNAL_SECONDS:
                 terminate(number, frame)
 
+        _start_guard(folder)
         os.environ[VARIABLE] = json.dumps([folder, os.getpid(), [*overrides]])
         previous = {n: signal.signal(n, receive) for n in (signal.SIGINT, signal.SIGTERM)}
         try:

@@ -1,0 +1,204 @@
+"""What leaves the package acts as what was trained."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torchrl.envs import ExplorationType, GymWrapper, set_exploration_type
+
+from torchrl_l2c2.experiment import (
+    DQNConfig,
+    Experiment,
+    ExperimentConfig,
+    PPOConfig,
+    PPORPEConfig,
+    SACConfig,
+    TaskConfig,
+    TD3Config,
+    UniformReplayConfig,
+    evaluate_policy,
+)
+from torchrl_l2c2.experiment.environments import control_rate
+from torchrl_l2c2.experiment.evaluate import load_policy
+from torchrl_l2c2.experiment.export import export_policy, main
+
+onnxruntime = pytest.importorskip("onnxruntime")
+ROOT = Path(__file__).parents[1]
+ALGORITHMS = {
+    "ppo_rpe": PPORPEConfig(hidden=(16,)),
+    "sac": SACConfig(random_frames=10, hidden=(16,)),
+    "td3": TD3Config(random_frames=10, hidden=(16,)),
+    "ppo": PPOConfig(frames=30, epochs=2),
+    "dqn": DQNConfig(random_frames=10, hidden=(16,)),
+}
+
+
+def finished_run(folder, name="ppo_rpe", **task):
+    env_id = "CartPole-v1" if name == "dqn" else "Pendulum-v1"
+    replay = {"replay": UniformReplayConfig(batch_size=16)} if name in ("sac", "td3", "dqn") else {}
+    config = ExperimentConfig(
+        task=TaskConfig("task", **{"env_id": env_id, "episodes": 3, "max_steps": 40, **task}),
+        algorithm=ALGORITHMS[name],
+        compile=False,
+        test_episodes=1,
+        late_share=0.0,
+        **replay,
+    )
+    run = Experiment(config, folder)
+    run.train()
+    run.finish(run.test())
+    run.close()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def pendulum(tmp_path_factory):
+    """A run with noise on its observations, exported."""
+    folder = finished_run(tmp_path_factory.mktemp("run"), noise_scale=0.05)
+    return export_policy(folder), folder
+
+
+def onnx_actor(path):
+    session = onnxruntime.InferenceSession(path)
+
+    def act(observation):
+        batch = observation.reshape(1, *observation.shape).numpy()
+        return torch.from_numpy(session.run(["action"], {"observation": batch})[0][0])
+
+    return TensorDictModule(act, in_keys=["observation"], out_keys=["action"])
+
+
+def test_over_ten_episodes_the_return_is_that_of_pytorch(pendulum):
+    """On the same seeds and noise; so is the action variation."""
+    exported, folder = pendulum
+    results = []
+    for exchange in (lambda policy: policy, lambda _: onnx_actor(exported.folder / "policy.onnx")):
+        policy, env, steps = load_policy(folder, seed=3)
+        results.append(evaluate_policy(exchange(policy), env, 10, max_steps=steps))
+    ours, theirs = results
+    np.testing.assert_allclose(theirs.returns, ours.returns, rtol=1e-4)
+    np.testing.assert_allclose(theirs.action_variations, ours.action_variations, rtol=1e-3)
+
+
+def test_the_contract_says_what_the_simulator_says(pendulum):
+    """Order, bounds and rate; the difference was measured on a whole episode."""
+    exported, _ = pendulum
+    contract = json.loads((exported.folder / "contract.json").read_text())
+    assert contract == exported.contract
+    assert contract["task"] == "Pendulum-v1" and contract["noise_scale"] == 0.05
+    assert contract["observation"]["shape"] == ["batch", 3]
+    assert contract["observation"]["entries"][2] == "observation[2]"
+    assert contract["action"]["low"] == [-2.0] and contract["action"]["high"] == [2.0]
+    assert contract["actions_per_second"] == 20.0 and contract["longest_episode"] == 40
+    assert contract["agreement"]["observations"] == 40
+    assert contract["agreement"]["largest_difference"] < 1e-5
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_every_algorithms_policy_is_the_same_in_all_three_forms(tmp_path, name):
+    """In batches of any size; discrete actions are their numbers."""
+    folder = finished_run(tmp_path, name)
+    exported = export_policy(folder)
+    policy, env, _ = load_policy(folder)
+    observations = torch.randn(7, env.observation_spec["observation"].shape[-1])
+    session = onnxruntime.InferenceSession(exported.folder / "policy.onnx")
+    (onnx,) = session.run(["action"], {"observation": observations.numpy()})
+    program = torch.export.load(exported.folder / "policy.pt2").module()(observations)
+    with torch.no_grad():
+        expected = torch.stack([mean_action(policy, each) for each in observations])
+    if name == "dqn":
+        expected = expected.argmax(-1)
+        assert onnx.dtype == np.int64 and exported.contract["action"]["choices"] == 2
+    torch.testing.assert_close(program, expected, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(onnx, expected.numpy(), rtol=1e-4, atol=1e-5)
+
+
+def mean_action(policy, observation):
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        return policy(TensorDict({"observation": observation}))["action"]
+
+
+def test_named_observations_keep_their_names(tmp_path):
+    """In the order in which the policy reads them, which is not that of the space."""
+    exported = export_policy(finished_run(tmp_path, env_id="Named-v0"))
+    assert exported.contract["observation"]["entries"] == ["angle[0]", "speed[0]", "speed[1]"]
+
+
+class Named(gymnasium.Env):
+    """Two entries, unsorted."""
+
+    observation_space = gymnasium.spaces.Dict(
+        {"speed": gymnasium.spaces.Box(-1, 1, (2,)), "angle": gymnasium.spaces.Box(-1, 1, (1,))}
+    )
+    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        return self.observation_space.sample(), 0.0, False, False, {}
+
+
+gymnasium.register("Named-v0", Named)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "rate"),
+    [
+        ("Pendulum-v1", 20.0),
+        ("CartPole-v1", 50.0),
+        ("MountainCar-v0", 30.0),
+        ("Named-v0", None),
+        ("pybullet_envs_gymnasium:HopperBulletEnv-v0", 1 / 0.0165),
+    ],
+)
+def test_the_rate_of_control_is_the_simulators(env_id, rate):
+    """Of its step, else of its pictures, else unknown."""
+    env = GymWrapper(gymnasium.make(env_id), categorical_action_encoding=True)
+    env.reset()
+    assert control_rate(env) == (None if rate is None else pytest.approx(rate, rel=1e-5))
+
+
+def test_the_example_plays_it_without_this_package(pendulum, tmp_path):
+    """Under 80 lines; neither torch nor this package is imported."""
+    exported, _ = pendulum
+    example = ROOT / "examples" / "onnx_policy.py"
+    assert len(example.read_text().splitlines()) < 80
+    hidden = tmp_path / "sitecustomize.py"
+    hidden.write_text("import sys; sys.modules.update(torch=None, torchrl_l2c2=None)")
+    done = subprocess.run(
+        [sys.executable, example, exported.folder, "2"],
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    told = dict(re.findall(r"^([a-z ]+) (\S+)$", done.stdout, re.M))
+    assert -1000 < float(told["return"]) < 0 < float(told["action variation"]) < 4
+
+
+def test_the_command_prints_the_contract_and_says_what_is_wrong(pendulum, tmp_path, capsys):
+    """A folder that is no run, and an extra that is missing, are one line."""
+    _, folder = pendulum
+    main([str(folder), "--output", str(tmp_path / "elsewhere")])
+    assert json.loads(capsys.readouterr().out)["policy"] == "policy.pt"
+    assert (tmp_path / "elsewhere" / "policy.onnx").exists()
+    with pytest.raises(SystemExit, match=r"error: '.*' is not the folder of a run"):
+        main([str(tmp_path)])
+
+
+def test_without_the_extra_it_says_how_to_get_it(pendulum, monkeypatch):
+    """Before anything is played."""
+    monkeypatch.setattr("torchrl_l2c2.experiment.export.find_spec", lambda name: None)
+    with pytest.raises(ImportError, match=r'onnxscript is missing: pip install "torchrl-l2c2\[exp'):
+        export_policy(pendulum[1])

@@ -1,0 +1,282 @@
+"""A policy to take away: its mean as ONNX and as a ``torch.export`` program, with a contract.
+
+``python -m torchrl_l2c2.experiment.export FOLDER`` makes them of a run's policy.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import logging
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.data import OneHot
+from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
+
+from torchrl_l2c2.experiment.collection import EpisodeCollector
+from torchrl_l2c2.experiment.environments import control_rate
+from torchrl_l2c2.experiment.evaluate import load_policy
+from torchrl_l2c2.experiment.folder import make_folder, versions, write_atomically, write_json
+from torchrl_l2c2.experiment.process import ProcessState
+
+NEEDED = ("onnx", "onnxruntime", "onnxscript")
+# Of the largest action there is: float32 kernels that sum in another order stay far below.
+TOLERANCE = 1e-4
+
+
+class MeanPolicy(nn.Module):
+    """A policy's mean as a function of tensors: observations ``[B, *F]`` to actions ``[B, A]``.
+
+    All that belongs to it is inside: layers, squashing, bounds. Discrete ones are numbers ``[B]``.
+
+    Args:
+        policy (TensorDictModule): acts deterministically under ``ExplorationType.DETERMINISTIC``.
+        discrete (bool): whether its actions are one-hot vectors. Default ``False``.
+    """
+
+    def __init__(self, policy: TensorDictModule, discrete: bool = False) -> None:
+        super().__init__()
+        self.policy = policy
+        self.discrete = discrete
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """The mean actions at these observations."""
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            batch = TensorDict({"observation": observation}, observation.shape[:1])
+            action: Tensor = self.policy(batch)["action"]
+        return action.argmax(-1) if self.discrete else action
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What an export wrote.
+
+    Attributes:
+        folder: with ``policy.onnx``, ``policy.pt2`` and ``contract.json``.
+        contract: what the last one says.
+    """
+
+    folder: Path
+    contract: dict[str, Any]
+
+
+def export_policy(
+    run: str | Path, output: str | Path | None = None, *, best: bool = False, episodes: int = 1
+) -> Exported:
+    """Writes the mean policy of a run for use without this package, and proves that it is the same.
+
+    ``policy.onnx`` has an input ``observation`` ``[batch, *F]`` and an output ``action``
+    ``[batch, A]`` (``[batch]`` of whole numbers where actions are discrete), float32;
+    ``policy.pt2`` is the same as a ``torch.export`` program. ``contract.json`` says in which order
+    observations and actions come, their bounds, how often an action is due, how far the exported
+    policy is from PyTorch's on recorded observations, and how long one action takes.
+
+    Args:
+        run (str or Path): a run's folder.
+        output (str or Path, optional): where the files go. Default: ``export/`` in the folder.
+
+    Keyword Args:
+        best (bool): whether to take ``policy_best.pt``. Default ``False``.
+        episodes (int): that are played to record observations, at least 1. Default 1.
+
+    Returns:
+        Exported: the folder and the contract.
+
+    Raises:
+        ImportError: a package of the ``export`` extra is missing.
+        FileNotFoundError: the folder holds no run, or no policy yet.
+        RuntimeError: the exported policy differs from PyTorch's; nothing is written.
+    """
+    missing = [name for name in NEEDED if find_spec(name) is None]
+    if missing:
+        raise ImportError(
+            f'{", ".join(missing)} is missing: pip install "torchrl-l2c2[export]" brings it.'
+        )
+    policy, env, max_steps = load_policy(run, best=best)
+    with ProcessState(0):
+        observations = _record(policy, env, max_steps, episodes)
+    mean = MeanPolicy(policy, isinstance(env.action_spec, OneHot)).eval()
+    program, content = _translate(mean, observations[:2])
+    act = _onnx_function(content)
+    agreement = _compare(mean, act, observations)
+    contract = {
+        **_origin(Path(run), best),
+        "observation": _describe_observation(env),
+        "action": _describe_action(env),
+        "actions_per_second": control_rate(env),
+        "longest_episode": max_steps,
+        "agreement": agreement,
+        "microseconds_per_action": {
+            "onnxruntime": _microseconds(lambda: act(observations[:1].numpy())),
+            "torch": _microseconds(lambda: mean(observations[:1])),
+        },
+    }
+    env.close()
+    folder = make_folder(output or Path(run) / "export")
+    write_atomically(folder / "policy.onnx", content)
+    saved = io.BytesIO()
+    torch.export.save(program, saved)
+    write_atomically(folder / "policy.pt2", saved.getvalue())
+    write_json(folder / "contract.json", contract)
+    return Exported(folder, contract)
+
+
+def _record(policy: TensorDictModule, env: EnvBase, max_steps: int, episodes: int) -> Tensor:
+    collector = EpisodeCollector(
+        env,
+        policy,
+        frames_per_batch=max_steps,
+        exploration_type=ExplorationType.DETERMINISTIC,
+    )
+    seen = torch.cat([collector.rollout()["observation"] for _ in range(episodes)])
+    collector.shutdown(close_env=False)
+    return seen
+
+
+def _translate(mean: MeanPolicy, observations: Tensor) -> tuple[Any, bytes]:
+    batch = torch.export.Dim("batch")
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    with warnings.catch_warnings(), torch.no_grad():
+        warnings.simplefilter("ignore")
+        program = torch.export.export(mean, (observations,), dynamic_shapes=({0: batch},))
+        made = torch.onnx.export(
+            program,
+            input_names=["observation"],
+            output_names=["action"],
+            dynamo=True,
+            verbose=False,
+        )
+    assert made is not None
+    return program, made.model_proto.SerializeToString()
+
+
+def _onnx_function(content: bytes) -> Callable[[Any], Any]:
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1  # of one action there is nothing to share
+    session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    return lambda observation: session.run(["action"], {"observation": observation})[0]
+
+
+@torch.no_grad()
+def _compare(
+    mean: MeanPolicy, act: Callable[[Any], Any], observations: Tensor
+) -> dict[str, float | int]:
+    expected = mean(observations).numpy()
+    difference = float(np.abs(act(observations.numpy()) - expected).max())
+    largest = float(np.abs(expected).max())
+    if not difference <= TOLERANCE * max(1.0, largest):
+        raise RuntimeError(
+            f"the ONNX policy differs from PyTorch's by {difference:.3g} on {len(observations)} "
+            f"recorded observations, where actions go up to {largest:.3g}: it was not written."
+        )
+    return {"observations": len(observations), "largest_difference": difference}
+
+
+def _microseconds(function: Callable[[], Any], repeats: int = 200) -> float:
+    """The median time of a call, after some that are not counted."""
+    times = []
+    with torch.no_grad():
+        for _ in range(repeats + 20):
+            started = time.perf_counter()
+            function()
+            times.append(time.perf_counter() - started)
+    return round(1e6 * float(np.median(times[20:])), 2)
+
+
+def _origin(run: Path, best: bool) -> dict[str, Any]:
+    config = json.loads((run / "config.json").read_text())
+    return {
+        "task": config["task"]["env_id"],
+        "noise_scale": config["task"]["noise_scale"],
+        "algorithm": config["algorithm"]["name"],
+        "regularizer": config["regularizer"]["name"],
+        "seed": config["seed"],
+        "policy": "policy_best.pt" if best else "policy.pt",
+        "versions": versions(),
+    }
+
+
+def _describe_observation(env: EnvBase) -> dict[str, Any]:
+    shape = tuple(env.observation_spec["observation"].shape)
+    seen = getattr(env, "base_env", env).unwrapped.observation_space
+    described: dict[str, Any] = {"shape": ["batch", *shape], "dtype": "float32"}
+    if len(shape) == 1:
+        described["entries"] = entry_names(seen, shape[0])
+    return described
+
+
+def entry_names(space: Any, size: int) -> list[str]:
+    """What the numbers of an observation are called: by their keys, in the order of a vector.
+
+    Examples:
+        >>> space = spaces.Dict(speed=spaces.Box(0, 1, (2,)), angle=spaces.Box(0, 1, (1,)))
+        >>> entry_names(space, 3)
+        ['angle[0]', 'speed[0]', 'speed[1]']
+    """
+    names = []
+    if isinstance(space, spaces.Dict):
+        for key in sorted(space.spaces):
+            names += [f"{key}[{i}]" for i in range(spaces.flatdim(space[key]))]
+    # A wrapper may have changed what the task shows.
+    return names if len(names) == size else [f"observation[{i}]" for i in range(size)]
+
+
+def _describe_action(env: EnvBase) -> dict[str, Any]:
+    spec = env.action_spec
+    if isinstance(spec, OneHot):
+        return {"shape": ["batch"], "dtype": "int64", "choices": spec.shape[-1]}
+    size = spec.shape[-1]
+    described = {
+        "shape": ["batch", size],
+        "dtype": "float32",
+        "entries": [f"action[{i}]" for i in range(size)],
+    }
+    low, high = spec.space.low, spec.space.high
+    if low.isfinite().all() and high.isfinite().all():
+        described |= {"low": low.tolist(), "high": high.tolist()}
+    return described
+
+
+def main(arguments: Iterable[str] | None = None) -> None:
+    """The command line: exports, and prints the contract."""
+    parser = argparse.ArgumentParser(
+        prog="python -m torchrl_l2c2.experiment.export",
+        description="Writes a run's mean policy as ONNX and as a torch.export program.",
+    )
+    parser.add_argument("folder", help="a run's folder, finished or not")
+    parser.add_argument("--output", help="where the files go (default: export/ in the folder)")
+    parser.add_argument("--best", action="store_true", help="policy_best.pt instead of policy.pt")
+    parser.add_argument(
+        "--episodes", type=int, default=1, help="played to compare the policies (default: 1)"
+    )
+    chosen = parser.parse_args(None if arguments is None else list(arguments))
+    if chosen.episodes < 1:
+        parser.error(f"--episodes must be at least 1, got {chosen.episodes}")
+    try:
+        exported = export_policy(
+            chosen.folder, chosen.output, best=chosen.best, episodes=chosen.episodes
+        )
+    except (ValueError, OSError, RuntimeError, ImportError) as error:
+        sys.exit(f"error: {error}")
+    print(json.dumps(exported.contract, indent=2))
+    print(f"policy.onnx, policy.pt2 and contract.json: {exported.folder}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()
