@@ -50,7 +50,7 @@ experiment.reports.__init__
 experiment.reports.__main__
 experiment.workers
 experiment.evaluate experiment.update experiment.player experiment.manual
-experiment.influence experiment.best_policy experiment.export
+experiment.influence experiment.best_policy experiment.export experiment.video
 experiment.learner
 experiment.continuation experiment.schedules
 experiment.training

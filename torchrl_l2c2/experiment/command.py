@@ -42,7 +42,7 @@ PACKAGE = Path(__file__).parents[1]
 # Beside the package in a clone, within it when installed.
 CONF = next(folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if folder.is_dir())
 # What tells by itself what was wrong; anything else is a fault of the program.
-EXPECTED = (ValueError, OSError, RuntimeError, FloatingPointError)
+EXPECTED = (ValueError, OSError, RuntimeError, FloatingPointError, ImportError)
 HINTS: dict[type[Exception], str] = {
     SettingError: "--help lists every setting.",
     OtherRunError: "In a shell: outputs=FOLDER, allow_other_versions=true, task.episodes=N.",
@@ -188,7 +188,10 @@ def run(values: dict[str, Any], standing: str = "") -> FinishedRun | None:
     from torchrl_l2c2.experiment.folder import save_policy
     from torchrl_l2c2.experiment.reports import compare_with_paper, finished_run
     from torchrl_l2c2.experiment.training import Experiment
+    from torchrl_l2c2.experiment.video import check_video, record_video
 
+    if config.record:
+        check_video()
     for chatty in ("torchrl", "matplotlib", "torch"):
         logging.getLogger(chatty).setLevel(logging.ERROR)
     warnings.simplefilter("ignore", FutureWarning)
@@ -208,8 +211,13 @@ def run(values: dict[str, Any], standing: str = "") -> FinishedRun | None:
             tests = [experiment.test(sampled=s, progress=True) for s in (False, True)]
             finished = experiment.finish(*tests)
             log(folder, f"finished:\n{compare_with_paper(finished)}")
+    video = folder / "video.mp4"
+    if config.record and not video.exists():
+        record_video(folder, video)
     print(compare_with_paper(finished))
     print(f"picture: {folder / 'learning_curves.png'}", flush=True)
+    if video.exists():
+        print(f"video: {video}", flush=True)
     return finished
 
 

@@ -109,6 +109,10 @@ class ExperimentConfig:
         description="episodes of training from one test to the next, of 10 episodes; "
         "policy_best.pt is the best one's policy; 0: none",
     )
+    record: bool = Field(
+        default=False,
+        description="a test episode as video.mp4, after training (extra video)",
+    )
     late_share: float = Field(
         default=0.1,
         ge=0,
@@ -236,6 +240,7 @@ FREE_SETTINGS = {
     "test_episodes",
     "late_share",
     "evaluate_every",
+    "record",
     "threads",
     "checkpoint_interval",
     "checkpoint_keep",

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import gymnasium
 import torch
+from gymnasium.wrappers import RenderCollection
 from torchrl.envs import EnvBase, GymWrapper, TransformedEnv
 
 from torchrl_l2c2.experiment.spaces import (
@@ -29,12 +30,16 @@ if TYPE_CHECKING:
 TEST_SEED = 1_000_003
 
 
-def make_env(task: TaskConfig, seed: int) -> EnvBase:
+def make_env(task: TaskConfig, seed: int, *, render: bool = False) -> EnvBase:
     """Makes a task's environment, noisy and seeded.
 
     Args:
         task (TaskConfig): the Gymnasium id and the noise.
         seed (int): of the simulator and, separately, of the noise.
+
+    Keyword Args:
+        render (bool): whether every state is drawn; the Gymnasium environment's ``render()`` gives
+            the pictures since its last call. Default ``False``.
 
     Returns:
         EnvBase: a ``GymWrapper`` that observes one vector, or image, of float32, transformed by
@@ -42,13 +47,16 @@ def make_env(task: TaskConfig, seed: int) -> EnvBase:
 
     Raises:
         ValueError: an id that Gymnasium does not know, a task without a time limit, or one whose
-            observations or actions are not vectors of numbers, nor images where they are to be.
+            observations or actions are not vectors of numbers, nor images where they are to be;
+            or one that draws no pictures, with ``render``.
     """
-    simulator = taking_vector(_make(task))
+    simulator = taking_vector(_make(task, render))
     if task.images:
         simulator = observing_image(simulator)
     else:
         simulator = observing_vector(simulator, flatten=task.flatten)
+    if render:
+        simulator = RenderCollection(simulator)
     with quiet_output():
         env = GymWrapper(simulator)
         env.reset()
@@ -104,10 +112,18 @@ def control_rate(env: EnvBase) -> float | None:
     return frames
 
 
-def _make(task: TaskConfig) -> Env:
+def _make(task: TaskConfig, render: bool) -> Env:
     limit = time_limit(task)
     with _explained(task), quiet_output():
-        return gymnasium.make(task.env_id, max_episode_steps=limit)
+        if not render:
+            return gymnasium.make(task.env_id, max_episode_steps=limit)
+        try:
+            env = gymnasium.make(task.env_id, max_episode_steps=limit, render_mode="rgb_array")
+        except TypeError:  # It knows of no render_mode at all.
+            env = None
+    if env is None or env.render_mode != "rgb_array":
+        raise ValueError(f"{task.env_id} draws no pictures: it has no render_mode 'rgb_array'.")
+    return env
 
 
 @contextlib.contextmanager

@@ -238,6 +238,7 @@ def load_policy(
     seed: int | None = None,
     noise_scale: float | None = None,
     best: bool = False,
+    render: bool = False,
 ) -> tuple[TensorDictModule, EnvBase, int]:
     """A run's acting policy and a fresh environment of its task, from its folder alone.
 
@@ -253,6 +254,8 @@ def load_policy(
             Default: the task's.
         best (bool): whether to take the best policy of the tests during training, where
             ``evaluate_every`` had some, instead of the last. Default ``False``.
+        render (bool): whether the simulator draws pictures, as for
+            :func:`~.environments.make_env`. Default ``False``.
 
     Returns:
         The policy, the environment and the longest episode.
@@ -281,7 +284,7 @@ def load_policy(
     config = replace(config, device="cpu")
     noise = config.task.noise_scale if noise_scale is None else noise_scale
     task = replace(config.task, noise_scale=noise)
-    env = make_env(task, config.seed + TEST_SEED if seed is None else seed)
+    env = make_env(task, config.seed + TEST_SEED if seed is None else seed, render=render)
     agent = config.make_agent(env)
     saved = folder / ("policy_best.pt" if best else "policy.pt")
     if saved.exists():

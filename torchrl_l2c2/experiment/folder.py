@@ -51,6 +51,8 @@ policy_best.pt        the best one of evaluations.json, likewise (evaluate_every
 evaluations.json      tests during training (evaluate_every)
 evaluation.json       test episodes at the end
 learning_curves.png   a picture of metrics.csv
+video.mp4             a test episode (record)
+export/               the policy as ONNX and torch.export program (experiment.export)
 
 To load the policy, a TorchRL actor, with an environment of its task:
 

@@ -1,0 +1,98 @@
+"""Videos of test episodes: as long as the episodes, at the simulator's speed."""
+
+import os
+import subprocess
+import sys
+from itertools import pairwise
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+
+from torchrl_l2c2.experiment import Experiment, ExperimentConfig, PPORPEConfig, TaskConfig
+from torchrl_l2c2.experiment.evaluate import load_policy
+from torchrl_l2c2.experiment.video import main, play_pictures, record_video
+
+imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
+pytest.importorskip("pygame")
+ROOT = Path(__file__).parents[1]
+
+
+class Bare(gymnasium.Env):
+    """Draws nothing."""
+
+    observation_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(2, np.float32), 0.0, False, False, {}
+
+
+gymnasium.register("Bare-v0", Bare)
+
+
+def trained(folder, env_id="Pendulum-v1"):
+    config = ExperimentConfig(
+        task=TaskConfig("task", env_id, episodes=1, max_steps=20),
+        algorithm=PPORPEConfig(hidden=(8,)),
+        compile=False,
+        late_share=0.0,
+    )
+    run = Experiment(config, folder)
+    run.train()
+    run.save()
+    run.close()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def pendulum(tmp_path_factory):
+    return trained(tmp_path_factory.mktemp("run"))
+
+
+def test_a_video_has_every_state_at_the_simulators_speed(pendulum, tmp_path):
+    """Two episodes of 20 steps are 42 pictures, at 20 a second; nothing else stays behind."""
+    path = record_video(pendulum, tmp_path / "video.mp4", episodes=2)
+    frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(path))
+    assert frames == 42 and seconds == pytest.approx(42 / 20, abs=0.01)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_pictures_are_those_of_the_test_episode(pendulum):
+    """They change as it moves; drawing changes none of its numbers, nor the environment's."""
+    before = dict(os.environ)
+    ((episode, pictures, rate),) = play_pictures(pendulum, 1)
+    assert len(pictures) == len(episode) + 1 and rate == 20.0
+    assert all((a != b).any() for a, b in pairwise(pictures))
+    first = load_policy(pendulum)[1].reset()["observation"]
+    assert np.array_equal(first.numpy(), episode["observation"][0].numpy())
+    assert dict(os.environ) == before
+
+
+def test_a_task_that_draws_nothing_is_refused(tmp_path):
+    """In one line; by the command as well."""
+    folder = trained(tmp_path, "Bare-v0")
+    with pytest.raises(ValueError, match=r"Bare-v0.*rgb_array"):
+        record_video(folder)
+    with pytest.raises(SystemExit, match=r"error: .*Bare-v0"):
+        main([str(folder)])
+    assert not list(folder.glob("*video*"))
+
+
+def test_recording_is_a_setting(tmp_path):
+    """After training; the command says where it is."""
+    command = [
+        *(sys.executable, ROOT / "train.py", "task=gymnasium", "task.env_id=Pendulum-v1"),
+        *("task.episodes=1", "task.max_steps=20", "compile=false", "test_episodes=1"),
+        *("record=true", f"outputs={tmp_path}"),
+    ]
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, env=env, capture_output=True, text=True, check=True)
+    (video,) = tmp_path.rglob("video.mp4")
+    assert f"video: {video}" in done.stdout
+    assert imageio_ffmpeg.count_frames_and_secs(str(video))[0] == 21

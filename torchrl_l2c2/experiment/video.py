@@ -1,0 +1,184 @@
+"""Test episodes as the simulator draws them, as a video.
+
+``python -m torchrl_l2c2.experiment.video FOLDER`` records a run's policy.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from torchrl.envs import ExplorationType
+
+from torchrl_l2c2.experiment.collection import EpisodeCollector
+from torchrl_l2c2.experiment.environments import control_rate
+from torchrl_l2c2.experiment.evaluate import load_policy
+from torchrl_l2c2.experiment.process import ProcessState
+
+Picture = NDArray[np.uint8]
+
+
+def check_video() -> None:
+    """Refuses to record where there is nothing to encode with.
+
+    Raises:
+        ImportError: the ``video`` extra is missing.
+    """
+    if find_spec("imageio_ffmpeg") is None:
+        raise ImportError('imageio-ffmpeg is missing: pip install "torchrl-l2c2[video]" brings it.')
+
+
+def record_video(
+    run: str | Path,
+    path: str | Path | None = None,
+    *,
+    episodes: int = 1,
+    seed: int | None = None,
+    noise_scale: float | None = None,
+    best: bool = False,
+) -> Path:
+    """Writes a video of test episodes with a run's mean policy, at the speed of simulated time.
+
+    Args:
+        run (str or Path): a run's folder.
+        path (str or Path, optional): of the file; its ending, such as ``.mp4``, says what it is.
+            Default: ``video.mp4`` in the folder.
+
+    Keyword Args:
+        episodes (int): how many, one after the other, at least 1. Default 1.
+        seed (int, optional): of the environment and its noise. Default: that of the run's test, so
+            that these are its first episodes.
+        noise_scale (float, optional): of the environment's noise. Default: the task's.
+        best (bool): whether to take ``policy_best.pt``. Default ``False``.
+
+    Returns:
+        Path: of the file.
+
+    Raises:
+        ImportError: the ``video`` extra is missing.
+        ValueError: the task draws no pictures, or fewer than one episode.
+        FileNotFoundError: the folder holds no run, or no policy yet.
+    """
+    check_video()
+    if episodes < 1:
+        raise ValueError(f"episodes must be at least 1, got {episodes}.")
+    path = Path(path or Path(run) / "video.mp4")
+    played = list(play_pictures(run, episodes, seed=seed, noise_scale=noise_scale, best=best))
+    rate = played[0][2]
+    write_video(path, [picture for _, seen, _ in played for picture in seen], rate or 30.0)
+    return path
+
+
+def play_pictures(
+    run: str | Path,
+    episodes: int,
+    *,
+    seed: int | None = None,
+    noise_scale: float | None = None,
+    best: bool = False,
+) -> Iterator[tuple[TensorDictBase, list[Picture], float | None]]:
+    """Test episodes with the pictures of every state, and the pictures per second.
+
+    The arguments are those of :func:`record_video`.
+
+    Yields:
+        tuple: an episode ``[T]``; its ``T + 1`` pictures, from the reset on; their rate, or
+        ``None`` where the simulator does not say.
+    """
+    with _without_a_screen():
+        policy, env, max_steps = load_policy(
+            run, seed=seed, noise_scale=noise_scale, best=best, render=True
+        )
+        collector = EpisodeCollector(
+            env,
+            policy,
+            frames_per_batch=max_steps,
+            exploration_type=ExplorationType.DETERMINISTIC,
+        )
+        simulator = getattr(env, "base_env", env)._env
+        for _ in range(episodes):
+            with ProcessState(seed or 0):
+                episode = collector.rollout()
+            yield episode, list(simulator.render()), control_rate(env)
+        collector.shutdown()
+
+
+def write_video(path: Path, pictures: Sequence[Picture], rate: float) -> None:
+    """Encodes pictures ``[H, W, 3]`` of bytes; the file is there when it is whole.
+
+    Raises:
+        OSError: it could not be written.
+    """
+    import imageio_ffmpeg
+
+    height, width, _ = pictures[0].shape
+    partial = path.with_name(f".partial_{path.name}")
+    writer = imageio_ffmpeg.write_frames(
+        str(partial),
+        (width, height),
+        fps=rate,
+        macro_block_size=2,  # an odd side is stretched by a pixel, which the encoder needs
+        ffmpeg_log_level="error",
+    )
+    try:
+        writer.send(None)
+        for picture in pictures:
+            writer.send(np.ascontiguousarray(picture))
+        writer.close()
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _without_a_screen() -> Iterator[None]:
+    """MuJoCo and SDL look for a screen unless told otherwise."""
+    known = {"MUJOCO_GL": "egl", "SDL_VIDEODRIVER": "dummy"}
+    told = (
+        {} if "DISPLAY" in os.environ else {k: v for k, v in known.items() if k not in os.environ}
+    )
+    os.environ.update(told)
+    try:
+        yield
+    finally:
+        for name in told:
+            del os.environ[name]
+
+
+def main(arguments: Iterable[str] | None = None) -> None:
+    """The command line: records, and says where the video is."""
+    parser = argparse.ArgumentParser(
+        prog="python -m torchrl_l2c2.experiment.video",
+        description="Records test episodes of a run's mean policy.",
+    )
+    parser.add_argument("folder", help="a run's folder, finished or not")
+    parser.add_argument("--output", help="the file (default: video.mp4 in the folder)")
+    parser.add_argument("--episodes", type=int, default=1, help="how many (default: 1)")
+    parser.add_argument("--seed", type=int, help="of all randomness (default: the test's own)")
+    parser.add_argument("--noise", type=float, help="on observations (default: the task's)")
+    parser.add_argument("--best", action="store_true", help="policy_best.pt instead of policy.pt")
+    chosen = parser.parse_args(None if arguments is None else list(arguments))
+    try:
+        path = record_video(
+            chosen.folder,
+            chosen.output,
+            episodes=chosen.episodes,
+            seed=chosen.seed,
+            noise_scale=chosen.noise,
+            best=chosen.best,
+        )
+    except (ValueError, OSError, RuntimeError, ImportError) as error:
+        sys.exit(f"error: {error}")
+    print(path)
+
+
+if __name__ == "__main__":
+    main()
