@@ -15,10 +15,11 @@ LAYERS = """
 _version _checks
 neighborhood affinities
 distances transforms metrics modules updaters optim.adaterm
+policy_distances
 optim.__init__
 objectives.specialization objectives.evaluation objectives.shared_evaluation
 objectives.transitions objectives.relative_pearson
-objectives.regularized
+objectives.regularized objectives.neighbors
 objectives.l2c2 objectives.caps objectives.ppo_rpe
 objectives.__init__
 trainers __init__

@@ -420,6 +420,61 @@ class TestMonteCarlo:
         assert found.item() == pytest.approx(expected.item(), rel=0.03)
 
 
+class TestPolicyDistances:
+    """Means move by 0 and 2, of normals with the standard deviation 1/2."""
+
+    @pytest.mark.parametrize(
+        ("distance", "diagnostic", "difference"),
+        [
+            ("hellinger", "l2c2_hellinger", HELLINGER),
+            ("mean", "l2c2_mean_distance", 0.5 * 2.0**2),
+            ("kl", "l2c2_kl", 2.0**2 / (2 * 0.5**2)),
+            (lambda p, q: (p.mean - q.mean).abs().sum(-1), "l2c2_policy_distance", 2.0),
+        ],
+        ids=["hellinger", "mean", "kl", "function"],
+    )
+    def test_the_one_that_was_chosen_is_trained_and_logged(self, distance, diagnostic, difference):
+        """The term has its gain, the diagnostic its name."""
+        loss = linear_loss(policy_distance=distance)
+        terms = loss.policy_regularizer(linear_batch())
+        expected = 0.25 / 1.25 * difference / 2
+        assert terms["loss_l2c2_actor"].item() == pytest.approx(expected, rel=1e-6)
+        assert terms[diagnostic].item() == pytest.approx(difference / 2, rel=1e-6)
+        assert diagnostic in loss.out_keys
+        (gradient,) = torch.autograd.grad(
+            terms["loss_l2c2_actor"], loss.actor_network.module[0].module.weight
+        )
+        assert gradient.abs().sum() > 0
+
+    @pytest.mark.parametrize("distance", ["hellinger", "mean"])
+    def test_deterministic_policies_have_their_actions_compared(self, distance):
+        """By the same number, under its own name."""
+        torch.manual_seed(0)
+        base, batch = DDPGLoss(deterministic_actor(), qvalue()), transitions(4)
+        batch = NeighborTransform(NEAR)(batch)
+        expected = L2C2Loss(base, NEAR).policy_regularizer(batch)
+        found = L2C2Loss(base, NEAR, policy_distance=distance).policy_regularizer(batch)
+        assert found["l2c2_action_distance"] == expected["l2c2_action_distance"]
+
+    @pytest.mark.parametrize("distance", ["kl", lambda p, q: p.mean])
+    def test_deterministic_policies_have_no_other(self, distance):
+        """The error says what to do."""
+        base = DDPGLoss(deterministic_actor(), qvalue())
+        with pytest.raises(TypeError, match=r"DDPGLoss has a deterministic policy.*its default"):
+            L2C2Loss(base, policy_distance=distance)
+
+    @pytest.mark.parametrize("distance", ["mean", "kl"])
+    def test_they_compile_into_one_graph(self, distance):
+        """With the eager numbers, squashed policies included."""
+        torch.manual_seed(0)
+        base = SACLoss(gaussian_actor(), qvalue(), action_spec=BOUNDS)
+        loss, batch = L2C2Loss(base, NEAR, policy_distance=distance), transitions(4)
+        batch = NeighborTransform(NEAR)(batch)
+        expected = loss.policy_regularizer(batch)["loss_l2c2_actor"]
+        compiled = torch.compile(loss.policy_regularizer, fullgraph=True, backend="eager")
+        torch.testing.assert_close(compiled(batch)["loss_l2c2_actor"], expected)
+
+
 class TestConstruction:
     @pytest.mark.parametrize(
         ("settings", "error", "message"),
@@ -429,6 +484,11 @@ class TestConstruction:
             ({"num_samples": 1.5}, TypeError, "num_samples must be an integer"),
             ({"hellinger_samples": 0}, ValueError, "hellinger_samples must be at least 1"),
             ({"hellinger_samples": "8"}, TypeError, "hellinger_samples must be an integer"),
+            (
+                {"policy_distance": "w2"},
+                ValueError,
+                "policy_distance must be 'hellinger' or 'mean'",
+            ),
             ({"beta": -0.1}, ValueError, "l2c2_beta must be finite and at least 0, got -0.1"),
             ({"beta": "0.1"}, TypeError, "l2c2_beta must be a real number"),
         ],

@@ -219,3 +219,16 @@ FREE_SETTINGS = {
 }
 # More episodes or frames are a longer run of the same kind.
 FREE_TASK_SETTINGS = {"name", "episodes", "frames", "solved_at"}
+# Settings that are newer than some runs, with the value at which they change none of the numbers.
+# Others are newer, too: null and false always are such values.
+NEUTRAL_SETTINGS = {"regularizer.policy_distance": "hellinger"}
+
+
+def is_neutral(name: str, value: Any) -> bool:
+    """Whether a run of before there was this setting has the numbers of one with this value.
+
+    Args:
+        name (str): with its group, such as ``"regularizer.policy_distance"``.
+        value: of the setting.
+    """
+    return value is None or value is False or NEUTRAL_SETTINGS.get(name) == value

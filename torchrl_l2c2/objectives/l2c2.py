@@ -5,10 +5,10 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import astuple
-from math import isclose
+from typing import Literal
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torch.distributions import Categorical, Distribution
 from torchrl.objectives import DistributionalDQNLoss, LossModule
@@ -16,9 +16,16 @@ from torchrl.objectives import DistributionalDQNLoss, LossModule
 from torchrl_l2c2._checks import check_positive_int
 from torchrl_l2c2.distances import squared_error, squared_hellinger
 from torchrl_l2c2.neighborhood import Neighborhood
-from torchrl_l2c2.objectives.evaluation import VALUE_NETWORKS
+from torchrl_l2c2.objectives.evaluation import VALUE_NETWORKS, Policy
+from torchrl_l2c2.objectives.neighbors import read_neighbors, warn_of_other_neighbors
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
 from torchrl_l2c2.objectives.transitions import next_key
+from torchrl_l2c2.policy_distances import (
+    PolicyDistance,
+    check_deterministic,
+    choose_policy_distance,
+    distance_name,
+)
 from torchrl_l2c2.transforms import draw_neighbors
 
 
@@ -35,10 +42,11 @@ class L2C2Loss(RegularizedLoss):
 
     with the neighbors :math:`\tilde s`, their distances :math:`d` and :math:`\lambda_\pi` of a
     :class:`~torchrl_l2c2.Neighborhood`. :math:`d_\pi` is the squared Hellinger distance
-    (:func:`~torchrl_l2c2.squared_hellinger`) or, for deterministic policies, half the squared
-    distance of the actions. :math:`d_V = \tfrac12\lVert V(s) - V(\tilde s)\rVert_2^2` is taken over
-    all heads or members of an ensemble; of action values over all (discrete) actions, or at the
-    batch's action; of the value distributions of :class:`~torchrl.objectives.DistributionalDQNLoss`
+    (:func:`~torchrl_l2c2.squared_hellinger`) or what ``policy_distance`` says; for deterministic
+    policies half the squared distance of the actions.
+    :math:`d_V = \tfrac12\lVert V(s) - V(\tilde s)\rVert_2^2` is taken over all heads or members of
+    an ensemble; of action values over all (discrete) actions, or at the batch's action; of the
+    value distributions of :class:`~torchrl.objectives.DistributionalDQNLoss`
     it is the squared Hellinger distance, summed over the actions.
 
     Gradients flow into the policy's parameters from the one term, into the value function's from
@@ -62,9 +70,11 @@ class L2C2Loss(RegularizedLoss):
       its network: ``loss_l2c2_critic``, ``loss_l2c2_qvalue``, ``loss_l2c2_value``, ...
     * ``l2c2_distance``, the mean :math:`d`, and ``l2c2_gain``, the mean gain applied,
       :math:`\lambda_\pi / d`;
-    * ``l2c2_hellinger`` (``l2c2_action_distance`` for deterministic policies) and
-      ``l2c2_value_distance``, the mean :math:`d_\pi` and, summed over the value functions,
-      :math:`d_V`. With ``reduction="none"`` diagnostics are not averaged either.
+    * the mean :math:`d_\pi`, named after the distance: ``l2c2_hellinger``,
+      ``l2c2_mean_distance``, ``l2c2_kl``, ``l2c2_policy_distance`` for a function of one's own,
+      ``l2c2_action_distance`` for deterministic policies;
+    * ``l2c2_value_distance``, the mean :math:`d_V`, summed over the value functions. With
+      ``reduction="none"`` diagnostics are not averaged either.
 
     .. note:: The gains are buffers that can be assigned to, as in ``loss.l2c2_coeff = 0.5``, also
         between calls of a compiled loss. They are not part of the ``state_dict``.
@@ -82,6 +92,15 @@ class L2C2Loss(RegularizedLoss):
             gradients. Scheduled as ``l2c2_coeff``. Defaults to ``1.0``.
         num_samples (int): neighbors per state, drawn here or by the transform, at least 1. More
             give a less noisy estimate at so many times the network evaluations. Defaults to ``1``.
+        policy_distance (str or callable): :math:`d_\pi`. ``"hellinger"``, the paper's, lies in
+            ``[0, 1]`` and is relative to how wide the policies are; ``"mean"``
+            (:func:`~torchrl_l2c2.policy_distances.mean_distance`), half the squared distance of the
+            means before they are squashed, is not, and grows without a bound; ``"kl"``
+            (:func:`~torchrl_l2c2.policy_distances.kl_divergence`), that of the policy at :math:`s`
+            from the one at :math:`\tilde s`, is both relative and unbounded. They differ by orders
+            of magnitude: choose the gains anew. A function takes two distributions ``[K, *B]`` and
+            returns their distances ``[K, *B]``. Only the first two take deterministic policies.
+            Defaults to ``"hellinger"``.
         hellinger_samples (int, optional): actions drawn from each policy for the paper's Monte
             Carlo estimate of :math:`d_\pi`, at least 1. Defaults to ``None``, its closed form.
         neighbor_key (NestedKey): the entry that ``NeighborTransform`` writes. Defaults to
@@ -136,6 +155,7 @@ class L2C2Loss(RegularizedLoss):
         *,
         coeff: float = 1.0,
         num_samples: int = 1,
+        policy_distance: Literal["hellinger", "mean", "kl"] | PolicyDistance = "hellinger",
         hellinger_samples: int | None = None,
         neighbor_key: NestedKey = "neighbor",
     ) -> None:
@@ -143,8 +163,8 @@ class L2C2Loss(RegularizedLoss):
         if not isinstance(neighborhood, Neighborhood):
             raise TypeError(f"neighborhood must be a Neighborhood, got {neighborhood!r}.")
         check_positive_int("num_samples", num_samples)
-        if hellinger_samples is not None:
-            check_positive_int("hellinger_samples", hellinger_samples)
+        self.l2c2_policy_distance = policy_distance
+        self._l2c2_distance = choose_policy_distance(policy_distance, hellinger_samples)
         self.l2c2_neighborhood = neighborhood
         self.l2c2_num_samples = num_samples
         self.l2c2_hellinger_samples = hellinger_samples
@@ -157,6 +177,8 @@ class L2C2Loss(RegularizedLoss):
         _check_terms(type(base_loss).__name__, self._l2c2_policies, self._l2c2_values, beta)
         self.declare_networks([*self._l2c2_policies, *self._l2c2_values])
         policies, values = self._l2c2_policies, self._l2c2_values
+        if policies and not self.has_stochastic_policy():
+            check_deterministic(type(base_loss).__name__, policy_distance)
         self.declare_terms(
             policy=["loss_l2c2_actor" for _ in policies],
             value=[_value_term(network) for network in values],
@@ -173,11 +195,7 @@ class L2C2Loss(RegularizedLoss):
             return terms
         states, distance = self._neighbors(tensordict)
         here, there = self.policies_at(tensordict, states)
-        if isinstance(here, Tensor) and isinstance(there, Tensor):
-            difference = squared_error(here, there)
-        else:
-            assert isinstance(here, Distribution) and isinstance(there, Distribution)
-            difference = squared_hellinger(here, there, num_samples=self.l2c2_hellinger_samples)
+        difference = self._policy_difference(here, there)
         terms.set("loss_l2c2_actor", self._penalty(difference, distance, tensordict))
         terms.set(self._policy_diagnostic(), self.reduce_diagnostic(difference.mean(0), tensordict))
         return terms.update(self._gain_diagnostics(distance, tensordict))
@@ -220,18 +238,13 @@ class L2C2Loss(RegularizedLoss):
         if self._l2c2_compared or not drawn:  # an empty batch
             return
         self._l2c2_compared = True
-        own = astuple(self.l2c2_neighborhood)
-        # The batch has them in its own precision.
-        same = all(isclose(a, b, rel_tol=0.01) for a, b in zip(drawn, own, strict=True))
-        if not same or num_samples != self.l2c2_num_samples:
-            names = ("sigma", "lambda_min", "lambda_max", "num_samples")
-            pairs = zip(names, (*drawn, num_samples), (*own, self.l2c2_num_samples), strict=True)
-            each = ", ".join(f"{name} {a:.4g} and {b:.4g}" for name, a, b in pairs)
-            warnings.warn(
-                f"neighbors are drawn otherwise than L2C2Loss counts them: {each}. Give the same "
-                "neighborhood and num_samples to NeighborTransform and L2C2Loss.",
-                stacklevel=3,
-            )
+        warn_of_other_neighbors(drawn, num_samples, self.l2c2_neighborhood, self.l2c2_num_samples)
+
+    def _policy_difference(self, here: Policy, there: Policy) -> Tensor:
+        if isinstance(here, Tensor) and isinstance(there, Tensor):
+            return squared_error(here, there)
+        assert isinstance(here, Distribution) and isinstance(there, Distribution)
+        return self._l2c2_distance(here, there)
 
     def _value_difference(
         self, network: str, tensordict: TensorDictBase, states: TensorDictBase
@@ -256,19 +269,10 @@ class L2C2Loss(RegularizedLoss):
         neighbor = tensordict.get(self.l2c2_neighbor_key, None)
         if neighbor is None:
             neighbor = self._draw(tensordict)
-        entries = {
-            key: value.movedim(tensordict.batch_dims, 0)
-            for key, value in neighbor.items(include_nested=True, leaves_only=True)
-        }
-        if "distance" not in entries:
-            raise KeyError(
-                f"{self.l2c2_neighbor_key!r} holds {list(entries)}, but no 'distance': write it "
-                "with NeighborTransform, or name another neighbor_key."
-            )
-        distance, drawn = entries.pop("distance"), entries.pop("neighborhood", None)
+        states, distance, drawn = read_neighbors(neighbor, self.l2c2_neighbor_key)
         if drawn is not None and not (self._l2c2_compared or torch.compiler.is_compiling()):
-            self._compare(drawn.reshape(3, -1)[:, :1].flatten().tolist(), len(distance))
-        return TensorDict(entries, batch_size=distance.shape), distance
+            self._compare(drawn.flatten(1)[:, :1].flatten().tolist(), len(distance))
+        return states, distance
 
     def _draw(self, tensordict: TensorDictBase) -> TensorDictBase:
         """What NeighborTransform would have written."""
@@ -284,7 +288,9 @@ class L2C2Loss(RegularizedLoss):
         }
 
     def _policy_diagnostic(self) -> str:
-        return "l2c2_hellinger" if self.has_stochastic_policy() else "l2c2_action_distance"
+        if not self.has_stochastic_policy():
+            return "l2c2_action_distance"
+        return f"l2c2_{distance_name(self.l2c2_policy_distance)}"
 
 
 def l2c2_penalty(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
@@ -36,6 +36,11 @@ class L2C2Config(RegularizerConfig):
         ge=0,
         description="gain of the value's regularization relative to the policy's [paper]",
     )
+    policy_distance: Literal["hellinger", "mean", "kl"] = Field(
+        default="hellinger",
+        description="how policies are compared: hellinger [paper], half the squared distance of "
+        "their means before the squashing, or the KL divergence; they need other gains",
+    )
     num_samples: int = Field(default=1, ge=1, description="neighbors per transition [inferred: 1]")
 
     @property
@@ -53,6 +58,7 @@ class L2C2Config(RegularizerConfig):
             neighborhood=self.neighborhood,
             beta=self.beta,
             num_samples=self.num_samples,
+            policy_distance=self.policy_distance,
         )
 
     def transform(self, generator: torch.Generator) -> NeighborTransform:

@@ -1,0 +1,71 @@
+"""The neighbors in a batch, as a loss reads them, and whether they are those that it counts."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import astuple, fields
+from math import isclose
+
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchrl_l2c2.neighborhood import Neighborhood
+
+
+def read_neighbors(
+    neighbor: TensorDictBase, key: NestedKey
+) -> tuple[TensorDictBase, Tensor, Tensor | None]:
+    """What :class:`~torchrl_l2c2.NeighborTransform` has written, with ``K`` in front.
+
+    Args:
+        neighbor (TensorDictBase): the entry, ``[*B]``, of states ``[*B, K, *F]``.
+        key (NestedKey): its name, for errors.
+
+    Returns:
+        tuple: the neighbors, ``[K, *B]``; their distances, ``[K, *B]``; and the numbers of the
+        neighborhood that they were drawn in, ``[n, *B]``, if the entry has them.
+
+    Raises:
+        KeyError: it has no distances.
+    """
+    entries = {
+        key: value.movedim(neighbor.batch_dims, 0)
+        for key, value in neighbor.items(include_nested=True, leaves_only=True)
+    }
+    if "distance" not in entries:
+        raise KeyError(
+            f"{key!r} holds {list(entries)}, but no 'distance': write it with NeighborTransform, "
+            "or name another neighbor_key."
+        )
+    distance, drawn = entries.pop("distance"), entries.pop("neighborhood", None)
+    return TensorDict(entries, batch_size=distance.shape), distance, drawn
+
+
+def warn_of_other_neighbors(
+    drawn: Sequence[float], num_drawn: int, neighborhood: Neighborhood, num_samples: int
+) -> None:
+    """Says where neighbors are drawn otherwise than a loss counts them.
+
+    Args:
+        drawn (Sequence of float): the numbers of the neighborhood that they are drawn in.
+        num_drawn (int): neighbors per state.
+        neighborhood (Neighborhood): that of the loss.
+        num_samples (int): likewise.
+
+    Warns:
+        UserWarning: the neighborhood or the number is not that of the loss.
+    """
+    own = astuple(neighborhood)
+    # The batch has them in its own precision.
+    same = all(isclose(a, b, rel_tol=0.01) for a, b in zip(drawn, own, strict=True))
+    if same and num_drawn == num_samples:
+        return
+    names = (*(field.name for field in fields(neighborhood)), "num_samples")
+    pairs = zip(names, (*drawn, num_drawn), (*own, num_samples), strict=True)
+    each = ", ".join(f"{name} {a:.4g} and {b:.4g}" for name, a, b in pairs)
+    warnings.warn(
+        f"neighbors are drawn otherwise than L2C2Loss counts them: {each}. Give the same "
+        "neighborhood and num_samples to NeighborTransform and L2C2Loss.",
+        stacklevel=4,
+    )
