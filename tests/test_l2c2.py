@@ -29,6 +29,7 @@ from torchrl.objectives import DDPGLoss, DiscreteSACLoss, DQNLoss, PPOLoss, SACL
 
 from torchrl_l2c2 import L2C2Loss, Neighborhood, NeighborTransform, PPORPELoss
 from torchrl_l2c2.objectives.l2c2 import l2c2_penalty
+from torchrl_l2c2.objectives.neighbors import draw_rows
 
 # epsilon = 1/4, lambda_pi = 1/4: the gain is 1 at distance 1/4 and 1/5 at distance 5/4.
 NEAR = Neighborhood(sigma=1.0, lambda_min=0.2, lambda_max=1.0)
@@ -407,6 +408,140 @@ class TestNeighbors:
         loss = linear_loss(neighbor_key="near")
         batch = linear_batch().rename_key_("neighbor", "near")
         assert loss.policy_regularizer(batch)["l2c2_distance"].item() == pytest.approx(1.0)
+
+
+class TestFraction:
+    """Neighbors for a random share of the batch."""
+
+    def losses(self, fraction: float, reduction: str = "mean") -> tuple[L2C2Loss, L2C2Loss]:
+        """One of all neighbors and one of a share, of the same networks."""
+        torch.manual_seed(0)
+        base = TD3Loss(deterministic_actor(), qvalue(), action_spec=BOUNDS, reduction=reduction)
+        return L2C2Loss(base, NEAR), L2C2Loss(base, NEAR, fraction=fraction)
+
+    def mean_of_draws(self, loss: L2C2Loss, batch: TensorDict, draws: int = 300):
+        """The means of both terms and their standard errors."""
+        with torch.no_grad():
+            found = torch.stack(
+                [
+                    torch.stack(
+                        (
+                            loss.policy_regularizer(batch)["loss_l2c2_actor"],
+                            loss.value_regularizer(batch)["loss_l2c2_qvalue"],
+                        )
+                    )
+                    for _ in range(draws)
+                ]
+            )
+        return found.mean(0), found.std(0) / draws**0.5
+
+    @pytest.mark.parametrize("extra", ["nothing", "weights", "mask", "trajectories"])
+    def test_the_expectation_is_that_of_all_neighbors(self, extra):
+        """Plain, with priority weights, with masked positions and of batches [B, T]."""
+        whole, share = self.losses(0.25)
+        batch = transitions(*((4, 2) if extra == "trajectories" else (8,)))
+        if extra == "weights":
+            batch["priority_weight"] = torch.linspace(0.1, 2.0, 8)
+        if extra == "mask":
+            batch["collector"] = TensorDict({"mask": torch.arange(8)[:, None] < 5}, [8])
+        batch = NeighborTransform(NEAR)(batch)
+        expected = torch.stack(
+            (
+                whole.policy_regularizer(batch)["loss_l2c2_actor"],
+                whole.value_regularizer(batch)["loss_l2c2_qvalue"],
+            )
+        )
+        mean, error = self.mean_of_draws(share, batch)
+        assert (error > 0).all()
+        assert ((mean - expected).abs() < 4 * error).all()
+
+    def test_unreduced_a_drawn_transition_stands_for_the_others(self):
+        """1 / fraction times what it has among all neighbors, the others nothing."""
+        whole, share = self.losses(0.25, reduction="none")
+        batch = NeighborTransform(NEAR)(transitions(8))
+        for method, key in (("policy", "loss_l2c2_actor"), ("value", "loss_l2c2_qvalue")):
+            full, found = (getattr(x, f"{method}_regularizer")(batch)[key] for x in (whole, share))
+            drawn = found != 0
+            assert drawn.sum() == 2
+            torch.testing.assert_close(found[drawn], 4 * full[drawn])
+
+    def test_networks_are_evaluated_at_so_many_states(self):
+        """Two of eight states and their neighbors, where nothing else evaluates the network."""
+        _, share = self.losses(0.25)
+        seen = []
+        share.actor_network.register_forward_hook(lambda *call: seen.append(len(call[2])))
+        share.policy_regularizer(transitions(8))
+        assert seen == [4]
+
+    def test_neighbors_in_the_batch_are_those_that_count(self):
+        """The share's distances are among those that the transform has written."""
+        _, share = self.losses(0.5, reduction="none")
+        batch = NeighborTransform(NEAR)(transitions(8))
+        found = share.policy_regularizer(batch)["l2c2_distance"]
+        written = batch["neighbor", "distance"].squeeze(1)
+        assert ((found == 0) | torch.isclose(found, 2 * written)).all()
+        assert (found != 0).sum() == 4
+
+    def test_both_terms_share_the_drawn_rows(self):
+        """Of one forward pass; the next one draws others."""
+        _, share = self.losses(0.5, reduction="none")
+        batch = transitions(64)
+        first, second = (share(batch.copy()) for _ in range(2))
+        for terms in (first, second):
+            assert torch.equal(terms["loss_l2c2_actor"] != 0, terms["loss_l2c2_qvalue"] != 0)
+        assert not torch.equal(first["loss_l2c2_actor"] != 0, second["loss_l2c2_actor"] != 0)
+
+    def test_what_the_loss_has_evaluated_is_taken_at_the_drawn_rows(self):
+        """PPORPELoss shares its evaluation: values and gradients as without sharing."""
+        torch.manual_seed(0)
+        loss = L2C2Loss(PPORPELoss(gaussian_actor(), heads_critic()), NEAR, fraction=0.5)
+        batch = NeighborTransform(NEAR)(on_policy(8))
+        torch.manual_seed(1)
+        shared = loss(batch.copy())
+        torch.manual_seed(1)
+        alone = loss.policy_regularizer(batch)
+        torch.manual_seed(1)
+        alone.update(loss.value_regularizer(batch))
+        parameters = list(loss.parameters())
+        for key in ("loss_l2c2_actor", "loss_l2c2_critic"):
+            torch.testing.assert_close(shared[key], alone[key])
+            pairs = zip(
+                *(
+                    torch.autograd.grad(x[key], parameters, allow_unused=True, retain_graph=True)
+                    for x in (shared, alone)
+                ),
+                strict=True,
+            )
+            for ours, theirs in pairs:
+                assert (ours is None) == (theirs is None)
+                if ours is not None:
+                    torch.testing.assert_close(ours, theirs)
+
+    def test_it_compiles_into_one_graph(self):
+        """With the eager numbers, at the same seed."""
+        torch._dynamo.reset()
+        _, share = self.losses(0.5)
+        batch = transitions(8)
+        torch.manual_seed(1)
+        expected = share(batch.copy())
+        compiled = torch.compile(share, fullgraph=True, backend="eager")
+        torch.manual_seed(1)
+        found = compiled(batch.copy())
+        for key in ("loss_l2c2_actor", "loss_l2c2_qvalue", "l2c2_gain"):
+            torch.testing.assert_close(found[key], expected[key])
+
+    def test_the_whole_batch_draws_nothing(self):
+        """A seed gives the numbers that it gave; other shares are whole rows, at least one."""
+        batch = NeighborTransform(NEAR)(transitions(8))
+        state = torch.get_rng_state()
+        assert draw_rows(batch, 1.0) is None and torch.equal(torch.get_rng_state(), state)
+        assert len(draw_rows(batch, 1e-3)) == 1 and len(draw_rows(batch, 0.3)) == 2
+
+    @pytest.mark.parametrize("fraction", [0.0, 1.5])
+    def test_other_shares_are_refused(self, fraction):
+        """At construction."""
+        with pytest.raises(ValueError, match=r"fraction must be in \(0, 1\], got"):
+            self.losses(fraction)
 
 
 class TestMonteCarlo:

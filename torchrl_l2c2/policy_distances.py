@@ -84,6 +84,16 @@ def _checked(distance: PolicyDistance, p: Distribution, q: Distribution) -> Tens
     return found
 
 
+def compare_policies(
+    distance: PolicyDistance, p: Distribution | Tensor, q: Distribution | Tensor
+) -> Tensor:
+    """A distance of two policies; of actions, half the squared one."""
+    if isinstance(p, Distribution) and isinstance(q, Distribution):
+        return distance(p, q)
+    assert isinstance(p, Tensor) and isinstance(q, Tensor)
+    return squared_error(p, q)
+
+
 def distance_name(chosen: str | PolicyDistance) -> str:
     """How the distance of :func:`choose_policy_distance` is called where it is logged."""
     return _NAMES[chosen] if isinstance(chosen, str) else "policy_distance"

@@ -221,7 +221,7 @@ FREE_SETTINGS = {
 FREE_TASK_SETTINGS = {"name", "episodes", "frames", "solved_at"}
 # Settings that are newer than some runs, with the value at which they change none of the numbers.
 # Others are newer, too: null and false always are such values.
-NEUTRAL_SETTINGS = {"regularizer.policy_distance": "hellinger"}
+NEUTRAL_SETTINGS = {"regularizer.fraction": 1.0, "regularizer.policy_distance": "hellinger"}
 
 
 def is_neutral(name: str, value: Any) -> bool:

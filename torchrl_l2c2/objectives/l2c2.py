@@ -10,20 +10,26 @@ from typing import Literal
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torch.distributions import Categorical, Distribution
+from torch.distributions import Categorical
 from torchrl.objectives import DistributionalDQNLoss, LossModule
 
-from torchrl_l2c2._checks import check_positive_int
+from torchrl_l2c2._checks import check_positive_int, check_real
 from torchrl_l2c2.distances import squared_error, squared_hellinger
 from torchrl_l2c2.neighborhood import Neighborhood
-from torchrl_l2c2.objectives.evaluation import VALUE_NETWORKS, Policy
-from torchrl_l2c2.objectives.neighbors import read_neighbors, warn_of_other_neighbors
+from torchrl_l2c2.objectives.evaluation import VALUE_NETWORKS, at_rows
+from torchrl_l2c2.objectives.neighbors import (
+    Neighbors,
+    draw_rows,
+    read_neighbors,
+    warn_of_other_neighbors,
+)
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
 from torchrl_l2c2.objectives.transitions import next_key
 from torchrl_l2c2.policy_distances import (
     PolicyDistance,
     check_deterministic,
     choose_policy_distance,
+    compare_policies,
     distance_name,
 )
 from torchrl_l2c2.transforms import draw_neighbors
@@ -92,15 +98,17 @@ class L2C2Loss(RegularizedLoss):
             gradients. Scheduled as ``l2c2_coeff``. Defaults to ``1.0``.
         num_samples (int): neighbors per state, drawn here or by the transform, at least 1. More
             give a less noisy estimate at so many times the network evaluations. Defaults to ``1``.
-        policy_distance (str or callable): :math:`d_\pi`. ``"hellinger"``, the paper's, lies in
-            ``[0, 1]`` and is relative to how wide the policies are; ``"mean"``
-            (:func:`~torchrl_l2c2.policy_distances.mean_distance`), half the squared distance of the
-            means before they are squashed, is not, and grows without a bound; ``"kl"``
-            (:func:`~torchrl_l2c2.policy_distances.kl_divergence`), that of the policy at :math:`s`
-            from the one at :math:`\tilde s`, is both relative and unbounded. They differ by orders
-            of magnitude: choose the gains anew. A function takes two distributions ``[K, *B]`` and
-            returns their distances ``[K, *B]``. Only the first two take deterministic policies.
-            Defaults to ``"hellinger"``.
+        fraction (float): share of the batch, in (0, 1], whose states have neighbors, drawn anew
+            each time with torch's global generator. Smaller ones cost less, pay in large batches,
+            and are noisier; the terms' expectation stays: a drawn transition counts
+            ``1 / fraction`` times and the others 0, also with ``reduction="none"``. Defaults to 1.
+        policy_distance (str or callable): :math:`d_\pi`. ``"hellinger"``, the paper's, is in [0, 1]
+            and relative to how wide the policies are; ``"mean"``
+            (:func:`~torchrl_l2c2.policy_distances.mean_distance`) is neither; ``"kl"``
+            (:func:`~torchrl_l2c2.policy_distances.kl_divergence`), of the policy at :math:`s` from
+            the other, is relative and unbounded. Each wants its own gains. A function takes two
+            distributions ``[K, *B]`` and returns ``[K, *B]``. Only the first two take deterministic
+            policies. Defaults to ``"hellinger"``.
         hellinger_samples (int, optional): actions drawn from each policy for the paper's Monte
             Carlo estimate of :math:`d_\pi`, at least 1. Defaults to ``None``, its closed form.
         neighbor_key (NestedKey): the entry that ``NeighborTransform`` writes. Defaults to
@@ -129,19 +137,10 @@ class L2C2Loss(RegularizedLoss):
         >>> isinstance(loss, DDPGLoss), isinstance(loss, L2C2Loss)
         (True, True)
         >>> updater = SoftUpdate(loss, tau=0.01)
-        >>> batch = TensorDict(
-        ...     {
-        ...         "observation": torch.randn(32, 3),
-        ...         "action": torch.randn(32, 1),
-        ...         "next": {
-        ...             "observation": torch.randn(32, 3),
-        ...             "reward": torch.randn(32, 1),
-        ...             "done": torch.zeros(32, 1, dtype=torch.bool),
-        ...             "terminated": torch.zeros(32, 1, dtype=torch.bool),
-        ...         },
-        ...     },
-        ...     batch_size=[32],
-        ... )
+        >>> state, flag = torch.randn(32, 3), torch.zeros(32, 1, dtype=torch.bool)
+        >>> batch = TensorDict({"observation": state, "action": torch.randn(32, 1)}, [32])
+        >>> batch["next"] = {"observation": state + 0.1, "reward": torch.randn(32, 1)}
+        >>> _ = batch["next"].update({"done": flag, "terminated": flag})
         >>> terms = loss(batch)
         >>> [key for key in terms.keys() if key.startswith("loss_")]
         ['loss_actor', 'loss_value', 'loss_l2c2_actor', 'loss_l2c2_value']
@@ -155,6 +154,7 @@ class L2C2Loss(RegularizedLoss):
         *,
         coeff: float = 1.0,
         num_samples: int = 1,
+        fraction: float = 1.0,
         policy_distance: Literal["hellinger", "mean", "kl"] | PolicyDistance = "hellinger",
         hellinger_samples: int | None = None,
         neighbor_key: NestedKey = "neighbor",
@@ -163,10 +163,12 @@ class L2C2Loss(RegularizedLoss):
         if not isinstance(neighborhood, Neighborhood):
             raise TypeError(f"neighborhood must be a Neighborhood, got {neighborhood!r}.")
         check_positive_int("num_samples", num_samples)
+        check_real("fraction", fraction, above=0, at_most=1)
         self.l2c2_policy_distance = policy_distance
         self._l2c2_distance = choose_policy_distance(policy_distance, hellinger_samples)
         self.l2c2_neighborhood = neighborhood
         self.l2c2_num_samples = num_samples
+        self.l2c2_fraction = float(fraction)
         self.l2c2_hellinger_samples = hellinger_samples
         self.l2c2_neighbor_key = neighbor_key
         self._l2c2_compared = False
@@ -193,31 +195,31 @@ class L2C2Loss(RegularizedLoss):
         terms = super().policy_regularizer(tensordict)
         if not self._l2c2_policies:
             return terms
-        states, distance = self._neighbors(tensordict)
-        here, there = self.policies_at(tensordict, states)
-        difference = self._policy_difference(here, there)
-        terms.set("loss_l2c2_actor", self._penalty(difference, distance, tensordict))
-        terms.set(self._policy_diagnostic(), self.reduce_diagnostic(difference.mean(0), tensordict))
-        return terms.update(self._gain_diagnostics(distance, tensordict))
+        near = self._neighbors(tensordict)
+        policies = self.policies_at(tensordict, near.states, near.rows)
+        difference = compare_policies(self._l2c2_distance, *policies)
+        terms.set("loss_l2c2_actor", self._penalty(difference, near, tensordict))
+        terms.set(self._policy_diagnostic(), self._diagnostic(difference, near, tensordict))
+        return terms.update(self._gain_diagnostics(near, tensordict))
 
     def value_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
         terms = super().value_regularizer(tensordict)
         if not self._l2c2_values:
             return terms
-        states, distance = self._neighbors(tensordict)
+        near = self._neighbors(tensordict)
         diagnostics = []
         for network in self._l2c2_values:
-            difference = self._value_difference(network, tensordict, states)
-            penalty = self._penalty(difference, distance, tensordict)
+            difference = self._value_difference(network, tensordict, near)
+            penalty = self._penalty(difference, near, tensordict)
             terms.set(_value_term(network), self.l2c2_beta * penalty)
-            diagnostics.append(self.reduce_diagnostic(difference.mean(0), tensordict))
+            diagnostics.append(self._diagnostic(difference, near, tensordict))
         terms.set("l2c2_value_distance", sum(diagnostics))
-        return terms.update(self._gain_diagnostics(distance, tensordict))
+        return terms.update(self._gain_diagnostics(near, tensordict))
 
     def known_states(self, tensordict: TensorDictBase) -> TensorDictBase | None:
-        if tensordict.get(self.l2c2_neighbor_key, None) is None:
+        if self.l2c2_fraction < 1 or tensordict.get(self.l2c2_neighbor_key, None) is None:
             return super().known_states(tensordict)
-        return self._neighbors(tensordict)[0]
+        return self._neighbors(tensordict).states
 
     def compare_neighbors(self, neighborhood: Neighborhood, num_samples: int) -> None:
         """Warns, once, where neighbors are drawn otherwise than this loss counts them.
@@ -240,16 +242,10 @@ class L2C2Loss(RegularizedLoss):
         self._l2c2_compared = True
         warn_of_other_neighbors(drawn, num_samples, self.l2c2_neighborhood, self.l2c2_num_samples)
 
-    def _policy_difference(self, here: Policy, there: Policy) -> Tensor:
-        if isinstance(here, Tensor) and isinstance(there, Tensor):
-            return squared_error(here, there)
-        assert isinstance(here, Distribution) and isinstance(there, Distribution)
-        return self._l2c2_distance(here, there)
-
     def _value_difference(
-        self, network: str, tensordict: TensorDictBase, states: TensorDictBase
+        self, network: str, tensordict: TensorDictBase, near: Neighbors
     ) -> Tensor:
-        here, there = self.values_at(network, tensordict, states)
+        here, there = self.values_at(network, tensordict, near.states, near.rows)
         if isinstance(self, DistributionalDQNLoss):
             # Logarithms of the atoms' probabilities, [K, *B, atoms, actions].
             policies = (Categorical(logits=value.transpose(-1, -2)) for value in (here, there))
@@ -257,34 +253,42 @@ class L2C2Loss(RegularizedLoss):
         difference = squared_error(here, there)
         return difference.sum(0) if self.is_ensemble(network) else difference
 
-    def _penalty(self, difference: Tensor, distance: Tensor, tensordict: TensorDictBase) -> Tensor:
-        penalty = l2c2_penalty(difference, self.l2c2_neighborhood.gain(distance))
+    def _penalty(self, difference: Tensor, near: Neighbors, tensordict: TensorDictBase) -> Tensor:
+        penalty = l2c2_penalty(difference, self.l2c2_neighborhood.gain(near.distance))
+        penalty = near.to_batch(penalty, tensordict.batch_size)
         return self.l2c2_coeff * self.reduce_term(penalty, tensordict)
 
-    def _neighbors(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
-        """The neighbors and their distances, both ``[K, *B]``."""
+    def _neighbors(self, tensordict: TensorDictBase) -> Neighbors:
         return self.made_once("l2c2_neighbors", lambda: self._make_neighbors(tensordict))
 
-    def _make_neighbors(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
+    def _make_neighbors(self, tensordict: TensorDictBase) -> Neighbors:
+        rows = draw_rows(tensordict, self.l2c2_fraction)
         neighbor = tensordict.get(self.l2c2_neighbor_key, None)
         if neighbor is None:
-            neighbor = self._draw(tensordict)
+            neighbor = self._draw(tensordict, rows)
+        elif rows is not None:
+            neighbor = at_rows(neighbor, rows)
         states, distance, drawn = read_neighbors(neighbor, self.l2c2_neighbor_key)
         if drawn is not None and not (self._l2c2_compared or torch.compiler.is_compiling()):
             self._compare(drawn.flatten(1)[:, :1].flatten().tolist(), len(distance))
-        return states, distance
+        return Neighbors(states, distance, rows)
 
-    def _draw(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def _draw(self, tensordict: TensorDictBase, rows: Tensor | None) -> TensorDictBase:
         """What NeighborTransform would have written."""
         keys = list(self.transitions(tensordict, [*self._l2c2_policies, *self._l2c2_values]))
         states = tensordict.select(*keys, *map(next_key, keys)).detach()
+        states = states if rows is None else at_rows(states, rows)
         return draw_neighbors(states, self.l2c2_neighborhood, keys, self.l2c2_num_samples)
 
-    def _gain_diagnostics(self, distance: Tensor, tensordict: TensorDictBase) -> dict[str, Tensor]:
-        gain = self.l2c2_coeff * self.l2c2_neighborhood.gain(distance)
+    def _diagnostic(self, value: Tensor, near: Neighbors, tensordict: TensorDictBase) -> Tensor:
+        value = near.to_batch(value.detach().mean(0), tensordict.batch_size)
+        return self.reduce_diagnostic(value, tensordict)
+
+    def _gain_diagnostics(self, near: Neighbors, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        gain = self.l2c2_coeff * self.l2c2_neighborhood.gain(near.distance)
         return {
-            "l2c2_distance": self.reduce_diagnostic(distance.mean(0), tensordict),
-            "l2c2_gain": self.reduce_diagnostic(gain.mean(0), tensordict),
+            "l2c2_distance": self._diagnostic(near.distance, near, tensordict),
+            "l2c2_gain": self._diagnostic(gain, near, tensordict),
         }
 
     def _policy_diagnostic(self) -> str:

@@ -1,4 +1,4 @@
-"""The neighbors in a batch, as a loss reads them, and whether they are those that it counts."""
+"""The neighbors of a batch, or of a random share of it, as a loss compares with them."""
 
 from __future__ import annotations
 
@@ -6,11 +6,65 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import astuple, fields
 from math import isclose
+from typing import NamedTuple
 
+import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_l2c2.neighborhood import Neighborhood
+
+
+class Neighbors(NamedTuple):
+    """The neighbors of the states in a batch ``[*B]``, or of ``M`` of them.
+
+    Attributes:
+        states: the neighbors, ``[K, *B]``, or ``[K, M]``.
+        distance: how far away they count, of the same shape.
+        rows: whose neighbors they are, ``[M]``, in the batch written as one row; ``None``: all.
+    """
+
+    states: TensorDictBase
+    distance: Tensor
+    rows: Tensor | None = None
+
+    def to_batch(self, value: Tensor, shape: torch.Size) -> Tensor:
+        """One number for each transition of the batch, of those for the rows.
+
+        Drawn rows stand for the others: they count ``B / M`` times, the others 0. That leaves the
+        expectation of every sum and mean over the batch, with weights and masks or without, as it
+        is.
+
+        Args:
+            value: ``[M, ...]``.
+            shape: of the batch, ``[*B]``.
+
+        Returns:
+            ``[*B, ...]``.
+        """
+        if self.rows is None:
+            return value
+        count, rest = shape.numel(), value.shape[1:]
+        spread = value.new_zeros(count, *rest)
+        spread = spread.index_copy(0, self.rows, value * (count / len(self.rows)))
+        return spread.reshape(*shape, *rest)
+
+
+def draw_rows(tensordict: TensorDictBase, fraction: float) -> Tensor | None:
+    """A random share of a batch, with torch's global generator: no row twice, each as likely.
+
+    Args:
+        tensordict (TensorDictBase): the batch, ``[*B]``.
+        fraction (float): its share, in (0, 1]; rounded to whole rows, at least one.
+
+    Returns:
+        Tensor: ``[M]``, in the batch written as one row; ``None`` stands for all of them.
+    """
+    count = tensordict.numel()
+    drawn = max(1, round(fraction * count))
+    if drawn >= count:
+        return None
+    return torch.randperm(count, device=tensordict.device)[:drawn]
 
 
 def read_neighbors(

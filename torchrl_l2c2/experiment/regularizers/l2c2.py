@@ -36,12 +36,19 @@ class L2C2Config(RegularizerConfig):
         ge=0,
         description="gain of the value's regularization relative to the policy's [paper]",
     )
+    num_samples: int = Field(default=1, ge=1, description="neighbors per transition [inferred: 1]")
+    fraction: float = Field(
+        default=1.0,
+        gt=0,
+        le=1,
+        description="share of the batch that has neighbors; smaller ones cost less in large "
+        "batches, and are noisier [paper: all]",
+    )
     policy_distance: Literal["hellinger", "mean", "kl"] = Field(
         default="hellinger",
         description="how policies are compared: hellinger [paper], half the squared distance of "
         "their means before the squashing, or the KL divergence; they need other gains",
     )
-    num_samples: int = Field(default=1, ge=1, description="neighbors per transition [inferred: 1]")
 
     @property
     def neighborhood(self) -> Neighborhood:
@@ -58,6 +65,7 @@ class L2C2Config(RegularizerConfig):
             neighborhood=self.neighborhood,
             beta=self.beta,
             num_samples=self.num_samples,
+            fraction=self.fraction,
             policy_distance=self.policy_distance,
         )
 
