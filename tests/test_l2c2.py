@@ -410,6 +410,63 @@ class TestNeighbors:
         assert loss.policy_regularizer(batch)["l2c2_distance"].item() == pytest.approx(1.0)
 
 
+class TestWhichStatesAreMoved:
+    def two_part_loss(self, **kwargs) -> tuple[L2C2Loss, TensorDict]:
+        """A policy of a position and a velocity, which move by 1 and by 10."""
+        keys = ["position", "velocity"]
+        actor = Actor(mlp(3, 2), in_keys=keys)
+        value = ValueOperator(mlp(5, 1), in_keys=[*keys, "action"])
+        batch = {"position": torch.zeros(400, 1), "velocity": torch.zeros(400, 2)}
+        later = {"position": torch.ones(400, 1), "velocity": torch.full((400, 2), 10.0)}
+        batch = TensorDict({**batch, "action": torch.zeros(400, 2), "next": later}, [400])
+        return L2C2Loss(DDPGLoss(actor, value), **{"neighborhood": NEAR, **kwargs}), batch
+
+    def test_the_keys_can_be_chosen(self):
+        """The largest of one draw has the mean 1/2; of all three 3/4."""
+        torch.manual_seed(0)
+        loss, batch = self.two_part_loss(moved_keys=["position"])
+        mean = loss.policy_regularizer(batch)["l2c2_distance"].item() - NEAR.epsilon
+        assert mean == pytest.approx(0.5, abs=0.05)
+
+    def test_a_key_that_the_batch_lacks_is_named(self):
+        """With what there is."""
+        loss, batch = self.two_part_loss(moved_keys=["speed"])
+        with pytest.raises(KeyError, match="needs 'speed', which the tensordict lacks"):
+            loss.policy_regularizer(batch)
+
+    def test_transitions_with_too_long_a_step_count_nothing(self):
+        """The step of either part: values, gradients and diagnostics of the others remain."""
+        near = Neighborhood(sigma=1.0, lambda_min=0.2, lambda_max=1.0, max_step=5.0)
+        torch.manual_seed(0)
+        base, batch = TD3Loss(deterministic_actor(), qvalue(), action_spec=BOUNDS), transitions(4)
+        batch["next", "observation"][1:3] += 100.0
+        batch = NeighborTransform(near)(batch)
+        found = L2C2Loss(base, near).policy_regularizer(batch)
+        expected = L2C2Loss(base, near).policy_regularizer(batch[[0, 3]])
+        for key in ("loss_l2c2_actor", "l2c2_gain", "l2c2_distance", "l2c2_action_distance"):
+            torch.testing.assert_close(found[key], expected[key] / 2)
+        gradients = torch.autograd.grad(
+            found["loss_l2c2_actor"], list(base.actor_network_params.values(True, True))
+        )
+        assert all(gradient.isfinite().all() for gradient in gradients)
+
+    def test_one_draw_moves_all_dimensions_of_all_keys(self):
+        """Where it is shared, in the loss as in the transform."""
+        near = Neighborhood(sigma=1.0, lambda_min=0.2, lambda_max=1.0, shared=True)
+        loss, batch = self.two_part_loss(neighborhood=near)
+        torch.manual_seed(0)
+        mean = loss.policy_regularizer(batch)["l2c2_distance"].item() - near.epsilon
+        assert mean == pytest.approx(0.5, abs=0.05)
+        neighbor = NeighborTransform(near, ["position", "velocity"], num_samples=3)(batch)
+        neighbor = neighbor["neighbor"]
+        assert neighbor["velocity"].shape == (400, 3, 2)
+        torch.testing.assert_close(
+            neighbor["velocity"], 10 * neighbor["position"].expand(-1, -1, 2)
+        )
+        away = neighbor["position"].squeeze(-1).abs()
+        torch.testing.assert_close(neighbor["distance"], away + near.epsilon)
+
+
 class TestFraction:
     """Neighbors for a random share of the batch."""
 
@@ -595,7 +652,7 @@ class TestPolicyDistances:
     def test_deterministic_policies_have_no_other(self, distance):
         """The error says what to do."""
         base = DDPGLoss(deterministic_actor(), qvalue())
-        with pytest.raises(TypeError, match=r"DDPGLoss has a deterministic policy.*its default"):
+        with pytest.raises(TypeError, match=r"a deterministic policy.*its default"):
             L2C2Loss(base, policy_distance=distance)
 
     @pytest.mark.parametrize("distance", ["mean", "kl"])

@@ -94,23 +94,25 @@ def compare_policies(
     return squared_error(p, q)
 
 
-def distance_name(chosen: str | PolicyDistance) -> str:
-    """How the distance of :func:`choose_policy_distance` is called where it is logged."""
-    return _NAMES[chosen] if isinstance(chosen, str) else "policy_distance"
+def distance_name(chosen: str | PolicyDistance, stochastic: bool) -> str:
+    """How the distance of :func:`choose_policy_distance` is called where it is logged.
 
-
-def check_deterministic(loss: str, policy_distance: str | PolicyDistance) -> None:
-    """Refuses a distance of distributions for a loss whose policy is an action.
+    Args:
+        chosen: as there.
+        stochastic: whether the policies are distributions; otherwise their actions are compared.
 
     Raises:
-        TypeError: it is neither of those that have a counterpart, ``"hellinger"`` and ``"mean"``.
+        TypeError: deterministic policies, and a distance that has no counterpart for actions.
     """
-    if policy_distance not in ("hellinger", "mean"):
+    if stochastic:
+        return _NAMES[chosen] if isinstance(chosen, str) else "policy_distance"
+    if chosen not in ("hellinger", "mean"):
         raise TypeError(
-            f"{loss} has a deterministic policy, which has no distribution to compare by "
-            f"policy_distance={policy_distance!r}: leave it at its default, which then is half the "
-            "squared distance of the actions."
+            "the loss has a deterministic policy, which is no distribution to compare by "
+            f"policy_distance={chosen!r}: leave it at its default, which then is half the squared "
+            "distance of the actions."
         )
+    return "action_distance"
 
 
 def policy_mean(policy: Distribution | Tensor, *, squashed: bool = False) -> Tensor:

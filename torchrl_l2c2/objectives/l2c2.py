@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import astuple
 from typing import Literal
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDictBase, unravel_key_list
 from torch import Tensor
 from torch.distributions import Categorical
 from torchrl.objectives import DistributionalDQNLoss, LossModule
@@ -27,7 +26,6 @@ from torchrl_l2c2.objectives.regularized import RegularizedLoss
 from torchrl_l2c2.objectives.transitions import next_key
 from torchrl_l2c2.policy_distances import (
     PolicyDistance,
-    check_deterministic,
     choose_policy_distance,
     compare_policies,
     distance_name,
@@ -67,8 +65,8 @@ class L2C2Loss(RegularizedLoss):
     them (give it the same neighborhood and ``num_samples``; a difference is told once, as a
     warning), and otherwise drawn from the observations and next
     observations with torch's global generator. Drawn here, those floating-point inputs of the
-    regularized networks are moved that have a successor in the batch, and the distance is the
-    largest of theirs.
+    regularized networks are moved that have a successor in the batch, or ``moved_keys``, and the
+    distance is the largest of theirs.
 
     ``forward`` adds these entries to the loss's own:
 
@@ -102,6 +100,8 @@ class L2C2Loss(RegularizedLoss):
             each time with torch's global generator. Smaller ones cost less, pay in large batches,
             and are noisier; the terms' expectation stays: a drawn transition counts
             ``1 / fraction`` times and the others 0, also with ``reduction="none"``. Defaults to 1.
+        moved_keys (sequence of NestedKey, optional): which observations neighbors drawn here differ
+            in, such as those that carry noise. Defaults to ``None``, all that can.
         policy_distance (str or callable): :math:`d_\pi`. ``"hellinger"``, the paper's, is in [0, 1]
             and relative to how wide the policies are; ``"mean"``
             (:func:`~torchrl_l2c2.policy_distances.mean_distance`) is neither; ``"kl"``
@@ -155,6 +155,7 @@ class L2C2Loss(RegularizedLoss):
         coeff: float = 1.0,
         num_samples: int = 1,
         fraction: float = 1.0,
+        moved_keys: Sequence[NestedKey] | None = None,
         policy_distance: Literal["hellinger", "mean", "kl"] | PolicyDistance = "hellinger",
         hellinger_samples: int | None = None,
         neighbor_key: NestedKey = "neighbor",
@@ -169,6 +170,7 @@ class L2C2Loss(RegularizedLoss):
         self.l2c2_neighborhood = neighborhood
         self.l2c2_num_samples = num_samples
         self.l2c2_fraction = float(fraction)
+        self.l2c2_moved_keys = None if moved_keys is None else unravel_key_list(list(moved_keys))
         self.l2c2_hellinger_samples = hellinger_samples
         self.l2c2_neighbor_key = neighbor_key
         self._l2c2_compared = False
@@ -179,14 +181,15 @@ class L2C2Loss(RegularizedLoss):
         _check_terms(type(base_loss).__name__, self._l2c2_policies, self._l2c2_values, beta)
         self.declare_networks([*self._l2c2_policies, *self._l2c2_values])
         policies, values = self._l2c2_policies, self._l2c2_values
-        if policies and not self.has_stochastic_policy():
-            check_deterministic(type(base_loss).__name__, policy_distance)
+        for _ in policies:
+            name = distance_name(policy_distance, self.has_stochastic_policy())
+            self._l2c2_policy_diagnostic = f"l2c2_{name}"
         self.declare_terms(
             policy=["loss_l2c2_actor" for _ in policies],
             value=[_value_term(network) for network in values],
             diagnostics=[
                 *("l2c2_distance", "l2c2_gain"),
-                *(self._policy_diagnostic() for _ in policies),
+                *(self._l2c2_policy_diagnostic for _ in policies),
                 *(["l2c2_value_distance"] if values else []),
             ],
         )
@@ -199,7 +202,7 @@ class L2C2Loss(RegularizedLoss):
         policies = self.policies_at(tensordict, near.states, near.rows)
         difference = compare_policies(self._l2c2_distance, *policies)
         terms.set("loss_l2c2_actor", self._penalty(difference, near, tensordict))
-        terms.set(self._policy_diagnostic(), self._diagnostic(difference, near, tensordict))
+        terms.set(self._l2c2_policy_diagnostic, self._diagnostic(difference, near, tensordict))
         return terms.update(self._gain_diagnostics(near, tensordict))
 
     def value_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -234,7 +237,7 @@ class L2C2Loss(RegularizedLoss):
         Warns:
             UserWarning: the neighborhood or the number is not that of this loss.
         """
-        self._compare(astuple(neighborhood), num_samples)
+        self._compare(neighborhood.numbers, num_samples)
 
     def _compare(self, drawn: Sequence[float], num_samples: int) -> None:
         if self._l2c2_compared or not drawn:  # an empty batch
@@ -275,8 +278,9 @@ class L2C2Loss(RegularizedLoss):
 
     def _draw(self, tensordict: TensorDictBase, rows: Tensor | None) -> TensorDictBase:
         """What NeighborTransform would have written."""
-        keys = list(self.transitions(tensordict, [*self._l2c2_policies, *self._l2c2_values]))
-        states = tensordict.select(*keys, *map(next_key, keys)).detach()
+        networks = [*self._l2c2_policies, *self._l2c2_values]
+        keys = self.l2c2_moved_keys or list(self.transitions(tensordict, networks))
+        states = tensordict.select(*keys, *map(next_key, keys), strict=False).detach()
         states = states if rows is None else at_rows(states, rows)
         return draw_neighbors(states, self.l2c2_neighborhood, keys, self.l2c2_num_samples)
 
@@ -286,15 +290,12 @@ class L2C2Loss(RegularizedLoss):
 
     def _gain_diagnostics(self, near: Neighbors, tensordict: TensorDictBase) -> dict[str, Tensor]:
         gain = self.l2c2_coeff * self.l2c2_neighborhood.gain(near.distance)
+        # Of a transition that counts nothing it is infinite.
+        finite = near.distance.masked_fill(near.distance.isinf(), 0.0)
         return {
-            "l2c2_distance": self._diagnostic(near.distance, near, tensordict),
+            "l2c2_distance": self._diagnostic(finite, near, tensordict),
             "l2c2_gain": self._diagnostic(gain, near, tensordict),
         }
-
-    def _policy_diagnostic(self) -> str:
-        if not self.has_stochastic_policy():
-            return "l2c2_action_distance"
-        return f"l2c2_{distance_name(self.l2c2_policy_distance)}"
 
 
 def l2c2_penalty(

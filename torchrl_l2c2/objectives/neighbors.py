@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import astuple, fields
+from dataclasses import fields
 from math import isclose
 from typing import NamedTuple
 
@@ -110,7 +110,7 @@ def warn_of_other_neighbors(
     Warns:
         UserWarning: the neighborhood or the number is not that of the loss.
     """
-    own = astuple(neighborhood)
+    own = neighborhood.numbers
     # The batch has them in its own precision.
     same = all(isclose(a, b, rel_tol=0.01) for a, b in zip(drawn, own, strict=True))
     if same and num_drawn == num_samples:

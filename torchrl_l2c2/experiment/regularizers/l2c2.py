@@ -31,6 +31,16 @@ class L2C2Config(RegularizerConfig):
         default=0.01, gt=0, description="gain at the edge of the neighborhood [paper]"
     )
     lambda_max: float = Field(default=1.0, gt=0, description="gain at its center [paper]")
+    shared: bool = Field(
+        default=False,
+        description="one draw for all dimensions of the state, and not one for each [paper: each]",
+    )
+    max_step: float | None = Field(
+        default=None,
+        gt=0,
+        description="longest step from s to s' that counts, in the observation's units: a reset or "
+        "a teleport is longer; null: all [paper]",
+    )
     beta: float = Field(
         default=0.1,
         ge=0,
@@ -55,7 +65,13 @@ class L2C2Config(RegularizerConfig):
         """Where neighbors are drawn, for the loss and the transform alike."""
         from torchrl_l2c2.neighborhood import Neighborhood
 
-        return Neighborhood(self.sigma, self.lambda_min, self.lambda_max)
+        return Neighborhood(
+            self.sigma,
+            self.lambda_min,
+            self.lambda_max,
+            shared=self.shared,
+            max_step=self.max_step,
+        )
 
     def wrap(self, loss: LossModule) -> LossModule:
         from torchrl_l2c2.objectives import L2C2Loss
