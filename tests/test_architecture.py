@@ -13,7 +13,7 @@ MODULES = {
 # From the bottom up: a module imports from lines above its own alone.
 LAYERS = """
 _version _checks
-neighborhood affinities
+neighborhood affinities gains
 distances transforms metrics modules updaters optim.adaterm
 policy_distances
 optim.__init__
@@ -52,6 +52,7 @@ experiment.workers
 experiment.evaluate experiment.update experiment.player experiment.manual
 experiment.influence experiment.best_policy
 experiment.learner
+experiment.gain
 experiment.continuation experiment.schedules
 experiment.training
 experiment.command

@@ -175,6 +175,13 @@ class ExperimentConfig:
                 f"{self.replay.name!r} is nothing that algorithm {self.algorithm.name!r} can learn "
                 "from: ppo needs rollout, the others prioritized or uniform.",
             )
+        if on_policy and getattr(self.regularizer, "gain", None) == "gradient":
+            raise SettingError(
+                "regularizer.gain",
+                f"must be constant, ramp or target with algorithm {self.algorithm.name!r}, got "
+                "'gradient': it is measured on a batch from a replay buffer, and a rollout is "
+                "forgotten once it is learned from.",
+            )
 
     def _check_rounds(self) -> None:
         """Several workers play whole episodes, and all of them as many."""
@@ -221,7 +228,15 @@ FREE_SETTINGS = {
 FREE_TASK_SETTINGS = {"name", "episodes", "frames", "solved_at"}
 # Settings that are newer than some runs, with the value at which they change none of the numbers.
 # Others are newer, too: null and false always are such values.
-NEUTRAL_SETTINGS = {"regularizer.fraction": 1.0, "regularizer.policy_distance": "hellinger"}
+NEUTRAL_SETTINGS = {
+    "regularizer.policy_distance": "hellinger",
+    "regularizer.fraction": 1.0,
+    "regularizer.gain": "constant",
+    "regularizer.gain_of": "action_variation",
+    "regularizer.gain_rate": 0.1,
+    "regularizer.gain_limit": 1000.0,
+    "regularizer.gain_length": 1.0,
+}
 
 
 def is_neutral(name: str, value: Any) -> bool:

@@ -1,11 +1,18 @@
 """What is added to the loss: a file for each regularizer, and a line here for each choice."""
 
-from torchrl_l2c2.experiment.regularizers.base import RegularizerConfig
+from torchrl_l2c2.experiment.regularizers.base import GainConfig, RegularizerConfig
 from torchrl_l2c2.experiment.regularizers.caps import CAPSConfig
 from torchrl_l2c2.experiment.regularizers.l2c2 import L2C2Config
 from torchrl_l2c2.experiment.regularizers.none import NoRegularizerConfig
 
-__all__ = ["REGULARIZERS", "CAPSConfig", "L2C2Config", "NoRegularizerConfig", "RegularizerConfig"]
+__all__ = [
+    "REGULARIZERS",
+    "CAPSConfig",
+    "GainConfig",
+    "L2C2Config",
+    "NoRegularizerConfig",
+    "RegularizerConfig",
+]
 
 REGULARIZERS: dict[str, RegularizerConfig] = {
     "none": NoRegularizerConfig(),

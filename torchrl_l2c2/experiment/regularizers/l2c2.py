@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
-from torchrl_l2c2.experiment.regularizers.base import RegularizerConfig
+from torchrl_l2c2.experiment.regularizers.base import GainConfig
 from torchrl_l2c2.experiment.settings import settings
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @settings
-class L2C2Config(RegularizerConfig):
+class L2C2Config(GainConfig):
     """The paper's method, :class:`~torchrl_l2c2.L2C2Loss`."""
 
     name: str = "l2c2"
@@ -91,3 +91,9 @@ class L2C2Config(RegularizerConfig):
         return NeighborTransform(
             self.neighborhood, num_samples=self.num_samples, generator=generator
         )
+
+    def set_gains(self, loss: LossModule, policy: float, value: float) -> None:
+        loss.l2c2_coeff = policy
+        if self.beta:
+            # Both gains are of the value terms.
+            loss.l2c2_beta = self.beta * value / policy if policy else self.beta
