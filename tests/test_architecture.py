@@ -20,7 +20,8 @@ optim.__init__
 objectives.specialization objectives.evaluation objectives.shared_evaluation
 objectives.transitions objectives.relative_pearson
 objectives.regularized objectives.neighbors
-objectives.l2c2 objectives.caps objectives.ppo_rpe
+objectives.l2c2 objectives.caps objectives.cats objectives.lcp objectives.sr2l
+objectives.ppo_rpe
 objectives.__init__
 trainers __init__
 experiment.settings experiment.compilation experiment.spaces
@@ -31,6 +32,7 @@ experiment.process experiment.progress experiment.sweep experiment.optimizers
 experiment.tasks experiment.replay experiment.collection
 experiment.regularizers.base
 experiment.regularizers.none experiment.regularizers.caps experiment.regularizers.l2c2
+experiment.regularizers.cats experiment.regularizers.lcp experiment.regularizers.sr2l
 experiment.regularizers.__init__
 experiment.algorithms.agent experiment.algorithms.networks experiment.algorithms.base
 experiment.algorithms.ppo_rpe experiment.algorithms.sac experiment.algorithms.td3

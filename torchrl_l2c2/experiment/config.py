@@ -153,7 +153,9 @@ class ExperimentConfig:
 
     def make_agent(self, env: EnvBase) -> Agent:
         """What learns, for an environment's observation and action."""
-        return self.algorithm.make_agent(env, self.regularizer, self.optimizer)
+        agent = self.algorithm.make_agent(env, self.regularizer, self.optimizer)
+        agent.compilable &= self.regularizer.compilable
+        return agent
 
     def make_replay(self) -> TensorDictReplayBuffer:
         """The replay buffer; its batches have what the regularizer wants in them."""

@@ -12,6 +12,7 @@ from torchrl.objectives import LossModule
 from torchrl_l2c2._checks import check_choice, check_real
 from torchrl_l2c2.distances import squared_error
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
+from torchrl_l2c2.objectives.transitions import finite_successor
 from torchrl_l2c2.policy_distances import policy_mean
 
 
@@ -113,7 +114,7 @@ class CAPSLoss(RegularizedLoss):
         states = TensorDict(batch_size=[2, *tensordict.batch_size])
         transitions = self.transitions(tensordict, self.policy_networks())
         for key, (state, successor) in transitions.items():
-            later = torch.where(successor.isfinite(), successor, state)
+            later = finite_successor(state, successor)
             noisy = state + self.caps_sigma * torch.randn_like(state)
             states.set(key, torch.stack((later, noisy)))
         return states

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from pydantic import Field
 
@@ -15,7 +15,13 @@ if TYPE_CHECKING:
 
 
 class RegularizerConfig:
-    """Makes a regularized loss and, where batches are to hold more for it, a transform."""
+    """Makes a regularized loss and, where batches are to hold more for it, a transform.
+
+    Attributes:
+        compilable: whether the regularized loss compiles into one graph where the plain one does.
+    """
+
+    compilable: ClassVar[bool] = True
 
     name: str
 
