@@ -21,6 +21,7 @@ objectives.specialization objectives.evaluation objectives.shared_evaluation
 objectives.transitions objectives.relative_pearson
 objectives.regularized objectives.neighbors
 objectives.l2c2 objectives.caps objectives.cats objectives.lcp objectives.sr2l
+objectives.grad_caps
 objectives.ppo_rpe
 objectives.__init__
 trainers __init__

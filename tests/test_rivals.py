@@ -1,4 +1,4 @@
-"""CATS, SR2L and LCP: by hand, around every loss that can be regularized, and in a run."""
+"""Rivals: by hand, around every loss that can be regularized, and in a run."""
 
 from __future__ import annotations
 
@@ -8,14 +8,23 @@ import pickle
 
 import pytest
 import torch
-from losses import CASES, deterministic_actor, gaussian_actor, on_policy, qvalue, transitions
+from losses import (
+    CASES,
+    action_values,
+    deterministic_actor,
+    gaussian_actor,
+    on_policy,
+    qvalue,
+    transitions,
+)
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
+from torchrl.envs import CatFrames, GymEnv, TransformedEnv
 from torchrl.modules import Actor, IndependentNormal, ProbabilisticActor
-from torchrl.objectives import DDPGLoss, PPOLoss
+from torchrl.objectives import DDPGLoss, DQNLoss, PPOLoss
 
-from torchrl_l2c2 import CAPSLoss, CATSLoss, L2C2Loss, LCPLoss, SR2LLoss
+from torchrl_l2c2 import CAPSLoss, CATSLoss, GradCAPSLoss, L2C2Loss, LCPLoss, SR2LLoss
 from torchrl_l2c2.experiment import (
     AdamConfig,
     CATSConfig,
@@ -28,6 +37,7 @@ from torchrl_l2c2.experiment import (
     UniformReplayConfig,
 )
 from torchrl_l2c2.objectives.cats import cats_term
+from torchrl_l2c2.objectives.grad_caps import grad_caps_term
 from torchrl_l2c2.objectives.lcp import lcp_term
 from torchrl_l2c2.objectives.sr2l import ascend, jeffreys_divergence
 
@@ -89,6 +99,59 @@ class TestCATS:
             expected = 2 * caps.policy_regularizer(batch)["loss_caps_temporal"]
             found = CATSLoss(base, 1.0, mean=mean).policy_regularizer(batch)["loss_cats"]
             torch.testing.assert_close(found, expected)
+
+
+class TestGradCAPS:
+    def batch(self) -> TensorDict:
+        """Two transitions with the states before: along a line, and back and forth."""
+        batch = transitions(2)
+        state = torch.tensor([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+        batch["observation"] = state
+        batch["next", "observation"] = torch.tensor([[2.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+        batch["frames"] = torch.cat((torch.zeros(2, 3), state), -1)
+        return batch
+
+    def test_a_steady_motion_is_free_and_a_zigzag_is_not(self):
+        """0 for the line; (-2 / 0.1)^2 for there and back."""
+        loss = GradCAPSLoss(linear_base(), 0.3, epsilon=0.1)
+        found = loss.policy_regularizer(self.batch())["loss_grad_caps"]
+        assert found.item() == pytest.approx(0.3 * (0.0 + 400.0) / 2, rel=1e-4)
+
+    def test_what_the_action_moved_over_both_steps_is_what_counts(self):
+        """(1 - 0) / (tanh 1 + .5) for actions 0, 0, 1."""
+        term = grad_caps_term(torch.zeros(1, 1), torch.zeros(1, 1), torch.ones(1, 1), 0.5)
+        assert term.item() == pytest.approx((1.0 / (math.tanh(1.0) + 0.5)) ** 2)
+
+    def test_catframes_gives_what_it_needs(self):
+        """The state before, and the state itself in the first step of an episode."""
+        frames = CatFrames(N=2, dim=-1, in_keys=["observation"], out_keys=["frames"])
+        played = TransformedEnv(GymEnv("Pendulum-v1"), frames).rollout(5)
+        states = played["observation"]
+        torch.testing.assert_close(played["frames"][1:, :3], states[:-1])
+        torch.testing.assert_close(played["frames"][0, :3], states[0])
+        net = nn.Linear(3, 1, bias=False)
+        loss = GradCAPSLoss(DDPGLoss(Actor(net), qvalue()), 1.0)
+        found = loss.policy_regularizer(played)["loss_grad_caps"]
+        with torch.no_grad():
+            actions = net(torch.cat((states[:1], states, played["next", "observation"][-1:])))
+            expected = grad_caps_term(actions[:-2], actions[1:-1], actions[2:], 0.1).mean()
+        torch.testing.assert_close(found.detach(), expected)
+
+    def test_other_batches_are_refused_with_what_to_do(self):
+        """Without frames, or with three."""
+        loss, batch = GradCAPSLoss(linear_base()), self.batch()
+        frames = batch.pop("frames")
+        with pytest.raises(KeyError, match=r"no 'frames': append CatFrames\(N=2, dim=-1"):
+            loss.policy_regularizer(batch)
+        batch["frames"] = torch.cat((frames, frames[:, :3]), -1)
+        with pytest.raises(ValueError, match=r"of shape \(2, 6\), got \(2, 9\)"):
+            loss.policy_regularizer(batch)
+
+    def test_a_loss_without_a_policy_is_refused(self):
+        """As for the others."""
+        base = DQNLoss(action_values(), action_space="one-hot")
+        with pytest.raises(TypeError, match="GradCAPSLoss needs a policy: DQNLoss has none"):
+            GradCAPSLoss(base)
 
 
 class TestSR2L:

@@ -9,6 +9,7 @@ from .neighborhood import Neighborhood
 from .objectives import (
     CAPSLoss,
     CATSLoss,
+    GradCAPSLoss,
     L2C2Loss,
     LCPLoss,
     PPORPELoss,
@@ -23,6 +24,7 @@ __all__ = [
     "AdaTerm",
     "CAPSLoss",
     "CATSLoss",
+    "GradCAPSLoss",
     "L2C2Loss",
     "LCPLoss",
     "NeighborTransform",

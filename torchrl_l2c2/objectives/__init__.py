@@ -2,6 +2,7 @@
 
 from torchrl_l2c2.objectives.caps import CAPSLoss
 from torchrl_l2c2.objectives.cats import CATSLoss
+from torchrl_l2c2.objectives.grad_caps import GradCAPSLoss
 from torchrl_l2c2.objectives.l2c2 import L2C2Loss
 from torchrl_l2c2.objectives.lcp import LCPLoss
 from torchrl_l2c2.objectives.ppo_rpe import PPORPELoss
@@ -12,6 +13,7 @@ from torchrl_l2c2.objectives.sr2l import SR2LLoss
 __all__ = [
     "CAPSLoss",
     "CATSLoss",
+    "GradCAPSLoss",
     "L2C2Loss",
     "LCPLoss",
     "PPORPELoss",
