@@ -28,8 +28,7 @@ from torchrl.modules import Actor, IndependentNormal, ProbabilisticActor, ValueO
 from torchrl.objectives import DDPGLoss, DiscreteSACLoss, DQNLoss, PPOLoss, SACLoss, TD3Loss
 
 from torchrl_l2c2 import L2C2Loss, Neighborhood, NeighborTransform, PPORPELoss
-from torchrl_l2c2.objectives.l2c2 import l2c2_penalty
-from torchrl_l2c2.objectives.neighbors import draw_rows
+from torchrl_l2c2.objectives.neighbors import draw_rows, l2c2_penalty
 
 # epsilon = 1/4, lambda_pi = 1/4: the gain is 1 at distance 1/4 and 1/5 at distance 5/4.
 NEAR = Neighborhood(sigma=1.0, lambda_min=0.2, lambda_max=1.0)
@@ -188,6 +187,29 @@ class TestThePenalty:
         difference = torch.tensor([[2.0, 5.0], [4.0, 7.0]])
         gain = torch.tensor([[1.0, 0.2], [0.5, 0.0]])
         torch.testing.assert_close(l2c2_penalty(difference, gain), torch.tensor([2.0, 0.5]))
+
+    def test_the_largest_of_the_neighbors_can_take_the_means_place(self):
+        """max(1 * 2, .5 * 6) and max(.2 * 5, 0): of the penalty, not of the difference."""
+        difference = torch.tensor([[2.0, 5.0], [6.0, 7.0]])
+        gain = torch.tensor([[1.0, 0.2], [0.5, 0.0]])
+        found = l2c2_penalty(difference, gain, "max")
+        torch.testing.assert_close(found, torch.tensor([3.0, 1.0]))
+
+    def test_the_losss_terms_are_of_the_largest_then(self):
+        """Of the two neighbors together what each has alone, per transition."""
+        torch.manual_seed(0)
+        base = DDPGLoss(deterministic_actor(), qvalue(), reduction="none")
+        batch = NeighborTransform(NEAR, num_samples=2)(transitions(6))
+        loss = L2C2Loss(base, NEAR, num_samples=2, over_neighbors="max")
+        alone = []
+        for k in range(2):
+            one = batch.copy()
+            one["neighbor"] = TensorDict(
+                {x: batch["neighbor", x][:, k : k + 1] for x in ("observation", "distance")}, [6]
+            )
+            alone.append(L2C2Loss(base, NEAR).policy_regularizer(one)["loss_l2c2_actor"])
+        found = loss.policy_regularizer(batch)["loss_l2c2_actor"]
+        torch.testing.assert_close(found, torch.maximum(*alone))
 
     def test_agents_share_the_gain_of_their_team(self):
         """Differences [K, B, agents] for gains [K, B]."""

@@ -232,6 +232,7 @@ FREE_TASK_SETTINGS = {"name", "episodes", "frames", "solved_at"}
 # Others are newer, too: null and false always are such values.
 NEUTRAL_SETTINGS = {
     "regularizer.policy_distance": "hellinger",
+    "regularizer.over_neighbors": "mean",
     "regularizer.fraction": 1.0,
     "regularizer.gain": "constant",
     "regularizer.gain_of": "action_variation",

@@ -12,13 +12,14 @@ from torch import Tensor
 from torch.distributions import Categorical
 from torchrl.objectives import DistributionalDQNLoss, LossModule
 
-from torchrl_l2c2._checks import check_positive_int, check_real
+from torchrl_l2c2._checks import check_choice, check_positive_int, check_real
 from torchrl_l2c2.distances import squared_error, squared_hellinger
 from torchrl_l2c2.neighborhood import Neighborhood
 from torchrl_l2c2.objectives.evaluation import VALUE_NETWORKS, at_rows
 from torchrl_l2c2.objectives.neighbors import (
     Neighbors,
     draw_rows,
+    l2c2_penalty,
     read_neighbors,
     warn_of_other_neighbors,
 )
@@ -96,6 +97,9 @@ class L2C2Loss(RegularizedLoss):
             gradients. Scheduled as ``l2c2_coeff``. Defaults to ``1.0``.
         num_samples (int): neighbors per state, drawn here or by the transform, at least 1. More
             give a less noisy estimate at so many times the network evaluations. Defaults to ``1``.
+        over_neighbors (str): ``"mean"``, the paper's, or ``"max"``: the neighbor with the largest
+            penalty alone, an adversary that is as strong as there are neighbors to choose from.
+            Larger at the same gain. Defaults to ``"mean"``.
         fraction (float): share of the batch, in (0, 1], whose states have neighbors, drawn anew
             each time with torch's global generator. Smaller ones cost less, pay in large batches,
             and are noisier; the terms' expectation stays: a drawn transition counts
@@ -154,6 +158,7 @@ class L2C2Loss(RegularizedLoss):
         *,
         coeff: float = 1.0,
         num_samples: int = 1,
+        over_neighbors: Literal["mean", "max"] = "mean",
         fraction: float = 1.0,
         moved_keys: Sequence[NestedKey] | None = None,
         policy_distance: Literal["hellinger", "mean", "kl"] | PolicyDistance = "hellinger",
@@ -164,11 +169,18 @@ class L2C2Loss(RegularizedLoss):
         if not isinstance(neighborhood, Neighborhood):
             raise TypeError(f"neighborhood must be a Neighborhood, got {neighborhood!r}.")
         check_positive_int("num_samples", num_samples)
+        check_choice("over_neighbors", over_neighbors, ("mean", "max"))
+        if over_neighbors == "max" and num_samples == 1:
+            raise ValueError(
+                "num_samples must be above 1 with over_neighbors='max', got 1: of one neighbor the "
+                "largest is the mean."
+            )
         check_real("fraction", fraction, above=0, at_most=1)
         self.l2c2_policy_distance = policy_distance
         self._l2c2_distance = choose_policy_distance(policy_distance, hellinger_samples)
         self.l2c2_neighborhood = neighborhood
         self.l2c2_num_samples = num_samples
+        self.l2c2_over_neighbors: Literal["mean", "max"] = over_neighbors
         self.l2c2_fraction = float(fraction)
         self.l2c2_moved_keys = None if moved_keys is None else unravel_key_list(list(moved_keys))
         self.l2c2_hellinger_samples = hellinger_samples
@@ -257,7 +269,8 @@ class L2C2Loss(RegularizedLoss):
         return difference.sum(0) if self.is_ensemble(network) else difference
 
     def _penalty(self, difference: Tensor, near: Neighbors, tensordict: TensorDictBase) -> Tensor:
-        penalty = l2c2_penalty(difference, self.l2c2_neighborhood.gain(near.distance))
+        gain = self.l2c2_neighborhood.gain(near.distance)
+        penalty = l2c2_penalty(difference, gain, self.l2c2_over_neighbors)
         penalty = near.to_batch(penalty, tensordict.batch_size)
         return self.l2c2_coeff * self.reduce_term(penalty, tensordict)
 
@@ -296,32 +309,6 @@ class L2C2Loss(RegularizedLoss):
             "l2c2_distance": self._diagnostic(finite, near, tensordict),
             "l2c2_gain": self._diagnostic(gain, near, tensordict),
         }
-
-
-def l2c2_penalty(
-    difference: Tensor,  # shape: [K, *B, ...]
-    gain: Tensor,  # shape: [K, *B]
-) -> Tensor:  # shape: [*B, ...]
-    r"""The mean over ``K`` neighbors of the gain times the difference, before the reduction.
-
-    .. math::
-        \frac1K \sum_k \frac{\lambda}{d(s, \tilde s_k; s')}\, d_f(f(s), f(\tilde s_k))
-
-    of a policy or a value function :math:`f` (Kobayashi, L2C2, 2022).
-
-    Args:
-        difference: :math:`d_f`, at least 0; it may have more dimensions, those of agents.
-        gain: :math:`\lambda / d`, as :meth:`Neighborhood.gain <torchrl_l2c2.Neighborhood.gain>`
-            gives it.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_l2c2.objectives.l2c2 import l2c2_penalty
-        >>> l2c2_penalty(torch.tensor([[1.0, 2.0], [3.0, 4.0]]), torch.tensor([[1.0], [0.5]]))
-        tensor([1.2500, 2.0000])
-    """
-    gain = gain[(...,) + (None,) * (difference.ndim - gain.ndim)]
-    return (gain * difference).mean(0)
 
 
 def _value_term(network: str) -> str:

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import fields
 from math import isclose
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -94,6 +94,35 @@ def read_neighbors(
         )
     distance, drawn = entries.pop("distance"), entries.pop("neighborhood", None)
     return TensorDict(entries, batch_size=distance.shape), distance, drawn
+
+
+def l2c2_penalty(
+    difference: Tensor,  # shape: [K, *B, ...]
+    gain: Tensor,  # shape: [K, *B]
+    over_neighbors: Literal["mean", "max"] = "mean",
+) -> Tensor:  # shape: [*B, ...]
+    r"""The mean over ``K`` neighbors of the gain times the difference, before the reduction.
+
+    .. math::
+        \frac1K \sum_k \frac{\lambda}{d(s, \tilde s_k; s')}\, d_f(f(s), f(\tilde s_k))
+
+    of a policy or a value function :math:`f` (Kobayashi, L2C2, 2022).
+
+    Args:
+        difference: :math:`d_f`, at least 0; it may have more dimensions, those of agents.
+        gain: :math:`\lambda / d`, as :meth:`Neighborhood.gain <torchrl_l2c2.Neighborhood.gain>`
+            gives it.
+        over_neighbors: ``"max"`` takes the largest of the ``K`` in the place of their mean.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_l2c2.objectives.neighbors import l2c2_penalty
+        >>> l2c2_penalty(torch.tensor([[1.0, 2.0], [3.0, 4.0]]), torch.tensor([[1.0], [0.5]]))
+        tensor([1.2500, 2.0000])
+    """
+    gain = gain[(...,) + (None,) * (difference.ndim - gain.ndim)]
+    penalty = gain * difference
+    return penalty.mean(0) if over_neighbors == "mean" else penalty.amax(0)
 
 
 def warn_of_other_neighbors(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import Field
 
 from torchrl_l2c2.experiment.regularizers.base import GainConfig
-from torchrl_l2c2.experiment.settings import settings
+from torchrl_l2c2.experiment.settings import SettingError, settings
 
 if TYPE_CHECKING:
     import torch
@@ -47,6 +47,11 @@ class L2C2Config(GainConfig):
         description="gain of the value's regularization relative to the policy's [paper]",
     )
     num_samples: int = Field(default=1, ge=1, description="neighbors per transition [inferred: 1]")
+    over_neighbors: Literal["mean", "max"] = Field(
+        default="mean",
+        description="mean over a transition's neighbors [paper], or the largest of them, which "
+        "needs num_samples above 1",
+    )
     fraction: float = Field(
         default=1.0,
         gt=0,
@@ -59,6 +64,11 @@ class L2C2Config(GainConfig):
         description="how policies are compared: hellinger [paper], half the squared distance of "
         "their means before the squashing, or the KL divergence; they need other gains",
     )
+
+    def __post_init__(self) -> None:
+        GainConfig.__post_init__(self)
+        if self.over_neighbors == "max" and self.num_samples == 1:
+            raise SettingError("num_samples", "must be above 1 with over_neighbors=max, got 1.")
 
     @property
     def neighborhood(self) -> Neighborhood:
@@ -81,6 +91,7 @@ class L2C2Config(GainConfig):
             neighborhood=self.neighborhood,
             beta=self.beta,
             num_samples=self.num_samples,
+            over_neighbors=self.over_neighbors,
             fraction=self.fraction,
             policy_distance=self.policy_distance,
         )
