@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import warnings
 
 import pytest
 
@@ -198,6 +199,17 @@ class TestInARun:
         assert all((state[name] == value).all() for name, value in expected.items())
         first, last = whole.metrics[0], whole.metrics[-1]
         assert any(first[name] != last[name] for name in first if name.startswith("gain"))
+
+    @pytest.mark.parametrize("kind", ["constant", "ramp"])
+    def test_only_a_constant_gain_is_told_to_be_faint(self, kind):
+        """After 100 updates; one that sets itself may be small for now."""
+        regularizer = L2C2Config(lambda_min=1e-9, lambda_max=1e-8, gain=kind)
+        run = Experiment(small(regularizer, algorithm=PPORPEConfig(hidden=(8,), updates=60)))
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            run.train(2)
+        told = [w for w in caught if "regularizer's terms are less" in str(w.message)]
+        assert len(told) == (kind == "constant")
 
     @pytest.mark.slow
     def test_a_compiled_update_follows_the_gain(self):
