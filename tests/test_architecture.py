@@ -14,9 +14,10 @@ MODULES = {
 LAYERS = """
 _version _checks
 neighborhood affinities gains
-distances transforms metrics modules updaters optim.adaterm
+distances transforms modules updaters optim.adaterm metrics.actions
 policy_distances
-optim.__init__
+optim.__init__ metrics.policy metrics.spectrum
+metrics.__init__
 objectives.specialization objectives.evaluation objectives.shared_evaluation
 objectives.transitions objectives.relative_pearson
 objectives.regularized objectives.neighbors
@@ -46,7 +47,7 @@ experiment.reports.records
 experiment.reports.runs experiment.reports.groups
 experiment.reports.score
 experiment.reports.tables
-experiment.reports.comparison
+experiment.reports.comparison experiment.reports.measures
 experiment.reports.figures
 experiment.reports.page experiment.reports.readme experiment.reports.results
 experiment.reports.__init__

@@ -10,6 +10,8 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import gymnasium
+import numpy as np
 import pytest
 import torch
 
@@ -31,7 +33,9 @@ from torchrl_l2c2.experiment import (
     UniformReplayConfig,
     make_env,
 )
-from torchrl_l2c2.experiment.player import SimulatorError, check_finite
+from torchrl_l2c2.experiment.collection import check_finite
+from torchrl_l2c2.experiment.evaluate import LateTests, evaluate_policy
+from torchrl_l2c2.experiment.player import SimulatorError
 from torchrl_l2c2.experiment.reports import read_runs
 
 ROOT = Path(__file__).parent.parent
@@ -187,6 +191,36 @@ def test_nan_from_the_environment_stops_the_run_with_key_and_frame():
     batch["next", "reward"][4] = float("nan")
     with pytest.raises(FloatingPointError, match=r"'next', 'reward'.*frame 104"):
         check_finite(batch.detach(), first_frame=100)
+
+
+class Faulty(gymnasium.Env):
+    """Its third reward is no number."""
+
+    observation_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.frame = 0
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        self.frame += 1
+        return np.zeros(2, np.float32), math.nan if self.frame == 3 else 0.0, False, False, {}
+
+
+gymnasium.register("Faulty-v0", entry_point=Faulty)
+
+
+def test_nan_in_a_test_episode_gives_no_result():
+    """Neither at the end nor late in training: a mean with it would be none."""
+    task = TaskConfig("faulty", "Faulty-v0", episodes=1, max_steps=5)
+    env = make_env(task, seed=0)
+    policy = make_actor(2, env.action_spec)
+    with pytest.raises(FloatingPointError, match=r"'next', 'reward'.*frame 2"):
+        evaluate_policy(policy, env, 2, max_steps=5)
+    with pytest.raises(FloatingPointError, match=r"'next', 'reward'.*frame 2"):
+        LateTests(task, 0, policy, compile_policy=False).play(1)
 
 
 def broken_after(experiment, frames, outcome):
@@ -362,6 +396,9 @@ def test_a_run_from_the_command_line_leaves_everything_behind(tmp_path):
     assert run.folder.relative_to(tmp_path).as_posix() == (
         "Pendulum-v1/ppo_rpe/l2c2/max_steps-50_compile-false/seed_0"
     )
+    # The field's measures, of the means and of the samples that were played.
+    assert 0 < run.evaluation["summary"]["roughness_mean"] < 0.5
+    assert len(run.evaluation["sampled"]["episodes"]["measures"]["sampled_sm_asap"]) == 2
     assert "torchrl" in json.loads((run.folder / "versions.json").read_text())
     config = json.loads((run.folder / "config.json").read_text())
     assert ExperimentConfig.from_dict(config).task.env_id == "Pendulum-v1"
@@ -430,6 +467,10 @@ def test_a_sweep_gives_one_table(tmp_path):
         ("l2c2", 0),
         ("l2c2", 1),
     ]
+    # Each says where the sweep stands, and how long the rest takes by those before.
+    assert "run 1 of 4: Pendulum-v1, ppo_rpe, none, seed 0" in done.stdout
+    assert "run 4 of 4, about 1 min left: Pendulum-v1, ppo_rpe, l2c2, seed 1" in done.stdout
+    assert "run 4 of 4, about 1 min left; episode 3 of 3" in done.stderr
     # At the end of the sweep, of its own runs.
     late, last = done.stdout.split("picture:")[-1].split("**Last policy**")
     for rows in (late, last):

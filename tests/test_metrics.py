@@ -1,9 +1,21 @@
 """The measures of smoothness against hand-computed numbers."""
 
+import numpy as np
 import pytest
 import torch
 
 from torchrl_l2c2 import Neighborhood, action_variation, local_lipschitz
+from torchrl_l2c2.metrics import (
+    action_fluctuation_ratio,
+    action_jerk,
+    action_rate,
+    amplitude_spectrum,
+    noise_sensitivity,
+    previous_action_gain,
+    roughness,
+    saturation,
+    spectral_smoothness,
+)
 
 
 def test_action_variation_by_hand():
@@ -106,3 +118,97 @@ def test_local_lipschitz_refuses_shapes_that_do_not_fit():
         local_lipschitz(state, neighbor, output, torch.zeros(4, 5, 1))
     with pytest.raises(ValueError, match="reduction must be 'max' or 'mean', got 'sum'"):
         local_lipschitz(state, neighbor, output, neighbor_output, reduction="sum")
+
+
+def test_differences_by_hand():
+    """Of 0, 1, 4, 10: changes 1, 3, 6; second ones 2, 3; a third one of 1."""
+    actions = torch.tensor([[0.0], [1.0], [4.0], [10.0]])
+    assert action_rate(actions).item() == pytest.approx((1 + 9 + 36) / 3)
+    assert action_fluctuation_ratio(actions).item() == pytest.approx(10 / 4)
+    assert action_jerk(actions).item() == pytest.approx(1.0)
+    assert action_jerk(actions, sampling_rate=10.0).item() == pytest.approx(1000.0)
+    # Around the mean of 3.75: -3.75, -2.75, .25, 6.25.
+    products, squares = 3.75 * 2.75 - 2.75 * 0.25 + 0.25 * 6.25, 3.75**2 + 2.75**2 + 0.25**2
+    assert previous_action_gain(actions).item() == pytest.approx(products / squares)
+
+
+def test_the_gain_on_the_action_before_tells_flips_from_drifts():
+    """A flip at every step has -1; a slow drift nearly 1; a coin about 0."""
+    torch.manual_seed(0)
+    flips = torch.tensor([1.0, -1.0]).repeat(50).unsqueeze(-1)
+    assert previous_action_gain(flips).item() == pytest.approx(-1.0)
+    assert previous_action_gain(torch.linspace(0, 1, 500).unsqueeze(-1)).item() > 0.98
+    assert abs(previous_action_gain(torch.randn(20_000, 1)).item()) < 0.03
+
+
+def test_the_spectrum_of_known_signals():
+    """Two sines of known amplitude, frequency and rate; a constant is all at 0."""
+    time = torch.arange(200) / 50.0  # 4 s at 50 a second
+    actions = 3 + 2 * torch.sin(2 * torch.pi * 5 * time) + 0.5 * torch.cos(2 * torch.pi * 20 * time)
+    frequencies, amplitudes = amplitude_spectrum(actions.unsqueeze(-1), sampling_rate=50.0)
+    found = {f: a for f, a in zip(frequencies.tolist(), amplitudes[:, 0].tolist(), strict=True)}
+    expected = {0.0: 6.0, 5.0: 2.0, 20.0: 0.5}
+    for frequency, amplitude in found.items():
+        assert amplitude == pytest.approx(expected.get(frequency, 0.0), abs=1e-4)
+    assert roughness(actions.unsqueeze(-1), 50.0).item() == pytest.approx(
+        (2 * 5 + 0.5 * 20) / 2.5 / 50, abs=1e-4
+    )
+
+
+@pytest.mark.parametrize("steps", [50, 1000])
+def test_the_two_forms_of_sm_are_the_published_ones_and_convert(steps):
+    """Each written out as its authors print it; one is (T - 2) / 4 times the other."""
+    torch.manual_seed(0)
+    actions = torch.randn(steps, 3, dtype=torch.float64)
+    spectrum = np.abs(np.fft.fft(actions.numpy(), axis=0))[: steps // 2]
+    caps = np.mean(2 / steps * spectrum * np.linspace(0, 1, steps // 2)[:, None])
+    frequencies = np.fft.fftfreq(steps)[: steps // 2]
+    asap = np.mean(2 / steps * (frequencies[:, None] * spectrum).sum(0))
+    assert spectral_smoothness(actions).item() == pytest.approx(caps)
+    assert spectral_smoothness(actions, "asap").item() == pytest.approx(asap)
+    assert asap / caps == pytest.approx((steps - 2) / 4)
+
+
+def test_roughness_is_free_of_amplitude_offset_and_length():
+    """White noise has .25, whatever its size; a slow sine less the slower it is."""
+    torch.manual_seed(0)
+    for steps, size in ((500, 1.0), (5000, 30.0)):
+        assert roughness(7 + size * torch.randn(steps, 4)).item() == pytest.approx(0.25, abs=0.02)
+
+
+def test_saturation_counts_what_is_at_the_bounds():
+    """Of six numbers in bounds -1, 1 and 0, 4: -1, .99 and 3.97 are at their ends."""
+    actions = torch.tensor([[-1.0, 2.0], [0.99, 3.97], [0.9, 0.5]])
+    low, high = torch.tensor([-1.0, 0.0]), torch.tensor([1.0, 4.0])
+    assert saturation(actions, low, high).item() == pytest.approx(3 / 6)
+    assert saturation(actions, low, high, margin=0.0).item() == pytest.approx(1 / 6)
+
+
+def test_noise_sensitivity_of_a_linear_policy():
+    """Half the squared scale times the squared norm of its weights."""
+    weight = torch.tensor([[1.0, -2.0, 0.0], [0.0, 0.5, 3.0]])
+    observations = torch.randn(50_000, 3)
+    found = noise_sensitivity(lambda s: s @ weight.T, observations, 0.2)
+    assert found.item() == pytest.approx(0.5 * 0.04 * weight.square().sum().item(), rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("measure", "least"),
+    [
+        (action_rate, 2),
+        (action_fluctuation_ratio, 2),
+        (previous_action_gain, 2),
+        (action_jerk, 4),
+        (amplitude_spectrum, 4),
+        (spectral_smoothness, 4),
+        (roughness, 4),
+    ],
+)
+def test_measures_of_batches_and_what_is_too_short(measure, least):
+    """Each episode of a batch by itself; one step fewer than it takes is refused."""
+    torch.manual_seed(0)
+    batch = torch.randn(2, 3, 9, 2)
+    if measure is not amplitude_spectrum:
+        torch.testing.assert_close(measure(batch)[1, 2], measure(batch[1, 2]))
+    with pytest.raises(ValueError, match=f"T of at least {least}, got"):
+        measure(torch.zeros(least - 1, 2))

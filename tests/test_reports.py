@@ -32,6 +32,7 @@ from torchrl_l2c2.experiment.reports.__main__ import main
 from torchrl_l2c2.experiment.reports.comparison import statistics_tables
 from torchrl_l2c2.experiment.reports.differences import differences, fingerprint
 from torchrl_l2c2.experiment.reports.groups import group_records
+from torchrl_l2c2.experiment.reports.measures import measures_table
 from torchrl_l2c2.experiment.reports.readme import END, START, fill
 from torchrl_l2c2.experiment.reports.records import FIGURES, merge
 from torchrl_l2c2.experiment.reports.score import readings
@@ -131,6 +132,25 @@ def cells(table, *start):
     """The cells of the only row that starts so."""
     (row,) = (list(row) for row in table.rows if tuple(row[: len(start)]) == start)
     return row[len(start) :]
+
+
+class TestMeasures:
+    def test_they_are_pooled_over_seeds_where_runs_have_them(self, tmp_path):
+        """Means of 1 and 2: 1.5 with a deviation of .71; a run of before has none."""
+        for seed in range(3):
+            make_run(tmp_path / str(seed), make_config(seed=seed), 10.0, 0.1)
+            path = tmp_path / str(seed) / "evaluation.json"
+            content = json.loads(path.read_text())
+            if seed:
+                content["summary"] |= {"roughness_mean": float(seed), "saturation_mean": math.nan}
+            path.write_text(json.dumps(content))
+        runs = read_runs(tmp_path)
+        table = measures_table(runs)
+        assert cells(table, "swingup", "ppo_rpe", "vanilla") == ["0-2", "1.5 (0.71)", "-"]
+        assert table.columns[-2:] == ["roughness", "at the bounds"]
+        page = write_report(tmp_path / "report", [run.record for run in runs], runs)
+        assert "1.5 (0.71)" in page.read_text()
+        assert measures_table(runs[:1]) is None
 
 
 class TestGroups:

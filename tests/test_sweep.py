@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from torchrl_l2c2.experiment.folder import list_checkpoints, load_checkpoint
+from torchrl_l2c2.experiment.sweep import Sweep, begin_sweep
 
 ROOT = Path(__file__).parent.parent
 SETTINGS = (
@@ -112,7 +113,8 @@ def test_an_interrupted_sweep_saves_ends_and_is_continued(tmp_path, launcher, nu
 
 def test_ctrl_c_while_compiling_saves(tmp_path):
     """The compiler does not hear it; the episode ends with its updates, and is saved."""
-    process = start(tmp_path, "task.episodes=100", "seed=9", f"algorithm.kappa={random.random()}")
+    kappa = f"algorithm.kappa={random.random()}"  # nothing of it is in the compiler's cache
+    process = start(tmp_path, "task.episodes=100", "seed=9", "regularizer=none", kappa)
     wait_until(lambda: "compiling" in said(tmp_path) and len(alive(process.pid)) > 1)
     time.sleep(1)
     os.killpg(process.pid, signal.SIGINT)
@@ -133,6 +135,18 @@ def test_the_failed_jobs_of_a_sweep_are_named_at_its_end(tmp_path):
     assert last.startswith("failed: ") and "regularizer.sigma=-1" in last
     assert "sigma must be greater than 0, got -1" in last and "Traceback" not in said(tmp_path)
     assert len(list((tmp_path / "o").rglob("evaluation.json"))) == 1
+
+
+def test_a_sweep_says_how_much_of_it_is_left():
+    """By the mean of what is finished: 15 of 18 runs at 40 minutes, two at once."""
+    with begin_sweep(["-m", "seed=0,1,2", "~logger"]) as begun:
+        params = {"seed": "range(0,18)", "task": "a,b", "regularizer": "none,caps,l2c2"}
+        assert begun.standing(1, params, 1) == "run 1 of 18"
+        for seconds in (1800.0, 3000.0, float("nan")):
+            begun.add_finished(Path("run"), seconds)
+        # As a job sees it, in whatever process.
+        assert Sweep.of_this_job().standing(4, params, 2) == "run 4 of 18, about 5.3 h left"
+        assert begun.standing(18, params, 1) == "run 18 of 18, about 40 min left"
 
 
 def numbers(folder):
@@ -159,7 +173,8 @@ def test_what_is_ended_at_random_times_ends_with_the_same_numbers(tmp_path, swee
         else:
             process.send_signal(number)
         process.wait(60)
-        wait_until(lambda pid=process.pid: not alive(pid), 20)
+        # Those of a killed process look for it, once they are there themselves.
+        wait_until(lambda pid=process.pid: not alive(pid), 60)
     assert start(folder, *command).wait(580) == 0, said(folder)
     ours, theirs = runs(folder), runs(tmp_path / "undisturbed")
     assert ours.keys() == theirs.keys() and len(ours) == (4 if sweep else 1)

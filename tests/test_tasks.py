@@ -141,10 +141,10 @@ def test_what_is_no_numbers_is_refused(monkeypatch, space, flatten):
     assert "\n" not in str(refused.value)
 
 
-def test_images_are_refused_without_a_network_for_them(monkeypatch):
-    """They are no vector, but their pixels can be."""
+def test_images_are_refused_where_a_vector_is_to_be(monkeypatch):
+    """With both ways to have them observed."""
     still(monkeypatch, space=spaces.Box(0, 255, (8, 8, 3), np.uint8))
-    with pytest.raises(ValueError, match=r"no network for images.*task.flatten=true"):
+    with pytest.raises(ValueError, match=r"task.images=true.*task.flatten=true"):
         make_env(task(), 0)
 
 

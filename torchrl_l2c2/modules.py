@@ -55,6 +55,19 @@ class Squish(nn.Module):
         return f"b={self.b}"
 
 
+class EncodedNetwork(nn.Module):
+    """A network on what an encoder makes of the first input, with the other inputs as they are."""
+
+    def __init__(self, encoder: nn.Module, network: nn.Module) -> None:
+        super().__init__()
+        self.encoder = encoder
+        self.network = network
+
+    def forward(self, observation: Tensor, *others: Tensor) -> Tensor:
+        """An observation that the encoder takes, and others ``[*B, F_i]``, to ``[*B, F]``."""
+        return self.network(self.encoder(observation), *others)
+
+
 class NormalNetwork(nn.Module):
     """Maps observations to the location and the positive scale of a diagonal normal."""
 
@@ -90,6 +103,7 @@ def make_actor(
     scale_mapping: str = "biased_softplus_1.0",
     squish_b: float = 4.0,
     in_keys: Sequence[NestedKey] = ("observation",),
+    encoder: nn.Module | None = None,
 ) -> ProbabilisticActor:
     r"""Builds the paper's policy: a diagonal normal from layers of ``Linear, LayerNorm, Squish``.
 
@@ -114,6 +128,9 @@ def make_actor(
         squish_b (float): bend of :class:`Squish`. Default 4.0.
         in_keys (sequence of NestedKey): observations to read; several are concatenated. Default
             ``("observation",)``.
+        encoder (nn.Module, optional): makes ``[*B, F]`` of the first of them, such as a
+            :class:`~torchrl.modules.ConvNet` of an image; ``observation_size`` counts ``F`` in its
+            place. Default ``None``: the observation as it is.
 
     Returns:
         ProbabilisticActor: the policy, for any leading batch dimensions.
@@ -139,7 +156,8 @@ def make_actor(
         spec = Bounded(low=-1.0, high=1.0, shape=(action,))
     size = _action_size(spec)
     network = NormalNetwork(
-        _body(observation_size, hidden, 2 * size, squish_b), NormalParamExtractor(scale_mapping)
+        _body(observation_size, hidden, 2 * size, squish_b, encoder),
+        NormalParamExtractor(scale_mapping),
     )
     return ProbabilisticActor(
         TensorDictModule(network, in_keys=list(in_keys), out_keys=["loc", "scale"]),
@@ -160,6 +178,7 @@ def make_critic(
     hidden: Sequence[int] = (100, 100),
     squish_b: float = 4.0,
     in_keys: Sequence[NestedKey] = ("observation",),
+    encoder: nn.Module | None = None,
 ) -> TensorDictModule:
     """Builds the paper's critic: an ensemble of values that share all layers but the last.
 
@@ -177,6 +196,9 @@ def make_critic(
         squish_b (float): bend of :class:`Squish`. Default 4.0.
         in_keys (sequence of NestedKey): observations to read; several are concatenated. Default
             ``("observation",)``.
+        encoder (nn.Module, optional): makes ``[*B, F]`` of the first of them, such as a
+            :class:`~torchrl.modules.ConvNet` of an image; ``observation_size`` counts ``F`` in its
+            place. Default ``None``: the observation as it is.
 
     Returns:
         TensorDictModule: the critic, for any leading batch dimensions.
@@ -196,17 +218,23 @@ def make_critic(
     """
     check_positive_int("make_critic: num_heads", num_heads)
     return TensorDictModule(
-        EnsembleNetwork(_body(observation_size, hidden, num_heads, squish_b)),
+        EnsembleNetwork(_body(observation_size, hidden, num_heads, squish_b, encoder)),
         in_keys=list(in_keys),
         out_keys=["state_value", "state_value_heads"],
     )
 
 
-def _body(in_features: int, hidden: Sequence[int], out_features: int, squish_b: float) -> MLP:
+def _body(
+    in_features: int,
+    hidden: Sequence[int],
+    out_features: int,
+    squish_b: float,
+    encoder: nn.Module | None,
+) -> nn.Module:
     check_positive_int("observation_size", in_features)
     for cells in hidden:
         check_positive_int("every entry of hidden", cells)
-    return MLP(
+    layers = MLP(
         in_features=in_features,
         out_features=out_features,
         num_cells=list(hidden),
@@ -215,6 +243,7 @@ def _body(in_features: int, hidden: Sequence[int], out_features: int, squish_b: 
         activation_class=Squish,
         activation_kwargs={"b": squish_b},
     )
+    return layers if encoder is None else EncodedNetwork(encoder, layers)
 
 
 def _action_size(spec: TensorSpec) -> int:

@@ -199,6 +199,32 @@ class EpisodeCollector(Collector):
         )
 
 
+def check_finite(batch: TensorDictBase, first_frame: int) -> None:
+    """Stops at the first NaN or infinity that the environment or the policy gave.
+
+    Args:
+        batch (TensorDictBase): frames, ``[T]``.
+        first_frame (int): frames before them, for the error.
+
+    Raises:
+        FloatingPointError: names the key and the frame.
+    """
+    found = []
+    # In the order in which they come about: what follows a bad action is bad as well.
+    for key in ("observation", "action", ("next", "observation"), ("next", "reward")):
+        bad = ~batch[key].isfinite()
+        if bad.any():
+            found.append((int(bad.flatten(1).any(1).nonzero()[0]), key))
+    if found:
+        step, key = min(found, key=lambda each: each[0])
+        giver = "policy" if key == "action" else "environment"
+        raise FloatingPointError(
+            f"{key} is not finite at frame {first_frame + step}: "
+            f"{batch[key][step].flatten().tolist()}. "
+            f"The {giver} gave it; nothing is learned from this episode."
+        )
+
+
 def _parts(env: EnvBase) -> tuple[GymWrapper, ObservationNoise | None]:
     """The simulator and its noise."""
     transforms: list[Transform] = []

@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import hydra
 from hydra.core.config_store import ConfigStore
@@ -34,6 +34,9 @@ from torchrl_l2c2.experiment.signals import (
     terminate,
 )
 from torchrl_l2c2.experiment.sweep import Sweep, begin_sweep
+
+if TYPE_CHECKING:
+    from torchrl_l2c2.experiment.reports import FinishedRun
 
 PACKAGE = Path(__file__).parents[1]
 # Beside the package in a clone, within it when installed.
@@ -84,7 +87,7 @@ def main() -> None:
     if not {"-m", "--multirun", "hydra.mode=MULTIRUN"} & set(sys.argv):
         _main()
         return
-    with begin_sweep() as sweep:
+    with begin_sweep(sys.argv[1:]) as sweep:
         try:
             _main()
         except KeyboardInterrupt:
@@ -134,8 +137,8 @@ def _run_job(values: dict[str, Any], sweep: Sweep) -> None:
         return
     try:
         with sweep.job():
-            if (finished := run(values)) is not None:
-                sweep.add_finished(finished)
+            if (finished := run(values, _standing(sweep))) is not None:
+                sweep.add_finished(finished.folder, finished.record.seconds)
     except Interrupted as interruption:
         print(interruption, file=sys.stderr)
         sweep.stop(interruption.signal_number)
@@ -146,6 +149,12 @@ def _run_job(values: dict[str, Any], sweep: Sweep) -> None:
             traceback.print_exc()
         job = " ".join(HydraConfig.get().overrides.task)
         sweep.add_failure(job, _tell(error).splitlines()[0])
+
+
+def _standing(sweep: Sweep) -> str:
+    chosen = HydraConfig.get()
+    at_once = max(1, chosen.launcher.get("n_jobs", 1))
+    return sweep.standing(chosen.job.num + 1, chosen.sweeper.params or {}, at_once)
 
 
 def _tell(error: Exception) -> str:
@@ -167,8 +176,13 @@ def run_folder(config: ExperimentConfig, outputs: str) -> Path:
     return Path(chosen.runtime.output_dir)
 
 
-def run(values: dict[str, Any]) -> Path | None:
-    """One run in its folder, its progress and its result; the folder, if there is a result."""
+def run(values: dict[str, Any], standing: str = "") -> FinishedRun | None:
+    """One run in its folder, its progress and its result, if it tests its policy.
+
+    Args:
+        values (dict): the configuration.
+        standing (str): of the sweep that it belongs to; shown before its name and its progress.
+    """
     config = ExperimentConfig.from_dict(values)
     # Here, as settings are checked before anything waits for torch.
     from torchrl_l2c2.experiment.folder import save_policy
@@ -181,12 +195,13 @@ def run(values: dict[str, Any]) -> Path | None:
     warnings.filterwarnings("ignore", "No target network updater")
     folder = run_folder(config, values["outputs"])
     chosen = (config.task, config.algorithm, config.regularizer)
-    print(f"{', '.join(group.name for group in chosen)}, seed {config.seed}: {folder}", flush=True)
+    named = f"{', '.join(group.name for group in chosen)}, seed {config.seed}: {folder}"
+    print(f"{standing}: {named}" if standing else named, flush=True)
     finished = finished_run(folder, config.to_dict())
     if finished is None:
         going_on = {name: values[name] for name in ("resume", "allow_other_versions")}
         with closing(Experiment(config, folder, **going_on)) as experiment, _end_logged(folder):
-            experiment.train(progress=True)
+            experiment.train(progress=standing or True)
             if not config.test_episodes:
                 save_policy(experiment.agent.policy, folder / "policy.pt")
                 return None
@@ -195,7 +210,7 @@ def run(values: dict[str, Any]) -> Path | None:
             log(folder, f"finished:\n{compare_with_paper(finished)}")
     print(compare_with_paper(finished))
     print(f"picture: {folder / 'learning_curves.png'}", flush=True)
-    return folder
+    return finished
 
 
 @contextmanager

@@ -73,6 +73,12 @@ class ExperimentConfig:
     optimizer: OptimizerConfig = None  # type: ignore[assignment]
     logger: LoggerConfig = dataclasses.field(default_factory=LoggerConfig)
     seed: int = Field(default=0, ge=0, description="of everything that is random in the run")
+    device: str = Field(
+        default="cpu",
+        pattern=r"^(cpu|cuda(:\d+)?)$",
+        description="of the updates and what they learn from: cpu, cuda or cuda:N; episodes are "
+        "played on the CPU, by a copy of the policy",
+    )
     threads: int = Field(
         default=1, ge=1, description="of PyTorch; the networks are too small to gain from more"
     )
@@ -152,9 +158,25 @@ class ExperimentConfig:
         return self.task.make_env(self.seed)
 
     def make_agent(self, env: EnvBase) -> Agent:
-        """What learns, for an environment's observation and action."""
-        agent = self.algorithm.make_agent(env, self.regularizer, self.optimizer)
+        """What learns, for an environment's observation and action, on the settings' device.
+
+        Raises:
+            SettingError: PyTorch finds no such device.
+        """
+        import torch
+
+        device = torch.device(self.device)
+        if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+            raise SettingError(
+                "device",
+                f"must be one that PyTorch finds; it finds {torch.cuda.device_count()} CUDA "
+                f"devices, got {self.device!r}: use device=cpu.",
+            )
+        with device:
+            agent = self.algorithm.make_agent(env, self.regularizer, self.optimizer)
         agent.compilable &= self.regularizer.compilable
+        if device.type != "cpu":
+            agent.act_on_cpu()
         return agent
 
     def make_replay(self) -> TensorDictReplayBuffer:
@@ -163,8 +185,8 @@ class ExperimentConfig:
 
         # The last episodes may go past the rollout's frames.
         longest = getattr(self.algorithm, "frames", 0) + self.num_workers * self.task.time_limit
-        buffer = self.replay.make(torch.Generator().manual_seed(self.seed), longest)
-        transform = self.regularizer.transform(torch.Generator().manual_seed(self.seed))
+        buffer = self.replay.make(torch.Generator().manual_seed(self.seed), longest, self.device)
+        transform = self.regularizer.transform(torch.Generator(self.device).manual_seed(self.seed))
         if transform is not None:
             buffer.append_transform(transform)
         return buffer
@@ -231,6 +253,7 @@ FREE_TASK_SETTINGS = {"name", "episodes", "frames", "solved_at"}
 # Settings that are newer than some runs, with the value at which they change none of the numbers.
 # Others are newer, too: null and false always are such values.
 NEUTRAL_SETTINGS = {
+    "device": "cpu",
     "regularizer.policy_distance": "hellinger",
     "regularizer.over_neighbors": "mean",
     "regularizer.fraction": 1.0,

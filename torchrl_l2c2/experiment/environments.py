@@ -14,7 +14,12 @@ import gymnasium
 import torch
 from torchrl.envs import EnvBase, GymWrapper, TransformedEnv
 
-from torchrl_l2c2.experiment.spaces import Env, observing_vector, taking_vector
+from torchrl_l2c2.experiment.spaces import (
+    Env,
+    observing_image,
+    observing_vector,
+    taking_vector,
+)
 from torchrl_l2c2.transforms import ObservationNoise
 
 if TYPE_CHECKING:
@@ -32,14 +37,18 @@ def make_env(task: TaskConfig, seed: int) -> EnvBase:
         seed (int): of the simulator and, separately, of the noise.
 
     Returns:
-        EnvBase: a ``GymWrapper`` that observes one vector of float32, transformed by
+        EnvBase: a ``GymWrapper`` that observes one vector, or image, of float32, transformed by
             :class:`ObservationNoise` where there is noise.
 
     Raises:
         ValueError: an id that Gymnasium does not know, a task without a time limit, or one whose
-            observations or actions are not vectors of numbers.
+            observations or actions are not vectors of numbers, nor images where they are to be.
     """
-    simulator = taking_vector(observing_vector(_make(task), flatten=task.flatten))
+    simulator = taking_vector(_make(task))
+    if task.images:
+        simulator = observing_image(simulator)
+    else:
+        simulator = observing_vector(simulator, flatten=task.flatten)
     with quiet_output():
         env = GymWrapper(simulator)
         env.reset()

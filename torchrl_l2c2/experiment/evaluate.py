@@ -10,23 +10,46 @@ import json
 import math
 import statistics
 import sys
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
+from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 from tqdm import tqdm
 
-from torchrl_l2c2.experiment.collection import EpisodeCollector
+from torchrl_l2c2.experiment.collection import EpisodeCollector, check_finite
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
 from torchrl_l2c2.experiment.folder import load_newest, write_json
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.tasks import TaskConfig
-from torchrl_l2c2.metrics import action_variation
+from torchrl_l2c2.metrics import (
+    action_fluctuation_ratio,
+    action_jerk,
+    action_rate,
+    action_variation,
+    previous_action_gain,
+    roughness,
+    saturation,
+    spectral_smoothness,
+)
+
+# The field's measures beside the paper's, each of the actions of an episode [T, A].
+MEASURES: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
+    "action_rate": action_rate,
+    "action_fluctuation_ratio": action_fluctuation_ratio,
+    "action_jerk": action_jerk,
+    "roughness": roughness,
+    "sm_caps": spectral_smoothness,
+    "sm_asap": partial(spectral_smoothness, form="asap"),
+    "previous_action_gain": previous_action_gain,
+}
+LEAST_STEPS = 4  # that each of them can be taken of
 
 
 @dataclass(frozen=True)
@@ -38,11 +61,15 @@ class Evaluation:
         action_variations: mean L2 norm of the change of the mean action from step to step, the
             paper's "L2 norm of temporal actions". Smaller is smoother.
         lengths: steps of the episodes.
+        measures: other measures of the mean action's smoothness (``torchrl_l2c2.metrics``), with
+            ``saturation`` where actions have bounds; of an episode that played samples, those of
+            the samples as well, as ``sampled_...``. NaN where an episode is too short.
     """
 
     returns: list[float]
     action_variations: list[float]
     lengths: list[int]
+    measures: dict[str, list[float]] = field(default_factory=dict)
 
     def summary(self) -> dict[str, float | int]:
         """Means and standard deviations over the episodes."""
@@ -52,6 +79,7 @@ class Evaluation:
             "return_std": statistics.pstdev(self.returns),
             "action_variation_mean": statistics.fmean(self.action_variations),
             "action_variation_std": statistics.pstdev(self.action_variations),
+            **{f"{name}_mean": statistics.fmean(each) for name, each in self.measures.items()},
         }
 
 
@@ -78,6 +106,8 @@ def evaluate_policy(
         progress (bool): whether to show a progress bar.
 
     Raises:
+        FloatingPointError: NaN or infinity in what the environment or the policy gave; names the
+            key and the frame.
         ValueError: fewer than one episode.
 
     Examples:
@@ -93,6 +123,7 @@ def evaluate_policy(
     returns: list[float] = []
     variations: list[float] = []
     lengths: list[int] = []
+    measures: dict[str, list[float]] = {}
     collector = EpisodeCollector(
         env,
         policy,
@@ -106,13 +137,31 @@ def evaluate_policy(
     )
     for _ in bar:
         episode = collector.rollout()
+        check_finite(episode, sum(lengths))
         actions = mean_actions(policy, episode) if sampled else episode["action"]
         returns.append(episode["next", "reward"].sum().item())
         variations.append(_variation(actions))
+        played = {"": actions, "sampled_": episode["action"]} if sampled else {"": actions}
+        for prefix, kind in played.items():
+            for name, value in measure(kind, env.action_spec).items():
+                measures.setdefault(prefix + name, []).append(value)
         lengths.append(len(episode))
         bar.set_postfix_str(f"return {statistics.fmean(returns):.1f}")
     collector.shutdown(close_env=False)
-    return Evaluation(returns, variations, lengths)
+    return Evaluation(returns, variations, lengths, measures)
+
+
+def measure(actions: torch.Tensor, spec: TensorSpec) -> dict[str, float]:
+    """The field's measures of an episode's actions ``[T, A]``; NaN where it is too short."""
+    actions = actions.float()
+    long_enough = len(actions) >= LEAST_STEPS
+    found = {
+        name: function(actions).item() if long_enough else math.nan
+        for name, function in MEASURES.items()
+    }
+    if isinstance(spec, Bounded) and spec.dtype.is_floating_point:
+        found["saturation"] = saturation(actions, spec.space.low, spec.space.high).item()
+    return found
 
 
 @torch.no_grad()
@@ -144,13 +193,18 @@ class LateTests:
         self._collector: EpisodeCollector | None = None
 
     def play(self, number: int) -> dict[str, float]:
-        """The figures of the test episode that belongs to a training episode's number."""
+        """The figures of the test episode that belongs to a training episode's number.
+
+        Raises:
+            FloatingPointError: as in :func:`evaluate_policy`.
+        """
         with ProcessState(self._seed, torch.get_num_threads()):
             # Late, as most calls of a short training need none.
             if self._collector is None:
                 self._collector = self._make_collector()
             self._collector.set_seed(self._seed + number)
             episode = self._collector.rollout()
+        check_finite(episode, 0)
         total = episode["next", "reward"].sum().item()
         return {"test_return": total, "test_action_variation": _variation(episode["action"])}
 
@@ -224,6 +278,7 @@ def load_policy(
     if not (folder / "config.json").exists():
         raise FileNotFoundError(f"{str(folder)!r} is not the folder of a run: no config.json.")
     config = ExperimentConfig.from_dict(json.loads((folder / "config.json").read_text()))
+    config = replace(config, device="cpu")
     noise = config.task.noise_scale if noise_scale is None else noise_scale
     task = replace(config.task, noise_scale=noise)
     env = make_env(task, config.seed + TEST_SEED if seed is None else seed)

@@ -182,7 +182,7 @@ def load_checkpoint(path: str | Path) -> dict[str, Any]:
     """
     path = Path(path)
     try:
-        return torch.load(io.BytesIO(_payload(path)), weights_only=True)
+        return torch.load(io.BytesIO(_payload(path)), "cpu", weights_only=True)
     except (RuntimeError, EOFError, pickle.UnpicklingError) as error:
         if isinstance(error, CheckpointError):
             raise

@@ -89,6 +89,7 @@ class Learner:
 
     def renew(self) -> None:
         """Makes the update anew: a compiled one is made for the tensors that were there."""
+        self.agent.refresh_policy()
         how: Any = {"compile": self._compile, "skip_nonfinite": self._skip_nonfinite}
         self.update: Step = (
             make_update(self.agent, **how)
@@ -100,7 +101,7 @@ class Learner:
     def remember(self, transitions: TensorDictBase) -> None:
         """Keeps the entries that the loss reads, and no others: sampling copies every one."""
         scaled = transitions["next", "reward"] * self._reward_factor
-        transitions = transitions.copy().set(("next", "reward"), scaled)
+        transitions = transitions.copy().set(("next", "reward"), scaled).to(self.agent.device)
         if self.agent.advantage is not None:
             transitions = self.agent.advantage(transitions)
         self.replay.extend(transitions.select(*self.agent.loss.in_keys, strict=False))
@@ -111,6 +112,7 @@ class Learner:
             return
         for _ in range(updates):
             self._update()
+        self.agent.refresh_policy()
 
     def learn_rollout(self, epochs: int) -> None:
         """Goes so many times through all that is remembered, and forgets it."""
@@ -118,6 +120,7 @@ class Learner:
             for batch in self.replay:
                 self._update(batch)
         self.replay.empty()
+        self.agent.refresh_policy()
 
     def _update(self, *batch: TensorDictBase) -> None:
         with_policy = (self.updates + 1) % self.agent.policy_delay == 0

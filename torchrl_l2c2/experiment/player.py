@@ -10,7 +10,7 @@ from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.modules import EGreedyModule
 
 from torchrl_l2c2.experiment.algorithms.agent import Agent
-from torchrl_l2c2.experiment.collection import EpisodeCollector
+from torchrl_l2c2.experiment.collection import EpisodeCollector, check_finite
 from torchrl_l2c2.experiment.workers import MultiEpisodeCollector
 from torchrl_l2c2.metrics import action_variation
 
@@ -108,25 +108,3 @@ class Player:
             "length": transitions.numel(),
         }
         return Episode(transitions, last_frame, measures)
-
-
-def check_finite(batch: TensorDictBase, first_frame: int) -> None:
-    """Stops at the first NaN or infinity that the environment or the policy gave.
-
-    Raises:
-        FloatingPointError: names the key and the frame.
-    """
-    found = []
-    # In the order in which they come about: what follows a bad action is bad as well.
-    for key in ("observation", "action", ("next", "observation"), ("next", "reward")):
-        bad = ~batch[key].isfinite()
-        if bad.any():
-            found.append((int(bad.flatten(1).any(1).nonzero()[0]), key))
-    if found:
-        step, key = min(found, key=lambda each: each[0])
-        giver = "policy" if key == "action" else "environment"
-        raise FloatingPointError(
-            f"{key} is not finite at frame {first_frame + step}: "
-            f"{batch[key][step].flatten().tolist()}. "
-            f"The {giver} gave it; nothing was learned from this episode."
-        )

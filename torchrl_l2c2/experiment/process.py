@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import torch
 
-_States = tuple[Any, Any, torch.Tensor]
-"""Of Python, of NumPy and of PyTorch."""
+_States = tuple[Any, Any, torch.Tensor, list[torch.Tensor]]
+"""Of Python, of NumPy, of PyTorch and of its CUDA devices, where there are any."""
 
 
 class ProcessState:
@@ -69,11 +69,12 @@ class ProcessState:
     def state_dict(self) -> dict[str, Any]:
         """The generators' states, as tensors and text."""
         now = self._inside if self._outside is None else _states()
-        python, (name, keys, *rest), state = now
+        python, (name, keys, *rest), state, devices = now
         return {
             "python": json.dumps(python),
             "numpy": json.dumps([name, keys.tolist(), *rest]),
             "torch": state,
+            "cuda": devices,
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -81,16 +82,20 @@ class ProcessState:
         version, internal, gauss = json.loads(state["python"])
         name, keys, *rest = json.loads(state["numpy"])
         numpy = (name, np.array(keys, dtype=np.uint32), *rest)
-        self._inside = ((version, tuple(internal), gauss), numpy, state["torch"])
+        python = (version, tuple(internal), gauss)
+        self._inside = (python, numpy, state["torch"], state.get("cuda", []))
         if self._outside is not None:
             _set_states(self._inside)
 
 
 def _states() -> _States:
-    return random.getstate(), np.random.get_state(), torch.get_rng_state()
+    devices = torch.cuda.get_rng_state_all() if torch.cuda.is_available() else []
+    return random.getstate(), np.random.get_state(), torch.get_rng_state(), devices
 
 
 def _set_states(states: _States) -> None:
     random.setstate(states[0])
     np.random.set_state(states[1])
     torch.set_rng_state(states[2])
+    if states[3] and torch.cuda.is_available():
+        torch.cuda.set_rng_state_all(states[3])

@@ -40,7 +40,7 @@ class Progress:
         frames (int): frames of an earlier call.
 
     Keyword Args:
-        shown (bool): whether there is a bar, or lines.
+        shown (bool or str): whether there is a bar, or lines; a text goes before them.
         compiles (bool): whether the first updates wait for a compiler.
         unit (str): what is counted, ``"episode"`` or ``"frame"``. Default ``"episode"``.
         folder (Path, optional): of the run.
@@ -52,17 +52,20 @@ class Progress:
         done: int,
         frames: int,
         *,
-        shown: bool,
+        shown: bool | str,
         compiles: bool,
         unit: str = "episode",
         folder: Path | None = None,
     ) -> None:
-        self._total, self._folder, self._shown, self._unit = total, folder, shown, unit
+        self._total, self._folder, self._shown, self._unit = total, folder, bool(shown), unit
+        name = shown if isinstance(shown, str) else ""
         self._started, self._first_frame = time.monotonic(), frames
         self._last_line = self._started
         self._waiting = compiles
         # tqdm leaves the bar out where there is no terminal.
-        self._bar = tqdm(total=total, initial=done, unit=unit, disable=None if shown else True)
+        disable = None if shown else True
+        self._bar = tqdm(desc=name, total=total, initial=done, unit=unit, disable=disable)
+        self._name = f"{name}; " if name else ""
         self._column = {"episode": "episode", "frame": "frames"}[unit]
         self._done: float = done
         if self._waiting:
@@ -100,7 +103,7 @@ class Progress:
         tenth = self._done * 10 // self._total > before * 10 // self._total
         if tenth or time.monotonic() - self._last_line > LINE_SECONDS:
             self._last_line = time.monotonic()
-            line = f"{self._unit} {self._done:g} of {self._total}: {state}"
+            line = f"{self._name}{self._unit} {self._done:g} of {self._total}: {state}"
             if self._bar.disable:
                 self._say(line)
             else:

@@ -40,7 +40,9 @@ class PrioritizedReplayConfig:
     def __post_init__(self) -> None:
         _check_fits(self.capacity, self.batch_size)
 
-    def make(self, generator: torch.Generator, longest_rollout: int) -> TensorDictReplayBuffer:
+    def make(
+        self, generator: torch.Generator, longest_rollout: int, device: str = "cpu"
+    ) -> TensorDictReplayBuffer:
         """The buffer; how long a rollout may be does not matter to it."""
         from torchrl.data import LazyTensorStorage, TensorDictPrioritizedReplayBuffer
 
@@ -48,7 +50,7 @@ class PrioritizedReplayConfig:
             alpha=self.alpha,
             beta=self.beta,
             priority_key="td_error",
-            storage=LazyTensorStorage(self.capacity),
+            storage=LazyTensorStorage(self.capacity, device=device),
             batch_size=self.batch_size,
             generator=generator,
         )
@@ -65,12 +67,14 @@ class UniformReplayConfig:
     def __post_init__(self) -> None:
         _check_fits(self.capacity, self.batch_size)
 
-    def make(self, generator: torch.Generator, longest_rollout: int) -> TensorDictReplayBuffer:
+    def make(
+        self, generator: torch.Generator, longest_rollout: int, device: str = "cpu"
+    ) -> TensorDictReplayBuffer:
         """The buffer; how long a rollout may be does not matter to it."""
         from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
         return TensorDictReplayBuffer(
-            storage=LazyTensorStorage(self.capacity),
+            storage=LazyTensorStorage(self.capacity, device=device),
             batch_size=self.batch_size,
             generator=generator,
         )
@@ -83,7 +87,9 @@ class RolloutReplayConfig:
     name: str = "rollout"
     batch_size: int = Field(default=64, ge=1, description="transitions per update")
 
-    def make(self, generator: torch.Generator, longest_rollout: int) -> TensorDictReplayBuffer:
+    def make(
+        self, generator: torch.Generator, longest_rollout: int, device: str = "cpu"
+    ) -> TensorDictReplayBuffer:
         """The buffer, with room for the longest rollout."""
         from torchrl.data import (
             LazyTensorStorage,
@@ -92,7 +98,7 @@ class RolloutReplayConfig:
         )
 
         return TensorDictReplayBuffer(
-            storage=LazyTensorStorage(longest_rollout),
+            storage=LazyTensorStorage(longest_rollout, device=device),
             sampler=SamplerWithoutReplacement(),
             batch_size=self.batch_size,
             generator=generator,
@@ -138,3 +144,6 @@ def load_replay_state(replay: TensorDictReplayBuffer, state: Mapping[str, Any]) 
                 sampler[tree][torch.arange(len(values))] = values
         state["_sampler"] = sampler
     replay.load_state_dict(state)
+    storage = replay.storage
+    if storage._storage is not None:  # Where it was empty, it is what was loaded.
+        storage._storage = storage._storage.to(storage.device)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
-from torchrl_l2c2.experiment.settings import settings
+from torchrl_l2c2.experiment.settings import SettingError, settings
 
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
@@ -75,8 +75,15 @@ class TaskConfig:
         description="make one vector of matrices, nested entries and labels (as one-hot vectors) "
         "that are observed; several vectors become one, in the order of their names, without it",
     )
+    images: bool = Field(
+        default=False,
+        description="the observation is an image, which small convolutional networks see, with its "
+        "values from 0 to 1; the replay buffer keeps two of them for every transition, as floats",
+    )
 
     def __post_init__(self) -> None:
+        if self.images and self.flatten:
+            raise SettingError("images", "and flatten exclude each other: leave one at false.")
         if self.noise_scale is None:
             # Frozen: this is how a default that depends on another field is set.
             object.__setattr__(self, "noise_scale", 0.01 if self.env_id == SWINGUP else 0.0)

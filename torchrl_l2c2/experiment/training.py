@@ -126,7 +126,7 @@ class Experiment:
             raise
 
     def train(
-        self, episodes: int | None = None, *, progress: bool = False
+        self, episodes: int | None = None, *, progress: bool | str = False
     ) -> list[dict[str, float]]:
         """Trains from where it left off, or where a checkpoint did.
 
@@ -136,7 +136,7 @@ class Experiment:
         Args:
             episodes (int, optional): how many there are to be in all. Default: the task's, or its
                 frames.
-            progress (bool): whether to show a progress bar.
+            progress (bool or str): whether to show a progress bar; a text goes before it.
 
         Returns:
             list: a dictionary of metrics per episode.

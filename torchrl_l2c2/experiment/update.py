@@ -155,6 +155,7 @@ class ReplayUpdate:
         self._prioritized = isinstance(replay, TensorDictPrioritizedReplayBuffer)
         transforms = list(replay.transform.transforms)
         self._neighbors: NeighborTransform | None = transforms[0] if transforms else None
+        self._device = agent.device
         self._source: TensorDictBase | None = None
         self._names: tuple[NestedKey, ...] = ()
         self._stored: tuple[Tensor, ...] = ()
@@ -184,17 +185,17 @@ class ReplayUpdate:
             self._source = storage._storage
             self._names, self._stored = zip(*self._source.items(True, True), strict=True)
         index, info = self._replay.sampler.sample(storage, self._replay.batch_size)
+        index, weight = index.to(self._device), info.get("priority_weight")
+        weight = None if weight is None else weight.to(self._device)
         generator = None if self._neighbors is None else self._neighbors.generator
-        return Draw(
-            self._stored, index, info.get("priority_weight"), self._uniform(len(index), generator)
-        )
+        return Draw(self._stored, index, weight, self._uniform(len(index), generator))
 
     def example(self) -> TensorDictBase:
         """A batch from all over the storage, for which nothing that runs depend on is drawn."""
-        size = self._replay.batch_size
-        rows = torch.linspace(0, len(self._replay) - 1, size).long()
-        weight = torch.ones(size) if self._prioritized else None
-        uniform = self._uniform(size, torch.Generator().manual_seed(0))
+        size, device = self._replay.batch_size, self._device
+        rows = torch.linspace(0, len(self._replay) - 1, size, device=device).long()
+        weight = torch.ones(size, device=device) if self._prioritized else None
+        uniform = self._uniform(size, torch.Generator(device).manual_seed(0))
         return self.read(self._stored, rows, weight, uniform)
 
     def _uniform(self, size: int, generator: torch.Generator | None) -> Tensor | None:
@@ -208,6 +209,7 @@ class ReplayUpdate:
     def prioritize(self, index: Tensor, priority: Tensor | None) -> None:
         """Sets the priorities of rows, where the buffer has any."""
         if self._prioritized and priority is not None:
+            index, priority = index.to("cpu"), priority.to("cpu")
             self._replay.sampler.update_priority(index, priority, storage=self._replay.storage)
 
     def read(

@@ -278,7 +278,7 @@ class L2C2Loss(RegularizedLoss):
         return self.made_once("l2c2_neighbors", lambda: self._make_neighbors(tensordict))
 
     def _make_neighbors(self, tensordict: TensorDictBase) -> Neighbors:
-        rows = draw_rows(tensordict, self.l2c2_fraction)
+        rows = draw_rows(tensordict, self.l2c2_fraction, self.l2c2_coeff.device)
         neighbor = tensordict.get(self.l2c2_neighbor_key, None)
         if neighbor is None:
             neighbor = self._draw(tensordict, rows)

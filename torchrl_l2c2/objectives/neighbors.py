@@ -50,12 +50,15 @@ class Neighbors(NamedTuple):
         return spread.reshape(*shape, *rest)
 
 
-def draw_rows(tensordict: TensorDictBase, fraction: float) -> Tensor | None:
+def draw_rows(
+    tensordict: TensorDictBase, fraction: float, device: torch.device | None = None
+) -> Tensor | None:
     """A random share of a batch, with torch's global generator: no row twice, each as likely.
 
     Args:
         tensordict (TensorDictBase): the batch, ``[*B]``.
         fraction (float): its share, in (0, 1]; rounded to whole rows, at least one.
+        device (torch.device, optional): of the batch's tensors.
 
     Returns:
         Tensor: ``[M]``, in the batch written as one row; ``None`` stands for all of them.
@@ -64,7 +67,7 @@ def draw_rows(tensordict: TensorDictBase, fraction: float) -> Tensor | None:
     drawn = max(1, round(fraction * count))
     if drawn >= count:
         return None
-    return torch.randperm(count, device=tensordict.device)[:drawn]
+    return torch.randperm(count, device=device)[:drawn]
 
 
 def read_neighbors(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 import torch
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import (
     DreamerActorLoss,
@@ -106,7 +106,8 @@ def finite_successor(state: Tensor, successor: Tensor) -> Tensor:
 
 def next_key(key: NestedKey) -> NestedKey:
     """Where the successor of an entry lies."""
-    return unravel_key(("next", key))
+    # Not by unravel_key, which Dynamo leaves out.
+    return ("next", *key) if isinstance(key, tuple) else ("next", key)
 
 
 def _is_floating_point(value: object) -> bool:

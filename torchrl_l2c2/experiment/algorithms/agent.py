@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import dataclass, field
 
+import torch
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torch.optim import Optimizer
@@ -18,7 +20,8 @@ class Agent:
 
     Attributes:
         loss: regularized.
-        policy: acts; shares its parameters with ``loss``, so it is always the current one.
+        policy: acts; shares its parameters with ``loss``, so it is always the current one, or is
+            a copy on the CPU (:meth:`act_on_cpu`).
         optimizer: of all of the loss's parameters.
         target_updater: moves the target networks after every update; ``None`` without any.
         exploration: the part of ``policy`` that only explores; ``None`` where it samples.
@@ -40,9 +43,38 @@ class Agent:
     policy_terms: frozenset[str] = field(default_factory=frozenset)
     policy_delay: int = 1
     compilable: bool = True
+    _trained: nn.Module | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
         self.policy_terms |= getattr(self.loss, "policy_terms", frozenset())
+
+    @property
+    def device(self) -> torch.device:
+        """Where the loss's parameters are, and batches have to be."""
+        return next(self.loss.parameters()).device
+
+    def act_on_cpu(self) -> None:
+        """Has a copy of the policy act on the CPU, whatever the device of the loss is.
+
+        For one observation after the other the way to another device takes longer than the policy.
+        """
+        self._trained = self._network()
+        self.policy = deepcopy(self.policy).to("cpu")
+        if self.exploration is not None:
+            self.exploration = self.policy[-1]
+
+    @torch.no_grad()
+    def refresh_policy(self) -> None:
+        """Gives a copy of the policy that acts the parameters as they are now."""
+        if self._trained is None:
+            return
+        acting, trained = self._network().state_dict(), self._trained.state_dict()
+        for name, value in acting.items():
+            value.copy_(trained[name])
+
+    def _network(self) -> nn.Module:
+        """The policy without what only explores."""
+        return self.policy if self.exploration is None else self.policy[0]
 
     @property
     def policy_compiles(self) -> bool:

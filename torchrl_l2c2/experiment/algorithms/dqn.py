@@ -60,14 +60,13 @@ class DQNConfig(OffPolicyConfig):
         from torchrl_l2c2.experiment.algorithms.agent import Agent
         from torchrl_l2c2.experiment.algorithms.networks import (
             check_actions,
-            observation_size,
             perceptron,
             sharing,
         )
 
         check_actions(env, self.name, continuous=False)
         spec = env.action_spec
-        network = perceptron(observation_size(env), spec.shape[-1], self.hidden, nn.ReLU)
+        network = perceptron(env, spec.shape[-1], self.hidden, nn.ReLU)
         values = QValueActor(network, spec=spec)
         loss = DQNLoss(
             values, action_space=spec, loss_function="l2", delay_value=True, double_dqn=True

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from copy import deepcopy
+from math import ceil
 
+import torch
 from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictParams
 from torch import nn
 from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase, ExplorationType
-from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.modules import MLP, ConvNet, ProbabilisticActor, TanhNormal, ValueOperator
+
+from torchrl_l2c2.modules import EncodedNetwork
 
 
 def check_actions(
@@ -40,9 +44,32 @@ def _bounded(spec: TensorSpec) -> bool:
     return isinstance(spec, Bounded) and all(bool(side.isfinite().all()) for side in sides)
 
 
+# Of the convolutional layers; each halves the image.
+CHANNELS = (16, 32, 32)
+
+
+def image_encoder(env: EnvBase) -> nn.Module | None:
+    """Convolutional layers for a task that observes images; ``None`` for one that does not."""
+    shape = env.observation_spec["observation"].shape
+    if len(shape) == 1:
+        return None
+    return ConvNet(
+        in_features=shape[0],
+        num_cells=list(CHANNELS),
+        kernel_sizes=3,
+        strides=2,
+        paddings=1,
+        activation_class=nn.ReLU,
+    )
+
+
 def observation_size(env: EnvBase) -> int:
-    """Numbers in an observation."""
-    return env.observation_spec["observation"].shape[-1]
+    """Numbers in an observation, or what :func:`image_encoder` makes of it."""
+    shape = env.observation_spec["observation"].shape
+    if len(shape) == 1:
+        return shape[0]
+    height, width = (ceil(side / 2 ** len(CHANNELS)) for side in shape[1:])
+    return CHANNELS[-1] * height * width
 
 
 def sharing(network: TensorDictModule, parameters: TensorDictParams) -> TensorDictModule:
@@ -53,24 +80,35 @@ def sharing(network: TensorDictModule, parameters: TensorDictParams) -> TensorDi
 
 
 def perceptron(
-    in_features: int, out_features: int, hidden: tuple[int, ...], activation: type[nn.Module]
-) -> MLP:
-    """Fully connected layers with an activation between any two."""
-    return MLP(
-        in_features=in_features,
+    env: EnvBase,
+    out_features: int,
+    hidden: tuple[int, ...],
+    activation: type[nn.Module],
+    *,
+    beside: int = 0,
+) -> nn.Module:
+    """Fully connected layers on an observation, behind convolutional ones where it is an image.
+
+    Keyword Args:
+        beside (int): numbers that are read beside the observation. Default 0.
+    """
+    encoder = image_encoder(env)
+    layers = MLP(
+        in_features=observation_size(env) + beside,
         out_features=out_features,
         num_cells=list(hidden),
         activation_class=activation,
     )
+    return layers if encoder is None else EncodedNetwork(encoder, layers)
 
 
 def tanh_normal_actor(
     env: EnvBase, hidden: tuple[int, ...], activation: type[nn.Module]
 ) -> TensorDictModule:
     """A tanh-squashed diagonal normal."""
-    spec = env.action_spec
+    spec = env.action_spec.to(torch.get_default_device())
     network = nn.Sequential(
-        perceptron(observation_size(env), 2 * spec.shape[-1], hidden, activation),
+        perceptron(env, 2 * spec.shape[-1], hidden, activation),
         NormalParamExtractor(),
     )
     return ProbabilisticActor(
@@ -87,6 +125,5 @@ def tanh_normal_actor(
 
 def action_value(env: EnvBase, hidden: tuple[int, ...]) -> ValueOperator:
     """The value of an action at an observation."""
-    size = observation_size(env) + env.action_spec.shape[-1]
-    network = perceptron(size, 1, hidden, nn.ReLU)
+    network = perceptron(env, 1, hidden, nn.ReLU, beside=env.action_spec.shape[-1])
     return ValueOperator(network, in_keys=["observation", "action"])

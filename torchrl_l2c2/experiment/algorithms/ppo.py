@@ -66,7 +66,6 @@ class PPOConfig(AlgorithmConfig):
         from torchrl_l2c2.experiment.algorithms.agent import Agent
         from torchrl_l2c2.experiment.algorithms.networks import (
             check_actions,
-            observation_size,
             perceptron,
             sharing,
             tanh_normal_actor,
@@ -74,7 +73,7 @@ class PPOConfig(AlgorithmConfig):
 
         check_actions(env, self.name, continuous=True, squashed=True)
         actor = tanh_normal_actor(env, self.hidden, nn.Tanh)
-        critic = ValueOperator(perceptron(observation_size(env), 1, self.hidden, nn.Tanh))
+        critic = ValueOperator(perceptron(env, 1, self.hidden, nn.Tanh))
         loss = ClipPPOLoss(
             actor,
             critic,

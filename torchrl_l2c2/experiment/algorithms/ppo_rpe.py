@@ -95,9 +95,12 @@ class PPORPEConfig(OffPolicyConfig):
     def make_agent(
         self, env: EnvBase, regularizer: RegularizerConfig, optimizer: OptimizerConfig
     ) -> Agent:
+        import torch
+
         from torchrl_l2c2.experiment.algorithms.agent import Agent
         from torchrl_l2c2.experiment.algorithms.networks import (
             check_actions,
+            image_encoder,
             observation_size,
             sharing,
         )
@@ -109,13 +112,18 @@ class PPORPEConfig(OffPolicyConfig):
         size = observation_size(env)
         actor = make_actor(
             size,
-            env.action_spec,
+            env.action_spec.to(torch.get_default_device()),
             hidden=self.hidden,
             squash=self.squash,
             squish_b=self.squish_b,
+            encoder=image_encoder(env),
         )
         critic = make_critic(
-            size, num_heads=self.num_heads, hidden=self.hidden, squish_b=self.squish_b
+            size,
+            num_heads=self.num_heads,
+            hidden=self.hidden,
+            squish_b=self.squish_b,
+            encoder=image_encoder(env),
         )
         loss = PPORPELoss(
             actor,

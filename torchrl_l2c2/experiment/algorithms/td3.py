@@ -62,6 +62,7 @@ class TD3Config(OffPolicyConfig):
     def make_agent(
         self, env: EnvBase, regularizer: RegularizerConfig, optimizer: OptimizerConfig
     ) -> Agent:
+        import torch
         from tensordict.nn import TensorDictSequential
         from torch import nn
         from torchrl.modules import Actor, AdditiveGaussianModule, TanhModule
@@ -71,15 +72,15 @@ class TD3Config(OffPolicyConfig):
         from torchrl_l2c2.experiment.algorithms.networks import (
             action_value,
             check_actions,
-            observation_size,
             perceptron,
             sharing,
         )
 
         check_actions(env, self.name, continuous=True, squashed=True)
         spec = env.action_spec
-        network = perceptron(observation_size(env), spec.shape[-1], self.hidden, nn.ReLU)
-        squash = TanhModule(in_keys=["action"], out_keys=["action"], spec=spec)
+        network = perceptron(env, spec.shape[-1], self.hidden, nn.ReLU)
+        bounds = spec.to(torch.get_default_device())
+        squash = TanhModule(in_keys=["action"], out_keys=["action"], spec=bounds)
         actor = TensorDictSequential(Actor(network, out_keys=["action"]), squash)
         half_range = ((spec.space.high - spec.space.low) / 2).max().item()
         loss = TD3Loss(

@@ -11,6 +11,7 @@ from torchrl_l2c2.experiment.folder import make_folder, write_atomically, write_
 from torchrl_l2c2.experiment.reports.comparison import statistics_tables, summary
 from torchrl_l2c2.experiment.reports.figures import draw_learning_curves, draw_plane
 from torchrl_l2c2.experiment.reports.groups import group_records
+from torchrl_l2c2.experiment.reports.measures import measures_table
 from torchrl_l2c2.experiment.reports.records import FIGURES, Record
 from torchrl_l2c2.experiment.reports.runs import FinishedRun
 from torchrl_l2c2.experiment.reports.score import readings
@@ -60,6 +61,8 @@ def write_report(
     """
     folder = make_folder(folder)
     tables, groups = all_tables(records), group_records(records)
+    if (measures := measures_table(runs)) is not None:
+        tables.insert(-1, measures)  # before every run by itself
     pictures = _draw(folder, records, runs)
     text = "\n\n".join(
         [

@@ -1,59 +1,14 @@
-"""How smooth a policy is: the variation of its actions and empirical local Lipschitz constants."""
+"""How steep a policy is around its observations, and how much it answers to noise on them."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal
 
 import torch
 from torch import Tensor
 
-from torchrl_l2c2._checks import check_choice
-
-
-def action_variation(actions: Tensor, mask: Tensor | None = None) -> Tensor:
-    r"""Mean change of the action from step to step, the paper's measure of smoothness.
-
-    .. math::
-        \frac{1}{T - 1} \sum_{t=1}^{T-1} \lVert a_t - a_{t+1} \rVert_2
-
-    (Kobayashi, L2C2, 2022, "Setup", on the policy's mean actions). Smaller is smoother. It is in
-    the action's unit per step, so it compares runs with the same action bounds and step time;
-    samples of a stochastic policy give larger values than its means.
-
-    Args:
-        actions (Tensor): actions of whole episodes, shape ``[*B, T, A]`` with at least two steps.
-        mask (Tensor, optional): which steps belong to the episode, boolean, shape ``[*B, T]``;
-            for episodes that were padded to one length. Default: all do.
-
-    Returns:
-        Tensor: the variation of each episode, shape ``[*B]``.
-
-    Raises:
-        ValueError: an episode has fewer than two steps, or the shapes do not fit.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_l2c2 import action_variation
-        >>> action_variation(torch.tensor([[0.0, 0.0], [3.0, 4.0], [3.0, 3.0]]))
-        tensor(3.)
-    """
-    if actions.ndim < 2 or actions.shape[-2] < 2:
-        raise ValueError(
-            "action_variation: actions must have shape [*B, T, A] with T of at least 2, got "
-            f"{tuple(actions.shape)}."
-        )
-    change = torch.linalg.vector_norm(actions.diff(dim=-2), dim=-1)
-    if mask is None:
-        return change.mean(-1)
-    if mask.shape != actions.shape[:-1] or mask.dtype != torch.bool:
-        raise ValueError(
-            f"action_variation: mask must be boolean of shape {tuple(actions.shape[:-1])}, got "
-            f"{mask.dtype} of shape {tuple(mask.shape)}."
-        )
-    pairs = mask[..., 1:] & mask[..., :-1]
-    if not pairs.any(-1).all():
-        raise ValueError("action_variation: an episode has no two successive steps in its mask.")
-    return torch.where(pairs, change, 0.0).sum(-1) / pairs.sum(-1)
+from torchrl_l2c2._checks import check_choice, check_real
 
 
 def local_lipschitz(
@@ -115,6 +70,57 @@ def local_lipschitz(
     if reduction == "mean":
         return quotient.sum(-1) / moved.sum(-1)
     return torch.where(moved.any(-1), quotient.amax(-1), torch.nan)
+
+
+@torch.no_grad()
+def noise_sensitivity(
+    policy: Callable[[Tensor], Tensor],
+    observations: Tensor,
+    scale: float,
+    *,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    r"""How much white noise on the observations moves the action.
+
+    .. math::
+        \frac{1}{2} \mathbb E \left[ \lVert \mu(s) - \mu(s + \epsilon) \rVert_2^2 \right],
+        \qquad \epsilon \sim \mathcal N(0, \mathrm{scale}^2)
+
+    (half the mean squared difference, as in CATS, arXiv:2610.07910). Smaller is smoother; in the
+    action's unit squared. It grows with the square of the scale where the policy is linear.
+
+    Args:
+        policy (callable): observations ``[*B, F]`` to mean actions ``[*B, A]``.
+        observations (Tensor): where it is measured, shape ``[*B, F]``.
+        scale (float): standard deviation of the noise, in the observation's unit, greater than 0.
+
+    Keyword Args:
+        generator (torch.Generator, optional): of the noise. Default: PyTorch's global one.
+
+    Returns:
+        Tensor: a single number.
+
+    Raises:
+        ValueError: the scale is not a finite number greater than 0.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_l2c2.metrics import noise_sensitivity
+        >>> observations = torch.zeros(20_000, 3)
+        >>> generator = torch.Generator().manual_seed(0)
+        >>> twice = lambda observation: 2 * observation
+        >>> noise_sensitivity(twice, observations, 0.1, generator=generator).round(decimals=3)
+        tensor(0.0600)
+    """
+    check_real("noise_sensitivity: scale", scale, above=0)
+    noise = torch.randn(
+        observations.shape,
+        generator=generator,
+        dtype=observations.dtype,
+        device=observations.device,
+    )
+    change = policy(observations + scale * noise) - policy(observations)
+    return 0.5 * change.square().sum(-1).mean()
 
 
 def _check_neighbors(name: str, point: Tensor, neighbors: Tensor) -> None:

@@ -1,0 +1,96 @@
+"""Updates on one device, a policy that plays on the CPU."""
+
+import pytest
+import torch
+
+from torchrl_l2c2.experiment import (
+    AdamConfig,
+    DQNConfig,
+    Experiment,
+    ExperimentConfig,
+    PPOConfig,
+    PPORPEConfig,
+    SACConfig,
+    TaskConfig,
+    TD3Config,
+    UniformReplayConfig,
+)
+from torchrl_l2c2.experiment.settings import SettingError
+
+ALGORITHMS = {
+    "ppo_rpe": PPORPEConfig(hidden=(8,)),
+    "sac": SACConfig(random_frames=10, hidden=(8,)),
+    "td3": TD3Config(random_frames=10, hidden=(8,)),
+    "ppo": PPOConfig(frames=30, epochs=2, hidden=(8,)),
+    "dqn": DQNConfig(random_frames=10, hidden=(8,)),
+}
+CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+
+
+SMALL = {"replay": UniformReplayConfig(batch_size=16)}
+
+
+def config(name, **settings):
+    env_id = "CartPole-v1" if name == "dqn" else "Pendulum-v1"
+    return ExperimentConfig(
+        **{
+            "task": TaskConfig("task", env_id, episodes=4, max_steps=30),
+            "algorithm": ALGORITHMS[name],
+            **(SMALL if name in ("sac", "td3", "dqn") else {}),
+            "optimizer": AdamConfig(lr=0.001),
+            "compile": False,
+            "test_episodes": 2,
+            **settings,
+        }
+    )
+
+
+def trained(chosen, folder=None):
+    run = Experiment(chosen, folder)
+    run.train()
+    numbers = [
+        value.clone() for value in run.agent.loss.state_dict().values() if torch.is_tensor(value)
+    ]
+    result, updates = run.test(sampled=True), run.learner.updates
+    run.close()
+    return numbers, result, updates
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_a_copy_of_the_policy_acts_as_the_policy_does(monkeypatch, name):
+    """The same bits: it has the trained parameters whenever it plays, and explores by itself."""
+    numbers, result, updates = trained(config(name))
+    make_agent = ExperimentConfig.make_agent
+
+    def copying(self, env):
+        agent = make_agent(self, env)
+        agent.act_on_cpu()
+        return agent
+
+    monkeypatch.setattr(ExperimentConfig, "make_agent", copying)
+    copied_numbers, copied_result, _ = trained(config(name))
+    assert updates > 0 and copied_result == result
+    assert all(torch.equal(a, b) for a, b in zip(copied_numbers, numbers, strict=True))
+
+
+def test_a_device_that_is_not_there_is_refused():
+    """With how many there are, before anything is made; and so is what is no device."""
+    with pytest.raises(SettingError, match=r"device must be one that PyTorch finds.*'cuda:99'"):
+        Experiment(config("sac", device="cuda:99"))
+    with pytest.raises(SettingError, match=r"device .*got 'gpu'"):
+        config("sac", device="gpu")
+
+
+@CUDA
+@pytest.mark.parametrize("compile", [False, True])
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_every_algorithm_learns_on_cuda_and_is_continued(tmp_path, name, compile):
+    """Where its parameters are; ended and continued it has the numbers of one run."""
+    chosen = config(name, device="cuda", compile=compile, checkpoint_interval=0.0)
+    whole, _, updates = trained(chosen)
+    assert updates > 0 and all(number.is_cuda for number in whole if number.is_floating_point())
+    begun = Experiment(chosen, tmp_path)
+    begun.train(2)
+    begun.close()
+    continued, _, _ = trained(chosen, tmp_path)
+    assert all(torch.equal(a, b) for a, b in zip(continued, whole, strict=True))

@@ -1,0 +1,121 @@
+"""How smoothly actions follow one another: what their spectrum is made of."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from torchrl_l2c2._checks import check_choice, check_real
+from torchrl_l2c2.metrics.actions import check_episodes
+
+
+def amplitude_spectrum(actions: Tensor, sampling_rate: float = 1.0) -> tuple[Tensor, Tensor]:
+    r"""Amplitudes of the frequencies that an episode's actions are made of.
+
+    .. math::
+        M_i = \frac{2}{T} \Big| \sum_t a_t\, e^{-2 \pi \mathrm{i}\, i t / T} \Big|, \qquad
+        f_i = \frac{i f_s}{T}, \qquad i = 0, \dots, \lfloor T / 2 \rfloor - 1
+
+    A sine of amplitude 1 whose period divides the episode has the amplitude 1 at its frequency, and
+    0 elsewhere. The first is twice the mean.
+
+    Args:
+        actions (Tensor): of whole episodes, shape ``[*B, T, A]`` with at least four steps.
+        sampling_rate (float): actions per second :math:`f_s`, greater than 0. Default 1.
+
+    Returns:
+        tuple: frequencies, shape ``[F]``, in hertz (in cycles per step at the default rate), and
+        amplitudes, shape ``[*B, F, A]``, in the action's unit.
+
+    Raises:
+        ValueError: an episode has fewer than four steps, or the rate is not greater than 0.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_l2c2.metrics import amplitude_spectrum
+        >>> sine = torch.sin(2 * torch.pi * torch.arange(8.0) / 4).unsqueeze(-1)
+        >>> frequencies, amplitudes = amplitude_spectrum(sine, sampling_rate=100.0)
+        >>> frequencies.tolist(), amplitudes.squeeze(-1).round(decimals=3).abs().tolist()
+        ([0.0, 12.5, 25.0, 37.5], [0.0, 0.0, 1.0, 0.0])
+    """
+    check_episodes("amplitude_spectrum", actions, 4)
+    check_real("amplitude_spectrum: sampling_rate", sampling_rate, above=0)
+    steps = actions.shape[-2]
+    amplitudes = 2.0 / steps * torch.fft.rfft(actions, dim=-2).abs()[..., : steps // 2, :]
+    frequencies = torch.arange(steps // 2, dtype=actions.dtype, device=actions.device)
+    return frequencies * sampling_rate / steps, amplitudes
+
+
+def spectral_smoothness(actions: Tensor, form: Literal["caps", "asap"] = "caps") -> Tensor:
+    r"""The literature's "Sm", in either of its two published forms.
+
+    .. math::
+        \mathrm{caps} = \operatorname{mean}_i \Big( M_i \frac{i}{n - 1} \Big), \qquad
+        \mathrm{asap} = \sum_i M_i f_i, \qquad n = \lfloor T / 2 \rfloor,
+
+    with :math:`M_i` and :math:`f_i` of :func:`amplitude_spectrum` at a rate of 1. The first is what
+    the authors of CAPS plot; the second what ASAP, PAVE and CATS print, where the transform is not
+    normalized: :math:`\frac{2}{T f_s} \sum_i f_i |\mathrm{FFT}_i|`. Both are means over the
+    action's dimensions. Smaller is smoother. For even :math:`T` the second is :math:`(T - 2) / 4`
+    times the first: it grows with the episode's length, so that returns of different lengths are
+    not to be compared by it. :func:`roughness` is nearly free of the length.
+
+    Args:
+        actions (Tensor): of whole episodes, shape ``[*B, T, A]`` with at least four steps.
+        form (str): ``"caps"`` or ``"asap"``. Default ``"caps"``.
+
+    Returns:
+        Tensor: of each episode, shape ``[*B]``, in the action's unit.
+
+    Raises:
+        ValueError: an episode has fewer than four steps, or another form.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_l2c2.metrics import spectral_smoothness
+        >>> sine = torch.sin(2 * torch.pi * torch.arange(8.0) / 4).unsqueeze(-1)
+        >>> spectral_smoothness(sine), spectral_smoothness(sine, "asap")
+        (tensor(0.1667), tensor(0.2500))
+    """
+    check_choice("spectral_smoothness: form", form, ("caps", "asap"))
+    frequencies, amplitudes = amplitude_spectrum(actions)
+    if form == "asap":
+        return (amplitudes * frequencies.unsqueeze(-1)).sum(-2).mean(-1)
+    weights = torch.linspace(0, 1, len(frequencies), dtype=actions.dtype, device=actions.device)
+    return (amplitudes * weights.unsqueeze(-1)).mean((-2, -1))
+
+
+def roughness(actions: Tensor, sampling_rate: float = 1.0) -> Tensor:
+    r"""The mean frequency of an episode's actions, weighted by amplitude, as a share of the rate.
+
+    .. math::
+        \frac{\sum_{i \ge 1} M_i f_i}{f_s \sum_{i \ge 1} M_i}
+
+    with :math:`M_i` and :math:`f_i` of :func:`amplitude_spectrum`; the mean over the action's
+    dimensions. Between 0 and .5, of which white noise has .25, whatever the amplitude and nearly
+    whatever the length: it says how fast an action moves and not how much. The constant part is
+    left out.
+
+    Args:
+        actions (Tensor): of whole episodes, shape ``[*B, T, A]`` with at least four steps.
+        sampling_rate (float): actions per second, greater than 0; the result is the same for each.
+            Default 1.
+
+    Returns:
+        Tensor: of each episode, shape ``[*B]``; NaN where a dimension never changes.
+
+    Raises:
+        ValueError: an episode has fewer than four steps, or the rate is not greater than 0.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_l2c2.metrics import roughness
+        >>> sine = torch.sin(2 * torch.pi * torch.arange(8.0) / 4).unsqueeze(-1)
+        >>> roughness(3 + 2 * sine)
+        tensor(0.2500)
+    """
+    frequencies, amplitudes = amplitude_spectrum(actions, sampling_rate)
+    moving, weights = amplitudes[..., 1:, :], frequencies[1:].unsqueeze(-1)
+    return ((moving * weights).sum(-2) / (sampling_rate * moving.sum(-2))).mean(-1)
