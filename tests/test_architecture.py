@@ -13,14 +13,17 @@ MODULES = {
 # From the bottom up: a module imports from lines above its own alone.
 LAYERS = """
 _version _checks
-neighborhood affinities
+neighborhood affinities gains
 distances transforms modules updaters optim.adaterm metrics.actions
+policy_distances
 optim.__init__ metrics.policy metrics.spectrum
 metrics.__init__
 objectives.specialization objectives.evaluation objectives.shared_evaluation
 objectives.transitions objectives.relative_pearson
-objectives.regularized
-objectives.l2c2 objectives.caps objectives.ppo_rpe
+objectives.regularized objectives.neighbors
+objectives.l2c2 objectives.caps objectives.cats objectives.lcp objectives.sr2l
+objectives.grad_caps
+objectives.ppo_rpe
 objectives.__init__
 trainers __init__
 experiment.settings experiment.compilation experiment.spaces experiment.guard
@@ -31,6 +34,7 @@ experiment.process experiment.progress experiment.sweep experiment.optimizers
 experiment.tasks experiment.replay experiment.collection
 experiment.regularizers.base
 experiment.regularizers.none experiment.regularizers.caps experiment.regularizers.l2c2
+experiment.regularizers.cats experiment.regularizers.lcp experiment.regularizers.sr2l
 experiment.regularizers.__init__
 experiment.algorithms.agent experiment.algorithms.networks experiment.algorithms.base
 experiment.algorithms.ppo_rpe experiment.algorithms.sac experiment.algorithms.td3
@@ -52,6 +56,7 @@ experiment.workers
 experiment.evaluate experiment.update experiment.player experiment.manual
 experiment.influence experiment.best_policy experiment.export experiment.video
 experiment.learner
+experiment.gain
 experiment.continuation experiment.schedules
 experiment.training
 experiment.command

@@ -40,6 +40,9 @@ from torchrl_l2c2 import (
 OURS = {
     ("loss", "l2c2"): trainers.L2C2LossConfig,
     ("loss", "caps"): trainers.CAPSLossConfig,
+    ("loss", "cats"): trainers.CATSLossConfig,
+    ("loss", "sr2l"): trainers.SR2LLossConfig,
+    ("loss", "lcp"): trainers.LCPLossConfig,
     ("loss", "ppo_rpe"): trainers.PPORPELossConfig,
     ("transform", "neighbor"): trainers.NeighborTransformConfig,
     ("transform", "observation_noise"): trainers.ObservationNoiseConfig,

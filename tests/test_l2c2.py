@@ -28,7 +28,7 @@ from torchrl.modules import Actor, IndependentNormal, ProbabilisticActor, ValueO
 from torchrl.objectives import DDPGLoss, DiscreteSACLoss, DQNLoss, PPOLoss, SACLoss, TD3Loss
 
 from torchrl_l2c2 import L2C2Loss, Neighborhood, NeighborTransform, PPORPELoss
-from torchrl_l2c2.objectives.l2c2 import l2c2_penalty
+from torchrl_l2c2.objectives.neighbors import draw_rows, l2c2_penalty
 
 # epsilon = 1/4, lambda_pi = 1/4: the gain is 1 at distance 1/4 and 1/5 at distance 5/4.
 NEAR = Neighborhood(sigma=1.0, lambda_min=0.2, lambda_max=1.0)
@@ -187,6 +187,29 @@ class TestThePenalty:
         difference = torch.tensor([[2.0, 5.0], [4.0, 7.0]])
         gain = torch.tensor([[1.0, 0.2], [0.5, 0.0]])
         torch.testing.assert_close(l2c2_penalty(difference, gain), torch.tensor([2.0, 0.5]))
+
+    def test_the_largest_of_the_neighbors_can_take_the_means_place(self):
+        """max(1 * 2, .5 * 6) and max(.2 * 5, 0): of the penalty, not of the difference."""
+        difference = torch.tensor([[2.0, 5.0], [6.0, 7.0]])
+        gain = torch.tensor([[1.0, 0.2], [0.5, 0.0]])
+        found = l2c2_penalty(difference, gain, "max")
+        torch.testing.assert_close(found, torch.tensor([3.0, 1.0]))
+
+    def test_the_losss_terms_are_of_the_largest_then(self):
+        """Of the two neighbors together what each has alone, per transition."""
+        torch.manual_seed(0)
+        base = DDPGLoss(deterministic_actor(), qvalue(), reduction="none")
+        batch = NeighborTransform(NEAR, num_samples=2)(transitions(6))
+        loss = L2C2Loss(base, NEAR, num_samples=2, over_neighbors="max")
+        alone = []
+        for k in range(2):
+            one = batch.copy()
+            one["neighbor"] = TensorDict(
+                {x: batch["neighbor", x][:, k : k + 1] for x in ("observation", "distance")}, [6]
+            )
+            alone.append(L2C2Loss(base, NEAR).policy_regularizer(one)["loss_l2c2_actor"])
+        found = loss.policy_regularizer(batch)["loss_l2c2_actor"]
+        torch.testing.assert_close(found, torch.maximum(*alone))
 
     def test_agents_share_the_gain_of_their_team(self):
         """Differences [K, B, agents] for gains [K, B]."""
@@ -409,6 +432,197 @@ class TestNeighbors:
         assert loss.policy_regularizer(batch)["l2c2_distance"].item() == pytest.approx(1.0)
 
 
+class TestWhichStatesAreMoved:
+    def two_part_loss(self, **kwargs) -> tuple[L2C2Loss, TensorDict]:
+        """A policy of a position and a velocity, which move by 1 and by 10."""
+        keys = ["position", "velocity"]
+        actor = Actor(mlp(3, 2), in_keys=keys)
+        value = ValueOperator(mlp(5, 1), in_keys=[*keys, "action"])
+        batch = {"position": torch.zeros(400, 1), "velocity": torch.zeros(400, 2)}
+        later = {"position": torch.ones(400, 1), "velocity": torch.full((400, 2), 10.0)}
+        batch = TensorDict({**batch, "action": torch.zeros(400, 2), "next": later}, [400])
+        return L2C2Loss(DDPGLoss(actor, value), **{"neighborhood": NEAR, **kwargs}), batch
+
+    def test_the_keys_can_be_chosen(self):
+        """The largest of one draw has the mean 1/2; of all three 3/4."""
+        torch.manual_seed(0)
+        loss, batch = self.two_part_loss(moved_keys=["position"])
+        mean = loss.policy_regularizer(batch)["l2c2_distance"].item() - NEAR.epsilon
+        assert mean == pytest.approx(0.5, abs=0.05)
+
+    def test_a_key_that_the_batch_lacks_is_named(self):
+        """With what there is."""
+        loss, batch = self.two_part_loss(moved_keys=["speed"])
+        with pytest.raises(KeyError, match="needs 'speed', which the tensordict lacks"):
+            loss.policy_regularizer(batch)
+
+    def test_transitions_with_too_long_a_step_count_nothing(self):
+        """The step of either part: values, gradients and diagnostics of the others remain."""
+        near = Neighborhood(sigma=1.0, lambda_min=0.2, lambda_max=1.0, max_step=5.0)
+        torch.manual_seed(0)
+        base, batch = TD3Loss(deterministic_actor(), qvalue(), action_spec=BOUNDS), transitions(4)
+        batch["next", "observation"][1:3] += 100.0
+        batch = NeighborTransform(near)(batch)
+        found = L2C2Loss(base, near).policy_regularizer(batch)
+        expected = L2C2Loss(base, near).policy_regularizer(batch[[0, 3]])
+        for key in ("loss_l2c2_actor", "l2c2_gain", "l2c2_distance", "l2c2_action_distance"):
+            torch.testing.assert_close(found[key], expected[key] / 2)
+        gradients = torch.autograd.grad(
+            found["loss_l2c2_actor"], list(base.actor_network_params.values(True, True))
+        )
+        assert all(gradient.isfinite().all() for gradient in gradients)
+
+    def test_one_draw_moves_all_dimensions_of_all_keys(self):
+        """Where it is shared, in the loss as in the transform."""
+        near = Neighborhood(sigma=1.0, lambda_min=0.2, lambda_max=1.0, shared=True)
+        loss, batch = self.two_part_loss(neighborhood=near)
+        torch.manual_seed(0)
+        mean = loss.policy_regularizer(batch)["l2c2_distance"].item() - near.epsilon
+        assert mean == pytest.approx(0.5, abs=0.05)
+        neighbor = NeighborTransform(near, ["position", "velocity"], num_samples=3)(batch)
+        neighbor = neighbor["neighbor"]
+        assert neighbor["velocity"].shape == (400, 3, 2)
+        torch.testing.assert_close(
+            neighbor["velocity"], 10 * neighbor["position"].expand(-1, -1, 2)
+        )
+        away = neighbor["position"].squeeze(-1).abs()
+        torch.testing.assert_close(neighbor["distance"], away + near.epsilon)
+
+
+class TestFraction:
+    """Neighbors for a random share of the batch."""
+
+    def losses(self, fraction: float, reduction: str = "mean") -> tuple[L2C2Loss, L2C2Loss]:
+        """One of all neighbors and one of a share, of the same networks."""
+        torch.manual_seed(0)
+        base = TD3Loss(deterministic_actor(), qvalue(), action_spec=BOUNDS, reduction=reduction)
+        return L2C2Loss(base, NEAR), L2C2Loss(base, NEAR, fraction=fraction)
+
+    def mean_of_draws(self, loss: L2C2Loss, batch: TensorDict, draws: int = 300):
+        """The means of both terms and their standard errors."""
+        with torch.no_grad():
+            found = torch.stack(
+                [
+                    torch.stack(
+                        (
+                            loss.policy_regularizer(batch)["loss_l2c2_actor"],
+                            loss.value_regularizer(batch)["loss_l2c2_qvalue"],
+                        )
+                    )
+                    for _ in range(draws)
+                ]
+            )
+        return found.mean(0), found.std(0) / draws**0.5
+
+    @pytest.mark.parametrize("extra", ["nothing", "weights", "mask", "trajectories"])
+    def test_the_expectation_is_that_of_all_neighbors(self, extra):
+        """Plain, with priority weights, with masked positions and of batches [B, T]."""
+        whole, share = self.losses(0.25)
+        batch = transitions(*((4, 2) if extra == "trajectories" else (8,)))
+        if extra == "weights":
+            batch["priority_weight"] = torch.linspace(0.1, 2.0, 8)
+        if extra == "mask":
+            batch["collector"] = TensorDict({"mask": torch.arange(8)[:, None] < 5}, [8])
+        batch = NeighborTransform(NEAR)(batch)
+        expected = torch.stack(
+            (
+                whole.policy_regularizer(batch)["loss_l2c2_actor"],
+                whole.value_regularizer(batch)["loss_l2c2_qvalue"],
+            )
+        )
+        mean, error = self.mean_of_draws(share, batch)
+        assert (error > 0).all()
+        assert ((mean - expected).abs() < 4 * error).all()
+
+    def test_unreduced_a_drawn_transition_stands_for_the_others(self):
+        """1 / fraction times what it has among all neighbors, the others nothing."""
+        whole, share = self.losses(0.25, reduction="none")
+        batch = NeighborTransform(NEAR)(transitions(8))
+        for method, key in (("policy", "loss_l2c2_actor"), ("value", "loss_l2c2_qvalue")):
+            full, found = (getattr(x, f"{method}_regularizer")(batch)[key] for x in (whole, share))
+            drawn = found != 0
+            assert drawn.sum() == 2
+            torch.testing.assert_close(found[drawn], 4 * full[drawn])
+
+    def test_networks_are_evaluated_at_so_many_states(self):
+        """Two of eight states and their neighbors, where nothing else evaluates the network."""
+        _, share = self.losses(0.25)
+        seen = []
+        share.actor_network.register_forward_hook(lambda *call: seen.append(len(call[2])))
+        share.policy_regularizer(transitions(8))
+        assert seen == [4]
+
+    def test_neighbors_in_the_batch_are_those_that_count(self):
+        """The share's distances are among those that the transform has written."""
+        _, share = self.losses(0.5, reduction="none")
+        batch = NeighborTransform(NEAR)(transitions(8))
+        found = share.policy_regularizer(batch)["l2c2_distance"]
+        written = batch["neighbor", "distance"].squeeze(1)
+        assert ((found == 0) | torch.isclose(found, 2 * written)).all()
+        assert (found != 0).sum() == 4
+
+    def test_both_terms_share_the_drawn_rows(self):
+        """Of one forward pass; the next one draws others."""
+        _, share = self.losses(0.5, reduction="none")
+        batch = transitions(64)
+        first, second = (share(batch.copy()) for _ in range(2))
+        for terms in (first, second):
+            assert torch.equal(terms["loss_l2c2_actor"] != 0, terms["loss_l2c2_qvalue"] != 0)
+        assert not torch.equal(first["loss_l2c2_actor"] != 0, second["loss_l2c2_actor"] != 0)
+
+    def test_what_the_loss_has_evaluated_is_taken_at_the_drawn_rows(self):
+        """PPORPELoss shares its evaluation: values and gradients as without sharing."""
+        torch.manual_seed(0)
+        loss = L2C2Loss(PPORPELoss(gaussian_actor(), heads_critic()), NEAR, fraction=0.5)
+        batch = NeighborTransform(NEAR)(on_policy(8))
+        torch.manual_seed(1)
+        shared = loss(batch.copy())
+        torch.manual_seed(1)
+        alone = loss.policy_regularizer(batch)
+        torch.manual_seed(1)
+        alone.update(loss.value_regularizer(batch))
+        parameters = list(loss.parameters())
+        for key in ("loss_l2c2_actor", "loss_l2c2_critic"):
+            torch.testing.assert_close(shared[key], alone[key])
+            pairs = zip(
+                *(
+                    torch.autograd.grad(x[key], parameters, allow_unused=True, retain_graph=True)
+                    for x in (shared, alone)
+                ),
+                strict=True,
+            )
+            for ours, theirs in pairs:
+                assert (ours is None) == (theirs is None)
+                if ours is not None:
+                    torch.testing.assert_close(ours, theirs)
+
+    def test_it_compiles_into_one_graph(self):
+        """With the eager numbers, at the same seed."""
+        torch._dynamo.reset()
+        _, share = self.losses(0.5)
+        batch = transitions(8)
+        torch.manual_seed(1)
+        expected = share(batch.copy())
+        compiled = torch.compile(share, fullgraph=True, backend="eager")
+        torch.manual_seed(1)
+        found = compiled(batch.copy())
+        for key in ("loss_l2c2_actor", "loss_l2c2_qvalue", "l2c2_gain"):
+            torch.testing.assert_close(found[key], expected[key])
+
+    def test_the_whole_batch_draws_nothing(self):
+        """A seed gives the numbers that it gave; other shares are whole rows, at least one."""
+        batch = NeighborTransform(NEAR)(transitions(8))
+        state = torch.get_rng_state()
+        assert draw_rows(batch, 1.0) is None and torch.equal(torch.get_rng_state(), state)
+        assert len(draw_rows(batch, 1e-3)) == 1 and len(draw_rows(batch, 0.3)) == 2
+
+    @pytest.mark.parametrize("fraction", [0.0, 1.5])
+    def test_other_shares_are_refused(self, fraction):
+        """At construction."""
+        with pytest.raises(ValueError, match=r"fraction must be in \(0, 1\], got"):
+            self.losses(fraction)
+
+
 class TestMonteCarlo:
     def test_sampled_actions_estimate_the_closed_form(self):
         """The paper's estimator has the closed form as its mean."""
@@ -420,6 +634,61 @@ class TestMonteCarlo:
         assert found.item() == pytest.approx(expected.item(), rel=0.03)
 
 
+class TestPolicyDistances:
+    """Means move by 0 and 2, of normals with the standard deviation 1/2."""
+
+    @pytest.mark.parametrize(
+        ("distance", "diagnostic", "difference"),
+        [
+            ("hellinger", "l2c2_hellinger", HELLINGER),
+            ("mean", "l2c2_mean_distance", 0.5 * 2.0**2),
+            ("kl", "l2c2_kl", 2.0**2 / (2 * 0.5**2)),
+            (lambda p, q: (p.mean - q.mean).abs().sum(-1), "l2c2_policy_distance", 2.0),
+        ],
+        ids=["hellinger", "mean", "kl", "function"],
+    )
+    def test_the_one_that_was_chosen_is_trained_and_logged(self, distance, diagnostic, difference):
+        """The term has its gain, the diagnostic its name."""
+        loss = linear_loss(policy_distance=distance)
+        terms = loss.policy_regularizer(linear_batch())
+        expected = 0.25 / 1.25 * difference / 2
+        assert terms["loss_l2c2_actor"].item() == pytest.approx(expected, rel=1e-6)
+        assert terms[diagnostic].item() == pytest.approx(difference / 2, rel=1e-6)
+        assert diagnostic in loss.out_keys
+        (gradient,) = torch.autograd.grad(
+            terms["loss_l2c2_actor"], loss.actor_network.module[0].module.weight
+        )
+        assert gradient.abs().sum() > 0
+
+    @pytest.mark.parametrize("distance", ["hellinger", "mean"])
+    def test_deterministic_policies_have_their_actions_compared(self, distance):
+        """By the same number, under its own name."""
+        torch.manual_seed(0)
+        base, batch = DDPGLoss(deterministic_actor(), qvalue()), transitions(4)
+        batch = NeighborTransform(NEAR)(batch)
+        expected = L2C2Loss(base, NEAR).policy_regularizer(batch)
+        found = L2C2Loss(base, NEAR, policy_distance=distance).policy_regularizer(batch)
+        assert found["l2c2_action_distance"] == expected["l2c2_action_distance"]
+
+    @pytest.mark.parametrize("distance", ["kl", lambda p, q: p.mean])
+    def test_deterministic_policies_have_no_other(self, distance):
+        """The error says what to do."""
+        base = DDPGLoss(deterministic_actor(), qvalue())
+        with pytest.raises(TypeError, match=r"a deterministic policy.*its default"):
+            L2C2Loss(base, policy_distance=distance)
+
+    @pytest.mark.parametrize("distance", ["mean", "kl"])
+    def test_they_compile_into_one_graph(self, distance):
+        """With the eager numbers, squashed policies included."""
+        torch.manual_seed(0)
+        base = SACLoss(gaussian_actor(), qvalue(), action_spec=BOUNDS)
+        loss, batch = L2C2Loss(base, NEAR, policy_distance=distance), transitions(4)
+        batch = NeighborTransform(NEAR)(batch)
+        expected = loss.policy_regularizer(batch)["loss_l2c2_actor"]
+        compiled = torch.compile(loss.policy_regularizer, fullgraph=True, backend="eager")
+        torch.testing.assert_close(compiled(batch)["loss_l2c2_actor"], expected)
+
+
 class TestConstruction:
     @pytest.mark.parametrize(
         ("settings", "error", "message"),
@@ -429,6 +698,11 @@ class TestConstruction:
             ({"num_samples": 1.5}, TypeError, "num_samples must be an integer"),
             ({"hellinger_samples": 0}, ValueError, "hellinger_samples must be at least 1"),
             ({"hellinger_samples": "8"}, TypeError, "hellinger_samples must be an integer"),
+            (
+                {"policy_distance": "w2"},
+                ValueError,
+                "policy_distance must be 'hellinger' or 'mean'",
+            ),
             ({"beta": -0.1}, ValueError, "l2c2_beta must be finite and at least 0, got -0.1"),
             ({"beta": "0.1"}, TypeError, "l2c2_beta must be a real number"),
         ],

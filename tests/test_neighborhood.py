@@ -212,3 +212,43 @@ def test_numbers_of_another_shape_are_refused():
         Neighborhood().place(torch.zeros(4, 3), torch.zeros(4, 3), torch.zeros(4, 3))
     with pytest.raises(TypeError, match="must be floating point"):
         Neighborhood().draw(torch.zeros(4, 3, dtype=torch.long))
+
+
+def test_a_shared_draw_leads_along_the_line_to_the_successor():
+    """u = 1/2 halfway to it, at the distance 1/2 + epsilon, for features of any shape."""
+    near = Neighborhood(sigma=1.0, lambda_min=0.2, lambda_max=1.0, shared=True)
+    state, later = torch.zeros(2, 3, 2), torch.arange(12.0).reshape(2, 3, 2)
+    neighbor, distance = near.place(state, later, torch.tensor([[0.75], [0.0]]))
+    torch.testing.assert_close(neighbor, torch.stack((0.5 * later[:1], -later[1:]))[:, 0][:, None])
+    torch.testing.assert_close(distance, torch.tensor([[0.75], [1.25]]))
+    assert near.draw(state, 5).shape == (2, 5)
+    with pytest.raises(ValueError, match=r"\[\*B, K\] of states"):
+        near.place(state, later, torch.zeros(2, 1, 3, 2))
+
+
+def test_steps_beyond_the_bound_are_infinitely_far():
+    """Their neighbor is the state, their gain 0; a step of exactly the bound counts."""
+    near = Neighborhood(max_step=5.0)
+    later = torch.tensor([[3.0, 4.0], [3.0, 4.1], [math.nan, 6.0]])
+    neighbor, distance = near.place(torch.zeros(3, 2), later, torch.ones(3, 1, 2))
+    assert distance.isinf().flatten().tolist() == [False, True, True]
+    assert neighbor[1:].abs().sum() == 0 and neighbor[0].tolist() == [[3.0, 4.0]]
+    assert near.gain(distance)[1:].tolist() == [[0.0], [0.0]]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"shared": 1}, TypeError, "shared must be True or False, got 1"),
+        (
+            {"max_step": 0.0},
+            ValueError,
+            "max_step must be finite and greater than 0, got",
+        ),
+        ({"max_step": math.inf}, ValueError, "None is no bound"),
+    ],
+)
+def test_other_boxes_are_refused(arguments, error, message):
+    """With what is allowed."""
+    with pytest.raises(error, match=message):
+        Neighborhood(**arguments)

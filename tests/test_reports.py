@@ -317,6 +317,16 @@ class TestSettings:
             codes.append(fingerprint(config))
         assert codes[0] == codes[1]
 
+    def test_a_setting_that_is_as_older_runs_had_it_leaves_the_fingerprint(self, monkeypatch):
+        """So that runs of before pool with those of now."""
+        plain = make_config(regularizer="l2c2").to_dict()
+        code = fingerprint(plain)
+        monkeypatch.setattr("torchrl_l2c2.experiment.config.NEUTRAL_SETTINGS", {})
+        assert fingerprint(plain) != code
+        monkeypatch.undo()
+        plain["regularizer"]["policy_distance"] = "mean"
+        assert fingerprint(plain) != code
+
     def test_differences_are_from_the_defaults_of_what_is_chosen_by_name(self):
         """Another replay's own defaults are none; a task of one's own is its id."""
         config = ExperimentConfig.from_dict(

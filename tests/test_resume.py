@@ -187,6 +187,16 @@ def test_a_setting_that_a_checkpoint_does_not_know_is_named(tmp_path):
         check_same_settings(saved, small().to_dict())
 
 
+def test_a_setting_that_changes_nothing_may_be_new():
+    """A checkpoint of before is continued where the run goes on as it was; not otherwise."""
+    saved = small().to_dict()
+    del saved["regularizer"]["policy_distance"]
+    check_same_settings(saved, small().to_dict())
+    with pytest.raises(OtherRunError, match=r"regularizer.policy_distance=none, as it is"):
+        now = small(regularizer=L2C2Config(policy_distance="mean"))
+        check_same_settings(saved, now.to_dict())
+
+
 @pytest.mark.parametrize("file", ["checkpoint_00000002.pt", "metrics.csv"])
 def test_a_full_disk_names_the_file_and_the_last_good_checkpoint(tmp_path, monkeypatch, file):
     """And the run continues from there when there is room again."""

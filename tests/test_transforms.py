@@ -256,8 +256,8 @@ def test_wrong_settings_of_neighbors(arguments, error, message):
 def test_reprs_show_the_settings():
     """What is printed of a pipeline shows what the transforms do."""
     assert repr(NeighborTransform(NEAR, num_samples=4)) == (
-        "NeighborTransform(Neighborhood(sigma=2.0, lambda_min=0.1, lambda_max=1.0), "
-        "keys=['observation'], out_key='neighbor', num_samples=4)"
+        "NeighborTransform(Neighborhood(sigma=2.0, lambda_min=0.1, lambda_max=1.0, shared=False, "
+        "max_step=None), keys=['observation'], out_key='neighbor', num_samples=4)"
     )
     assert repr(ObservationNoise(0.5)) == "ObservationNoise(scale=0.5, keys=['observation'])"
 

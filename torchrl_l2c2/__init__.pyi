@@ -6,7 +6,16 @@ from .distances import squared_error, squared_hellinger
 from .metrics import action_variation, local_lipschitz
 from .modules import Squish, make_actor, make_critic
 from .neighborhood import Neighborhood
-from .objectives import CAPSLoss, L2C2Loss, PPORPELoss, RegularizedLoss
+from .objectives import (
+    CAPSLoss,
+    CATSLoss,
+    GradCAPSLoss,
+    L2C2Loss,
+    LCPLoss,
+    PPORPELoss,
+    RegularizedLoss,
+    SR2LLoss,
+)
 from .optim import AdaTerm
 from .transforms import NeighborTransform, ObservationNoise
 from .updaters import TSoftUpdate
@@ -14,12 +23,16 @@ from .updaters import TSoftUpdate
 __all__ = [
     "AdaTerm",
     "CAPSLoss",
+    "CATSLoss",
+    "GradCAPSLoss",
     "L2C2Loss",
+    "LCPLoss",
     "NeighborTransform",
     "Neighborhood",
     "ObservationNoise",
     "PPORPELoss",
     "RegularizedLoss",
+    "SR2LLoss",
     "Squish",
     "TSoftUpdate",
     "__version__",

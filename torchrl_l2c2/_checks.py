@@ -64,8 +64,14 @@ def check_real(
         raise ValueError(f"{name} must be {allowed}, got {value!r}.{hint and ' ' + hint}")
 
 
-def check_choice(name: str, value: Any, allowed: Sequence[str]) -> None:
+def check_choice(name: str, value: Any, allowed: Sequence[str], *, hint: str = "") -> None:
     """Refuses all but the strings that are allowed.
+
+    Args:
+        name: what the message calls it.
+        value: what was given.
+        allowed: which there are.
+        hint: what to do instead, a sentence that ends the message.
 
     Raises:
         TypeError: it is not a string.
@@ -73,9 +79,11 @@ def check_choice(name: str, value: Any, allowed: Sequence[str]) -> None:
     """
     listed = " or ".join(map(repr, allowed))
     if not isinstance(value, str):
-        raise TypeError(f"{name} must be {listed}, got {value!r} ({type(value).__name__}).")
+        raise TypeError(
+            f"{name} must be {listed}, got {value!r} ({type(value).__name__}).{hint and ' ' + hint}"
+        )
     if value not in allowed:
-        raise ValueError(f"{name} must be {listed}, got {value!r}.")
+        raise ValueError(f"{name} must be {listed}, got {value!r}.{hint and ' ' + hint}")
 
 
 def _range(

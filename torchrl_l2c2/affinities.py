@@ -158,13 +158,21 @@ def _transformed(p: TransformedDistribution, q: TransformedDistribution) -> Tens
 
 @register_hellinger(TanhNormal)
 def _tanh_normal(p: TanhNormal, q: TanhNormal) -> Tensor:
-    base = log_affinity(p.base_dist, q.base_dist)
-    same_bounds = (p.low == q.low).all() & (p.high == q.high).all()
-    # Where Python cannot wait for the answer, a wrong one must at least show.
+    base, same = log_affinity(p.base_dist, q.base_dist), same_bounds(p, q)
+    if isinstance(same, Tensor):
+        return torch.where(same, base, math.nan)
+    return base if same else NotImplemented
+
+
+def same_bounds(p: TanhNormal, q: TanhNormal) -> bool | Tensor:
+    """Whether actions are squashed alike; a tensor where Python cannot wait for the answer.
+
+    There, under ``torch.compile`` or while a CUDA graph is captured, a wrong one must at least
+    show: as NaN.
+    """
+    same = (p.low == q.low).all() & (p.high == q.high).all()
     capturing = p.loc.is_cuda and torch.cuda.is_current_stream_capturing()
-    if torch.compiler.is_compiling() or capturing:
-        return torch.where(same_bounds, base, math.nan)
-    return base if same_bounds else NotImplemented
+    return same if torch.compiler.is_compiling() or capturing else bool(same)
 
 
 @register_hellinger(CompositeDistribution)

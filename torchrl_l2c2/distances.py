@@ -90,7 +90,7 @@ def squared_hellinger(
         >>> squared_hellinger(p, q, sample=torch.zeros(2), sample_log_prob=torch.zeros(2))
         tensor([0.0000, 0.0797])
     """
-    _check_pair(p, q)
+    check_pair(p, q)
     if sample is not None or sample_log_prob is not None:
         if sample is None or sample_log_prob is None:
             raise ValueError("sample and sample_log_prob belong together: give both or neither.")
@@ -135,12 +135,18 @@ def squared_error(a: Tensor, b: Tensor) -> Tensor:
     return 0.5 * (a - b).square().sum(-1)
 
 
-def _check_pair(p: Distribution, q: Distribution) -> None:
+def check_pair(p: Distribution, q: Distribution) -> None:
+    """Refuses policies whose densities cannot be compared.
+
+    Raises:
+        TypeError: one is deterministic.
+        ValueError: they are distributions of different actions.
+    """
     for distribution in (p, q):
         if isinstance(distribution, (Delta, TanhDelta)):
             raise TypeError(
-                f"{type(distribution).__name__} has no density, so no Hellinger distance: compare "
-                "the actions of deterministic policies with squared_error."
+                f"{type(distribution).__name__} has no density, so no Hellinger distance and no "
+                "divergence: compare the actions of deterministic policies with squared_error."
             )
     if isinstance(p, CompositeDistribution) and isinstance(q, CompositeDistribution):
         if p.dists.keys() != q.dists.keys():
@@ -149,7 +155,7 @@ def _check_pair(p: Distribution, q: Distribution) -> None:
                 f"{sorted(map(str, p.dists))} and {sorted(map(str, q.dists))}."
             )
         for name, entry in p.dists.items():
-            _check_pair(entry, q.dists[name])
+            check_pair(entry, q.dists[name])
         return
     if p.event_shape != q.event_shape:
         raise ValueError(
@@ -173,7 +179,7 @@ def _monte_carlo(p: Distribution, q: Distribution, num_samples: int) -> Tensor:
 
 
 def _mixture_difference(p: Distribution, q: Distribution, sample: Any) -> Tensor:
-    log_p, log_q = _log_prob(p, sample), _log_prob(q, sample)
+    log_p, log_q = log_prob_of(p, sample), log_prob_of(q, sample)
     log_b = torch.logaddexp(log_p.detach(), log_q.detach()) - math.log(2.0)
     return _root_difference(log_p - log_b, log_q - log_b).mean(0)
 
@@ -181,7 +187,7 @@ def _mixture_difference(p: Distribution, q: Distribution, sample: Any) -> Tensor
 def _weighted_difference(
     p: Distribution, q: Distribution, sample: Any, sample_log_prob: Tensor
 ) -> Tensor:
-    log_p, log_q = _log_prob(p, sample), _log_prob(q, sample)
+    log_p, log_q = log_prob_of(p, sample), log_prob_of(q, sample)
     if sample_log_prob.shape != log_p.shape:
         raise ValueError(
             "sample_log_prob must have the shape of the policies' log-likelihood of the sample, "
@@ -195,10 +201,11 @@ def _root_difference(log_ratio_p: Tensor, log_ratio_q: Tensor) -> Tensor:
     return 0.5 * ((0.5 * log_ratio_p).exp() - (0.5 * log_ratio_q).exp()).square()
 
 
-def _log_prob(distribution: Distribution, sample: Any) -> Tensor:
+def log_prob_of(distribution: Distribution, sample: Any) -> Tensor:
+    """The log-likelihood of actions, also of a composite policy's, in one tensor."""
     if not isinstance(distribution, CompositeDistribution):
         return distribution.log_prob(sample)
     # Its own log_prob returns a tensor or a TensorDict, as a global switch says.
     heads = distribution.dists.items()
-    parts = (sum_to(_log_prob(head, sample.get(name)), sample.ndim) for name, head in heads)
+    parts = (sum_to(log_prob_of(head, sample.get(name)), sample.ndim) for name, head in heads)
     return functools.reduce(torch.add, parts)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -45,9 +46,17 @@ class Neighborhood:
         lambda_max: gain at its center, greater than ``lambda_min`` and than
             ``sigma * lambda_min``. Larger values smooth more where the neighbor is close to the
             state, and change nothing at the edge. Defaults to ``1.0``.
+        shared: one :math:`u` for all dimensions of a state, so that neighbors lie on the line
+            through :math:`s` and :math:`s'`, as in implementations for robots; their distances are
+            uniform then, and the gain that of one dimension. Defaults to ``False``, one for each:
+            the paper.
+        max_step: the largest :math:`\lVert s' - s \rVert_2`, greater than 0, in the state's units.
+            A transition with a longer one is a reset or a teleport, and counts nothing: its
+            neighbors are the state itself, at an infinite distance with a gain of 0. Defaults to
+            ``None``, no bound.
 
     Raises:
-        TypeError: if a value is not a real number.
+        TypeError: if a value is not a real number, or ``shared`` is not a boolean.
         ValueError: if a value is not finite or out of its range.
 
     Examples:
@@ -67,11 +76,17 @@ class Neighborhood:
     sigma: float = 1.0
     lambda_min: float = 0.01
     lambda_max: float = 1.0
+    shared: bool = False
+    max_step: float | None = None
 
     def __post_init__(self) -> None:
         hint = "To switch the regularization off, leave it out instead of setting its gain to 0."
-        for field in fields(self):
-            check_real(field.name, getattr(self, field.name), above=0, hint=hint)
+        for name in ("sigma", "lambda_min", "lambda_max"):
+            check_real(name, getattr(self, name), above=0, hint=hint)
+        if not isinstance(self.shared, bool):
+            raise TypeError(f"shared must be True or False, got {self.shared!r}.")
+        if self.max_step is not None:
+            check_real("max_step", self.max_step, above=0, hint="None is no bound.")
         if self.lambda_max <= self.sigma * self.lambda_min:
             raise ValueError(
                 f"lambda_max must be greater than sigma * lambda_min, got lambda_max="
@@ -102,15 +117,21 @@ class Neighborhood:
         r"""The constant gain :math:`\lambda_\pi` in front of the regularization."""
         return self.lambda_max * self.epsilon
 
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """What it is, in numbers to be written beside its neighbors; without a bound infinity."""
+        bound = math.inf if self.max_step is None else self.max_step
+        return self.sigma, self.lambda_min, self.lambda_max, float(self.shared), bound
+
     def gain(self, distance: Tensor) -> Tensor:
         """The gain applied at a distance: :attr:`scale` over it.
 
         Args:
             distance: distances as :meth:`sample` returns them, any shape, in
-                ``[epsilon, radius + epsilon]``.
+                ``[epsilon, radius + epsilon]`` or infinite.
 
         Returns:
-            A tensor of the same shape, in ``[lambda_min, lambda_max]``.
+            A tensor of the same shape, in ``[lambda_min, lambda_max]`` or 0.
         """
         return self.scale / distance
 
@@ -140,7 +161,7 @@ class Neighborhood:
 
         Returns:
             The neighbors, shape ``[*B, K, *F]`` in the dtype of ``state``, and their distances,
-            shape ``[*B, K]``.
+            shape ``[*B, K]``; infinite for steps longer than ``max_step``.
 
         Raises:
             TypeError: if the states are not floating point, or ``num_samples`` is no integer.
@@ -168,7 +189,8 @@ class Neighborhood:
             batch_dims: as in :meth:`sample`.
 
         Returns:
-            Numbers in ``[0, 1)``, shape ``[*B, K, *F]``, in the dtype of ``state``.
+            Numbers in ``[0, 1)``, shape ``[*B, K, *F]``, or ``[*B, K]`` if ``shared``, in the dtype
+            of ``state``.
 
         Raises:
             TypeError: if the states are not floating point, or ``num_samples`` is no integer.
@@ -176,7 +198,8 @@ class Neighborhood:
         """
         check_positive_int("num_samples", num_samples)
         _check_states(state, state, batch_dims)
-        shape = (*state.shape[:batch_dims], num_samples, *state.shape[batch_dims:])
+        features = () if self.shared else state.shape[batch_dims:]
+        shape = (*state.shape[:batch_dims], num_samples, *features)
         return torch.rand(shape, generator=generator, dtype=state.dtype, device=state.device)
 
     def place(
@@ -187,8 +210,8 @@ class Neighborhood:
         Args:
             state: states, shape ``[*B, *F]``, floating point.
             next_state: their successors, the same shape.
-            uniform: numbers in ``[0, 1)``, shape ``[*B, K, *F]``: 0.5 is the state itself, 0 and 1
-                are the edges of the box.
+            uniform: numbers in ``[0, 1)``, shape ``[*B, K, *F]``, or ``[*B, K]`` if ``shared``: 0.5
+                is the state itself, 0 and 1 are the edges of the box.
             batch_dims: how many leading dimensions are batch dimensions. Defaults to ``1``.
 
         Returns:
@@ -208,19 +231,28 @@ class Neighborhood:
         """
         _check_states(state, next_state, batch_dims)
         batch, features = state.shape[:batch_dims], state.shape[batch_dims:]
-        expected = (*batch, *uniform.shape[batch_dims : batch_dims + 1], *features)
-        if uniform.shape != expected:
+        drawn = torch.Size() if self.shared else features
+        if uniform.shape != (*batch, *uniform.shape[batch_dims : batch_dims + 1], *drawn):
             raise ValueError(
-                f"uniform must have the shape [*B, K, *F] of states {tuple(state.shape)} with "
-                f"{batch_dims} batch dimensions, got {tuple(uniform.shape)}."
+                f"uniform must have the shape [*B, K{'' if self.shared else ', *F'}] of states "
+                f"{tuple(state.shape)} with {batch_dims} batch dimensions, got "
+                f"{tuple(uniform.shape)}."
             )
         u = (2.0 * uniform - 1.0) * self.radius
         displacement = (next_state - state).to(state.dtype)
         displacement = torch.nan_to_num(displacement, nan=0.0, posinf=0.0, neginf=0.0)
-        neighbor = state.unsqueeze(batch_dims) + displacement.unsqueeze(batch_dims) * u
         # An explicit size: -1 is ambiguous for empty batches.
-        extent = u.abs().reshape(*uniform.shape[: batch_dims + 1], features.numel()).amax(-1)
-        return neighbor, extent + self.epsilon
+        distance = u.abs().reshape(*uniform.shape[: batch_dims + 1], drawn.numel()).amax(-1)
+        distance = distance + self.epsilon
+        if self.max_step is not None:
+            step = displacement.reshape(*batch, features.numel()).square().sum(-1).sqrt()
+            too_long = step > self.max_step
+            distance = distance.masked_fill(too_long.unsqueeze(-1), math.inf)
+            too_long = too_long.reshape(*batch, *(1 for _ in features))
+            displacement = displacement.masked_fill(too_long, 0.0)
+        u = u.reshape(*u.shape, *(1 for _ in features)) if self.shared else u
+        neighbor = state.unsqueeze(batch_dims) + displacement.unsqueeze(batch_dims) * u
+        return neighbor, distance
 
 
 def _check_states(state: Tensor, next_state: Tensor, batch_dims: int) -> None:

@@ -24,14 +24,28 @@ from torchrl.trainers.algorithms.configs.objectives import LossConfig, TargetNet
 from torchrl.trainers.algorithms.configs.transforms import TransformConfig
 
 from torchrl_l2c2.neighborhood import Neighborhood
-from torchrl_l2c2.objectives import CAPSLoss, L2C2Loss, PPORPELoss
+from torchrl_l2c2.objectives import (
+    CAPSLoss,
+    CATSLoss,
+    L2C2Loss,
+    LCPLoss,
+    PPORPELoss,
+    SR2LLoss,
+)
 from torchrl_l2c2.optim import AdaTerm
 from torchrl_l2c2.transforms import NeighborTransform, ObservationNoise
 from torchrl_l2c2.updaters import TSoftUpdate
 
 
-def _make_l2c2_loss(base_loss: LossModule, neighbor_key: Any, **settings: Any) -> L2C2Loss:
-    return L2C2Loss(base_loss, neighbor_key=_normalize_hydra_key(neighbor_key), **settings)
+def _make_l2c2_loss(
+    base_loss: LossModule, neighbor_key: Any, moved_keys: list[Any] | None = None, **settings: Any
+) -> L2C2Loss:
+    return L2C2Loss(
+        base_loss,
+        neighbor_key=_normalize_hydra_key(neighbor_key),
+        moved_keys=_normalize_hydra_keys(moved_keys),
+        **settings,
+    )
 
 
 def _make_neighbor_transform(
@@ -132,6 +146,9 @@ def _checkable(hint: Any) -> Any:
 NeighborhoodConfig = _node(Neighborhood, ConfigBase)
 L2C2LossConfig = _node(L2C2Loss, LossConfig, builder=_make_l2c2_loss)
 CAPSLossConfig = _node(CAPSLoss, LossConfig)
+CATSLossConfig = _node(CATSLoss, LossConfig)
+SR2LLossConfig = _node(SR2LLoss, LossConfig)
+LCPLossConfig = _node(LCPLoss, LossConfig)
 PPORPELossConfig = _node(PPORPELoss, LossConfig)
 NeighborTransformConfig = _node(
     NeighborTransform, TransformConfig, builder=_make_neighbor_transform, without=("generator",)
@@ -154,7 +171,8 @@ def register() -> None:
     ====================== ===================================
     group                  names
     ====================== ===================================
-    ``loss``               ``l2c2``, ``caps``, ``ppo_rpe``
+    ``loss``               ``l2c2``, ``caps``, ``cats``,
+                           ``sr2l``, ``lcp``, ``ppo_rpe``
     ``transform``          ``neighbor``, ``observation_noise``
     ``optimizer``          ``adaterm``
     ``target_net_updater`` ``tsoft``
@@ -185,6 +203,9 @@ def register() -> None:
     store = ConfigStore.instance()
     store.store(group="loss", name="l2c2", node=L2C2LossConfig)
     store.store(group="loss", name="caps", node=CAPSLossConfig)
+    store.store(group="loss", name="cats", node=CATSLossConfig)
+    store.store(group="loss", name="sr2l", node=SR2LLossConfig)
+    store.store(group="loss", name="lcp", node=LCPLossConfig)
     store.store(group="loss", name="ppo_rpe", node=PPORPELossConfig)
     store.store(group="transform", name="neighbor", node=NeighborTransformConfig)
     store.store(group="transform", name="observation_noise", node=ObservationNoiseConfig)

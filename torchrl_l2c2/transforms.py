@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import astuple
 from typing import Any
 
 import torch
@@ -34,7 +33,6 @@ def draw_neighbors(
 
     Examples:
         >>> import torch
-        >>> from tensordict import TensorDict
         >>> from torchrl_l2c2 import Neighborhood
         >>> from torchrl_l2c2.transforms import draw_neighbors
         >>> batch = {"observation": torch.zeros(4, 3), "next": {"observation": torch.ones(4, 3)}}
@@ -55,8 +53,10 @@ def _draw(
     generator: torch.Generator | None,
 ) -> TensorDictBase:
     uniform = TensorDict(batch_size=tensordict.batch_size, device=tensordict.device)
+    numbers, dims = None, tensordict.batch_dims
     for key, (state, _) in transitions.items():
-        numbers = neighborhood.draw(state, num_samples, generator, batch_dims=tensordict.batch_dims)
+        if numbers is None or not neighborhood.shared:
+            numbers = neighborhood.draw(state, num_samples, generator, batch_dims=dims)
         uniform.set(key, numbers)
     return uniform
 
@@ -76,7 +76,7 @@ def _place(
         neighbors.set(key, neighbor)
         distances.append(distance)
     distance = torch.stack(distances).amax(0)
-    numbers = distance.new_tensor(astuple(neighborhood)).expand(*tensordict.batch_size, -1)
+    numbers = distance.new_tensor(neighborhood.numbers).expand(*tensordict.batch_size, -1)
     return neighbors.set("neighborhood", numbers).set("distance", distance)
 
 
@@ -138,11 +138,11 @@ class NeighborTransform(_RandomTransform):
         neighbor = {
             "observation": [*B, K, *F],   # one per key of in_keys, nested as there
             "distance": [*B, K],
-            "neighborhood": [*B, 3],      # its numbers, for the loss to compare
+            "neighborhood": [*B, 5],      # its numbers, for the loss to compare
         }
 
-    Several keys are parts of one state: their displacements are drawn independently and the
-    distance is that of the whole, the largest of the parts'.
+    Several keys are parts of one state: their displacements are independent, unless ``shared``, and
+    the distance is that of the whole, the largest of the parts'.
 
     .. note::
         A transform that widens the step from :math:`s` to :math:`s'`, such as

@@ -4,7 +4,14 @@ from .config import ExperimentConfig, LoggerConfig
 from .environments import make_env
 from .evaluate import Evaluation, evaluate_policy, load_policy
 from .optimizers import AdamConfig, AdaTermConfig
-from .regularizers import CAPSConfig, L2C2Config, NoRegularizerConfig
+from .regularizers import (
+    CAPSConfig,
+    CATSConfig,
+    L2C2Config,
+    LCPConfig,
+    NoRegularizerConfig,
+    SR2LConfig,
+)
 from .replay import PrioritizedReplayConfig, RolloutReplayConfig, UniformReplayConfig
 from .tasks import TASKS, TaskConfig
 from .training import Experiment
@@ -15,12 +22,14 @@ __all__ = [
     "AdaTermConfig",
     "AdamConfig",
     "CAPSConfig",
+    "CATSConfig",
     "DQNConfig",
     "EpisodeCollector",
     "Evaluation",
     "Experiment",
     "ExperimentConfig",
     "L2C2Config",
+    "LCPConfig",
     "LoggerConfig",
     "MultiEpisodeCollector",
     "NoRegularizerConfig",
@@ -29,6 +38,7 @@ __all__ = [
     "PrioritizedReplayConfig",
     "RolloutReplayConfig",
     "SACConfig",
+    "SR2LConfig",
     "TD3Config",
     "TaskConfig",
     "UniformReplayConfig",

@@ -178,6 +178,7 @@ class ExperimentConfig:
             )
         with device:
             agent = self.algorithm.make_agent(env, self.regularizer, self.optimizer)
+        agent.compilable &= self.regularizer.compilable
         if device.type != "cpu":
             agent.act_on_cpu()
         return agent
@@ -201,6 +202,13 @@ class ExperimentConfig:
                 "replay",
                 f"{self.replay.name!r} is nothing that algorithm {self.algorithm.name!r} can learn "
                 "from: ppo needs rollout, the others prioritized or uniform.",
+            )
+        if on_policy and getattr(self.regularizer, "gain", None) == "gradient":
+            raise SettingError(
+                "regularizer.gain",
+                f"must be constant, ramp or target with algorithm {self.algorithm.name!r}, got "
+                "'gradient': it is measured on a batch from a replay buffer, and a rollout is "
+                "forgotten once it is learned from.",
             )
 
     def _check_rounds(self) -> None:
@@ -247,3 +255,26 @@ FREE_SETTINGS = {
 }
 # More episodes or frames are a longer run of the same kind.
 FREE_TASK_SETTINGS = {"name", "episodes", "frames", "solved_at"}
+# Settings that are newer than some runs, with the value at which they change none of the numbers.
+# Others are newer, too: null and false always are such values.
+NEUTRAL_SETTINGS = {
+    "device": "cpu",
+    "regularizer.policy_distance": "hellinger",
+    "regularizer.over_neighbors": "mean",
+    "regularizer.fraction": 1.0,
+    "regularizer.gain": "constant",
+    "regularizer.gain_of": "action_variation",
+    "regularizer.gain_rate": 0.1,
+    "regularizer.gain_limit": 1000.0,
+    "regularizer.gain_length": 1.0,
+}
+
+
+def is_neutral(name: str, value: Any) -> bool:
+    """Whether a run of before there was this setting has the numbers of one with this value.
+
+    Args:
+        name (str): with its group, such as ``"regularizer.policy_distance"``.
+        value: of the setting.
+    """
+    return value is None or value is False or NEUTRAL_SETTINGS.get(name) == value

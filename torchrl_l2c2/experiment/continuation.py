@@ -14,6 +14,7 @@ from torchrl_l2c2.experiment.config import (
     FREE_TASK_SETTINGS,
     ExperimentConfig,
     OtherRunError,
+    is_neutral,
 )
 from torchrl_l2c2.experiment.folder import CheckpointError, list_checkpoints, load_newest, versions
 from torchrl_l2c2.experiment.player import SimulatorError
@@ -36,8 +37,7 @@ def check_same_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> Non
             names = sorted((was.keys() | is_now.keys()) - free)
             pairs = {f"{group}.{n}": (was.get(n, MISSING), is_now.get(n, MISSING)) for n in names}
         for name, (before, after) in pairs.items():
-            # What is off now and was no setting then has changed nothing.
-            since = before == MISSING and after in (None, False)
+            since = before == MISSING and is_neutral(name, after)
             # As JSON, where a tuple and a list are the same; 10 and 10.0 are, too.
             if not since and json.loads(json.dumps(before)) != json.loads(json.dumps(after)):
                 raise OtherRunError(

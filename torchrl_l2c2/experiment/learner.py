@@ -57,6 +57,7 @@ class Learner:
         updates: gradient steps so far.
         skipped_updates: batches that were not finite and changed nothing.
         first_update_seconds: how long the first took, compilation included; ``None`` before it.
+        tells_faint_regularizer: whether to warn of a regularizer whose gradients are too small.
     """
 
     def __init__(
@@ -74,6 +75,7 @@ class Learner:
         self.updates = 0
         self.skipped_updates = 0
         self.first_update_seconds: float | None = None
+        self.tells_faint_regularizer = True
         self._reward_factor = reward_factor
         self._on_policy = on_policy
         self._compile = compile
@@ -131,7 +133,7 @@ class Learner:
             return
         self.updates += 1
         self._terms.append(result[0])
-        if self.updates == MEASURED_AFTER:
+        if self.updates == MEASURED_AFTER and self.tells_faint_regularizer:
             self._tell_faint_regularizer(*batch)
 
     def _tell_faint_regularizer(self, *batch: TensorDictBase) -> None:

@@ -30,6 +30,7 @@ from torchrl_l2c2.experiment.folder import (
     write_atomically,
     write_settings,
 )
+from torchrl_l2c2.experiment.gain import GainControl
 from torchrl_l2c2.experiment.learner import Learner, untrained
 from torchrl_l2c2.experiment.lock import lock_folder
 from torchrl_l2c2.experiment.loggers import check_installed
@@ -114,6 +115,7 @@ class Experiment:
         self.metrics: list[dict[str, float]] = []
         self._late_tests = LateTests(config.task, config.seed, self.agent.policy, self._compile)
         self._best_policy = BestPolicy(config, self.agent.policy, self.folder)
+        self._gain = GainControl(config, self.learner)
         # Only now, as what was refused above leaves no folder.
         if self.folder is not None:
             self._unlock = lock_folder(make_folder(self.folder), self)
@@ -199,17 +201,12 @@ class Experiment:
         return {
             "config": json.dumps(self.config.to_dict()),
             "versions": json.dumps(versions()),
-            "loss": self.agent.loss.state_dict(),
-            "optimizer": self.agent.optimizer.state_dict(),
-            "target_updater": _state_of(self.agent.target_updater),
-            "exploration": _state_of(self.agent.exploration),
+            **{name: part.state_dict() for name, part in self._parts().items()},
             "replay": replay_state(learner.replay),
             "collector": self.player.collector.generator_state(),
             "global_rng": self._process.state_dict(),
             "counters": [self.player.frames, learner.updates, learner.skipped_updates],
             "metrics": json.dumps(self.metrics),
-            "best_policy": self._best_policy.state_dict(),
-            "metrics_log": self._log.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -220,18 +217,13 @@ class Experiment:
         """
         learner = self.learner
         check_same_settings(json.loads(state["config"]), self.config.to_dict())
-        self.agent.loss.load_state_dict(state["loss"])
-        self.agent.optimizer.load_state_dict(state["optimizer"])
-        for part in ("target_updater", "exploration"):
-            if state[part] is not None:
-                getattr(self.agent, part).load_state_dict(state[part])
+        for name, part in self._parts().items():
+            if name in state:  # Checkpoints of earlier releases lack some.
+                part.load_state_dict(state[name])
         load_replay_state(learner.replay, state["replay"])
         self.player.collector.set_generator_state(state["collector"])
         self.player.frames, learner.updates, learner.skipped_updates = state["counters"]
         self.metrics = json.loads(state["metrics"])
-        self._log.load_state_dict(state["metrics_log"])
-        if "best_policy" in state:  # Checkpoints of earlier releases have none.
-            self._best_policy.load_state_dict(state["best_policy"])
         # Some of the tensors that a compiled update was made for are others now.
         learner.renew()
         self._process.load_state_dict(state["global_rng"])
@@ -319,6 +311,13 @@ class Experiment:
         self.load_state_dict(state)
         say(self.folder, f"continuing after episode {len(self.metrics)} from {path}")
 
+    def _parts(self) -> dict[str, Any]:
+        """What has a state of its own, by its name in checkpoints."""
+        named = ("loss", "optimizer", "target_updater", "exploration")
+        parts = {name: getattr(self.agent, name) for name in named}
+        parts |= {"best_policy": self._best_policy, "gain": self._gain, "metrics_log": self._log}
+        return {name: part for name, part in parts.items() if part is not None}
+
     def _untrained(self) -> str | None:
         random_frames = getattr(self.config.algorithm, "random_frames", 0)
         return untrained(self.player.frames, self.learner.updates, random_frames)
@@ -329,7 +328,7 @@ class Experiment:
     def _row(self, episode: Episode, budget: Budget) -> dict[str, float]:
         number = len(self.metrics) + 1
         late = budget.is_late(budget.spent(number, episode.last_frame), self.config.late_share)
-        return {
+        row = {
             "episode": number,
             "frames": episode.last_frame,
             "updates": self.learner.updates,
@@ -338,13 +337,10 @@ class Experiment:
             **(self._late_tests.play(number) if late else self._late_tests.none()),
             **self.learner.report(episode.last_frame),
         }
+        return {**row, **self._gain.after(row)}
 
     def _write(self, row: dict[str, float], bar: Progress) -> None:
         row["frames_per_second"] = bar.frames_per_second(self.player.frames)
         self.metrics.append(row)
         self._log.write(row)
         bar.show(self.metrics, self.learner.first_update_seconds)
-
-
-def _state_of(part: Any) -> dict[str, Any] | None:
-    return None if part is None else part.state_dict()

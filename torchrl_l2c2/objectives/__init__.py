@@ -1,9 +1,23 @@
-"""Losses: the L2C2 and CAPS regularizers, what they are built on, and PPO-RPE."""
+"""Losses: L2C2, its rivals, what they are built on, and PPO-RPE."""
 
 from torchrl_l2c2.objectives.caps import CAPSLoss
+from torchrl_l2c2.objectives.cats import CATSLoss
+from torchrl_l2c2.objectives.grad_caps import GradCAPSLoss
 from torchrl_l2c2.objectives.l2c2 import L2C2Loss
+from torchrl_l2c2.objectives.lcp import LCPLoss
 from torchrl_l2c2.objectives.ppo_rpe import PPORPELoss
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
 from torchrl_l2c2.objectives.shared_evaluation import SharedEvaluation
+from torchrl_l2c2.objectives.sr2l import SR2LLoss
 
-__all__ = ["CAPSLoss", "L2C2Loss", "PPORPELoss", "RegularizedLoss", "SharedEvaluation"]
+__all__ = [
+    "CAPSLoss",
+    "CATSLoss",
+    "GradCAPSLoss",
+    "L2C2Loss",
+    "LCPLoss",
+    "PPORPELoss",
+    "RegularizedLoss",
+    "SR2LLoss",
+    "SharedEvaluation",
+]

@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
-import functools
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import CompositeDistribution
 from torch import Tensor
-from torch.distributions import (
-    Bernoulli,
-    Categorical,
-    OneHotCategorical,
-    TransformedDistribution,
-)
-from torch.distributions.utils import _sum_rightmost
 from torchrl.objectives import LossModule
 
 from torchrl_l2c2._checks import check_choice, check_real
 from torchrl_l2c2.distances import squared_error
-from torchrl_l2c2.objectives.evaluation import Policy
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
+from torchrl_l2c2.objectives.transitions import finite_successor
+from torchrl_l2c2.policy_distances import policy_mean
 
 
 class CAPSLoss(RegularizedLoss):
@@ -38,9 +30,9 @@ class CAPSLoss(RegularizedLoss):
     Gradients flow into the policy's parameters alone, through both states.
 
     The mean :math:`\mu` is that of the normal distribution. [inferred] The paper's policy is a
-    plain normal; of a squashed one, ``mean`` says which side of the squashing is compared. Of
+    plain normal; of a squashed or truncated one, ``mean`` says which side of that is compared. Of
     discrete policies the probabilities are compared, the mean of an action written as one-hot
-    vector.
+    vector; the heads of composite ones add up.
     Coordinates of the next observation that are not finite, as at the ends of some episodes, count
     as not having moved.
 
@@ -108,7 +100,10 @@ class CAPSLoss(RegularizedLoss):
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
         terms = super().policy_regularizer(tensordict)
         here, there = self.policies_at(tensordict, self._states(tensordict))
-        temporal, spatial = _terms(here, there, squashed=self.caps_mean == "action")
+        squashed = self.caps_mean == "action"
+        temporal, spatial = caps_terms(
+            policy_mean(here, squashed=squashed), policy_mean(there, squashed=squashed)
+        )
         temporal, spatial = (self.reduce_term(term, tensordict) for term in (temporal, spatial))
         terms.set("loss_caps_temporal", self.caps_lambda_temporal * temporal)
         terms.set("loss_caps_spatial", self.caps_lambda_spatial * spatial)
@@ -119,7 +114,7 @@ class CAPSLoss(RegularizedLoss):
         states = TensorDict(batch_size=[2, *tensordict.batch_size])
         transitions = self.transitions(tensordict, self.policy_networks())
         for key, (state, successor) in transitions.items():
-            later = torch.where(successor.isfinite(), successor, state)
+            later = finite_successor(state, successor)
             noisy = state + self.caps_sigma * torch.randn_like(state)
             states.set(key, torch.stack((later, noisy)))
         return states
@@ -153,28 +148,3 @@ def caps_terms(
     """
     temporal, spatial = squared_error(mean, moved)
     return temporal, spatial
-
-
-def _terms(here: Any, there: Any, squashed: bool) -> tuple[Tensor, Tensor]:
-    """Those of policies ``[2, *B]``; the heads of a composite one add up."""
-    if not isinstance(here, CompositeDistribution):
-        return caps_terms(_mean(here, squashed), _mean(there, squashed))
-    ndim = len(here.batch_shape) - 1
-    heads = [_terms(here.dists[name], there.dists[name], squashed) for name in here.dists]
-    temporal, spatial = (
-        functools.reduce(torch.add, (_sum_rightmost(term, term.ndim - ndim) for term in terms))
-        for terms in zip(*heads, strict=True)
-    )
-    return temporal, spatial
-
-
-def _mean(policy: Policy, squashed: bool) -> Tensor:
-    if isinstance(policy, Tensor):
-        return policy
-    if isinstance(policy, Bernoulli | Categorical | OneHotCategorical):
-        return policy.probs
-    if not squashed:
-        while isinstance(policy, TransformedDistribution):
-            policy = policy.base_dist
-    mean = getattr(policy, "deterministic_sample", None)
-    return policy.mean if mean is None else mean

@@ -84,19 +84,32 @@ class Evaluation:
             self.wiring[POLICY_NETWORK] = _wiring(loss, POLICY_NETWORK)
 
     def policies_at(
-        self, loss: LossModule, tensordict: TensorDictBase, states: TensorDictBase
+        self,
+        loss: LossModule,
+        tensordict: TensorDictBase,
+        states: TensorDictBase,
+        rows: Tensor | None = None,
     ) -> tuple[Policy, Policy]:
-        """The policy at the batch's states and at others, both ``[K, *B]``."""
+        """The policy at the batch's states and at others, both ``[K, *B]``.
+
+        With ``rows``, ``[M]``, at these of the batch's states, written as one row, and at others in
+        their place, ``[K, M]``; likewise for the values.
+        """
         actor, wiring = getattr(loss, POLICY_NETWORK), self.wiring[POLICY_NETWORK]
         keys = actor.dist_params_keys if wiring.stochastic else [wiring.output]
-        here, there = self._outputs_at(loss, POLICY_NETWORK, tensordict, states, keys)
+        here, there = self._outputs_at(loss, POLICY_NETWORK, tensordict, states, keys, rows)
         here = here.expand(states.batch_size)
         if wiring.stochastic:
             return actor.build_dist_from_params(here), actor.build_dist_from_params(there)
         return here.get(wiring.output), there.get(wiring.output)
 
     def values_at(
-        self, loss: LossModule, network: str, tensordict: TensorDictBase, states: TensorDictBase
+        self,
+        loss: LossModule,
+        network: str,
+        tensordict: TensorDictBase,
+        states: TensorDictBase,
+        rows: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """A value function at the batch's states, ``[1, *B, ...]``, and at others, ``[K, ...]``."""
         key = self.wiring[network].output
@@ -106,7 +119,7 @@ class Evaluation:
                 f"{network} writes {list(getattr(loss, network).out_keys)}, and none of it is a "
                 f"value to this loss, whose keys are {loss.tensor_keys}: name it with set_keys."
             )
-        here, there = self._outputs_at(loss, network, tensordict, states, [key])
+        here, there = self._outputs_at(loss, network, tensordict, states, [key], rows)
         return here.get(key), there.get(key)
 
     def at_batch(
@@ -154,11 +167,15 @@ class Evaluation:
         tensordict: TensorDictBase,
         states: TensorDictBase,
         keys: Iterable[NestedKey],
+        chosen: Tensor | None,
     ) -> tuple[TensorDictBase, TensorDictBase]:
         """A network's outputs at the batch's states, ``[1, *B]``, and at others, ``[K, *B]``."""
         shared = ForwardPass() if self.forward_pass is None else self.forward_pass
         wiring, known = self.wiring[network], shared.at_batch.get(network)
         dim, num = int(is_ensemble(loss, network)), len(states)
+        if chosen is not None:
+            known = None if known is None else at_rows(known.select(*keys), chosen, dim)
+            tensordict = at_rows(tensordict.select(*wiring.inputs, strict=False), chosen)
         evaluated, there = shared.at_others.get(network, (None, None))
         if evaluated is states and known is not None and there is not None:
             return known.select(*keys).unsqueeze(dim), there.select(*keys)
@@ -223,6 +240,13 @@ def is_ensemble(loss: LossModule, network: str) -> bool:
 
 def _parameters_of(loss: LossModule, network: str) -> TensorDictBase | None:
     return getattr(loss, f"{network}_params", None) if loss.functional else None
+
+
+def at_rows(tensordict: TensorDictBase, rows: Tensor, dim: int = 0) -> TensorDictBase:
+    """Some rows of a batch ``[*B]``, behind ``dim`` other dimensions, written as one row."""
+    if tensordict.ndim > dim + 1:
+        tensordict = tensordict.flatten(dim, tensordict.ndim - 1)
+    return tensordict[:, rows] if dim else tensordict[rows]
 
 
 def _split(

@@ -4,21 +4,33 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import astuple
-from math import isclose
+from typing import Literal
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDictBase, unravel_key_list
 from torch import Tensor
-from torch.distributions import Categorical, Distribution
+from torch.distributions import Categorical
 from torchrl.objectives import DistributionalDQNLoss, LossModule
 
-from torchrl_l2c2._checks import check_positive_int
+from torchrl_l2c2._checks import check_choice, check_positive_int, check_real
 from torchrl_l2c2.distances import squared_error, squared_hellinger
 from torchrl_l2c2.neighborhood import Neighborhood
-from torchrl_l2c2.objectives.evaluation import VALUE_NETWORKS
+from torchrl_l2c2.objectives.evaluation import VALUE_NETWORKS, at_rows
+from torchrl_l2c2.objectives.neighbors import (
+    Neighbors,
+    draw_rows,
+    l2c2_penalty,
+    read_neighbors,
+    warn_of_other_neighbors,
+)
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
 from torchrl_l2c2.objectives.transitions import next_key
+from torchrl_l2c2.policy_distances import (
+    PolicyDistance,
+    choose_policy_distance,
+    compare_policies,
+    distance_name,
+)
 from torchrl_l2c2.transforms import draw_neighbors
 
 
@@ -35,10 +47,11 @@ class L2C2Loss(RegularizedLoss):
 
     with the neighbors :math:`\tilde s`, their distances :math:`d` and :math:`\lambda_\pi` of a
     :class:`~torchrl_l2c2.Neighborhood`. :math:`d_\pi` is the squared Hellinger distance
-    (:func:`~torchrl_l2c2.squared_hellinger`) or, for deterministic policies, half the squared
-    distance of the actions. :math:`d_V = \tfrac12\lVert V(s) - V(\tilde s)\rVert_2^2` is taken over
-    all heads or members of an ensemble; of action values over all (discrete) actions, or at the
-    batch's action; of the value distributions of :class:`~torchrl.objectives.DistributionalDQNLoss`
+    (:func:`~torchrl_l2c2.squared_hellinger`) or what ``policy_distance`` says; for deterministic
+    policies half the squared distance of the actions.
+    :math:`d_V = \tfrac12\lVert V(s) - V(\tilde s)\rVert_2^2` is taken over all heads or members of
+    an ensemble; of action values over all (discrete) actions, or at the batch's action; of the
+    value distributions of :class:`~torchrl.objectives.DistributionalDQNLoss`
     it is the squared Hellinger distance, summed over the actions.
 
     Gradients flow into the policy's parameters from the one term, into the value function's from
@@ -53,8 +66,8 @@ class L2C2Loss(RegularizedLoss):
     them (give it the same neighborhood and ``num_samples``; a difference is told once, as a
     warning), and otherwise drawn from the observations and next
     observations with torch's global generator. Drawn here, those floating-point inputs of the
-    regularized networks are moved that have a successor in the batch, and the distance is the
-    largest of theirs.
+    regularized networks are moved that have a successor in the batch, or ``moved_keys``, and the
+    distance is the largest of theirs.
 
     ``forward`` adds these entries to the loss's own:
 
@@ -62,9 +75,11 @@ class L2C2Loss(RegularizedLoss):
       its network: ``loss_l2c2_critic``, ``loss_l2c2_qvalue``, ``loss_l2c2_value``, ...
     * ``l2c2_distance``, the mean :math:`d`, and ``l2c2_gain``, the mean gain applied,
       :math:`\lambda_\pi / d`;
-    * ``l2c2_hellinger`` (``l2c2_action_distance`` for deterministic policies) and
-      ``l2c2_value_distance``, the mean :math:`d_\pi` and, summed over the value functions,
-      :math:`d_V`. With ``reduction="none"`` diagnostics are not averaged either.
+    * the mean :math:`d_\pi`, named after the distance: ``l2c2_hellinger``,
+      ``l2c2_mean_distance``, ``l2c2_kl``, ``l2c2_policy_distance`` for a function of one's own,
+      ``l2c2_action_distance`` for deterministic policies;
+    * ``l2c2_value_distance``, the mean :math:`d_V`, summed over the value functions. With
+      ``reduction="none"`` diagnostics are not averaged either.
 
     .. note:: The gains are buffers that can be assigned to, as in ``loss.l2c2_coeff = 0.5``, also
         between calls of a compiled loss. They are not part of the ``state_dict``.
@@ -82,6 +97,22 @@ class L2C2Loss(RegularizedLoss):
             gradients. Scheduled as ``l2c2_coeff``. Defaults to ``1.0``.
         num_samples (int): neighbors per state, drawn here or by the transform, at least 1. More
             give a less noisy estimate at so many times the network evaluations. Defaults to ``1``.
+        over_neighbors (str): ``"mean"``, the paper's, or ``"max"``: the neighbor with the largest
+            penalty alone, an adversary that is as strong as there are neighbors to choose from.
+            Larger at the same gain. Defaults to ``"mean"``.
+        fraction (float): share of the batch, in (0, 1], whose states have neighbors, drawn anew
+            each time with torch's global generator. Smaller ones cost less, pay in large batches,
+            and are noisier; the terms' expectation stays: a drawn transition counts
+            ``1 / fraction`` times and the others 0, also with ``reduction="none"``. Defaults to 1.
+        moved_keys (sequence of NestedKey, optional): which observations neighbors drawn here differ
+            in, such as those that carry noise. Defaults to ``None``, all that can.
+        policy_distance (str or callable): :math:`d_\pi`. ``"hellinger"``, the paper's, is in [0, 1]
+            and relative to how wide the policies are; ``"mean"``
+            (:func:`~torchrl_l2c2.policy_distances.mean_distance`) is neither; ``"kl"``
+            (:func:`~torchrl_l2c2.policy_distances.kl_divergence`), of the policy at :math:`s` from
+            the other, is relative and unbounded. Each wants its own gains. A function takes two
+            distributions ``[K, *B]`` and returns ``[K, *B]``. Only the first two take deterministic
+            policies. Defaults to ``"hellinger"``.
         hellinger_samples (int, optional): actions drawn from each policy for the paper's Monte
             Carlo estimate of :math:`d_\pi`, at least 1. Defaults to ``None``, its closed form.
         neighbor_key (NestedKey): the entry that ``NeighborTransform`` writes. Defaults to
@@ -110,19 +141,10 @@ class L2C2Loss(RegularizedLoss):
         >>> isinstance(loss, DDPGLoss), isinstance(loss, L2C2Loss)
         (True, True)
         >>> updater = SoftUpdate(loss, tau=0.01)
-        >>> batch = TensorDict(
-        ...     {
-        ...         "observation": torch.randn(32, 3),
-        ...         "action": torch.randn(32, 1),
-        ...         "next": {
-        ...             "observation": torch.randn(32, 3),
-        ...             "reward": torch.randn(32, 1),
-        ...             "done": torch.zeros(32, 1, dtype=torch.bool),
-        ...             "terminated": torch.zeros(32, 1, dtype=torch.bool),
-        ...         },
-        ...     },
-        ...     batch_size=[32],
-        ... )
+        >>> state, flag = torch.randn(32, 3), torch.zeros(32, 1, dtype=torch.bool)
+        >>> batch = TensorDict({"observation": state, "action": torch.randn(32, 1)}, [32])
+        >>> batch["next"] = {"observation": state + 0.1, "reward": torch.randn(32, 1)}
+        >>> _ = batch["next"].update({"done": flag, "terminated": flag})
         >>> terms = loss(batch)
         >>> [key for key in terms.keys() if key.startswith("loss_")]
         ['loss_actor', 'loss_value', 'loss_l2c2_actor', 'loss_l2c2_value']
@@ -136,6 +158,10 @@ class L2C2Loss(RegularizedLoss):
         *,
         coeff: float = 1.0,
         num_samples: int = 1,
+        over_neighbors: Literal["mean", "max"] = "mean",
+        fraction: float = 1.0,
+        moved_keys: Sequence[NestedKey] | None = None,
+        policy_distance: Literal["hellinger", "mean", "kl"] | PolicyDistance = "hellinger",
         hellinger_samples: int | None = None,
         neighbor_key: NestedKey = "neighbor",
     ) -> None:
@@ -143,10 +169,20 @@ class L2C2Loss(RegularizedLoss):
         if not isinstance(neighborhood, Neighborhood):
             raise TypeError(f"neighborhood must be a Neighborhood, got {neighborhood!r}.")
         check_positive_int("num_samples", num_samples)
-        if hellinger_samples is not None:
-            check_positive_int("hellinger_samples", hellinger_samples)
+        check_choice("over_neighbors", over_neighbors, ("mean", "max"))
+        if over_neighbors == "max" and num_samples == 1:
+            raise ValueError(
+                "num_samples must be above 1 with over_neighbors='max', got 1: of one neighbor the "
+                "largest is the mean."
+            )
+        check_real("fraction", fraction, above=0, at_most=1)
+        self.l2c2_policy_distance = policy_distance
+        self._l2c2_distance = choose_policy_distance(policy_distance, hellinger_samples)
         self.l2c2_neighborhood = neighborhood
         self.l2c2_num_samples = num_samples
+        self.l2c2_over_neighbors: Literal["mean", "max"] = over_neighbors
+        self.l2c2_fraction = float(fraction)
+        self.l2c2_moved_keys = None if moved_keys is None else unravel_key_list(list(moved_keys))
         self.l2c2_hellinger_samples = hellinger_samples
         self.l2c2_neighbor_key = neighbor_key
         self._l2c2_compared = False
@@ -157,12 +193,15 @@ class L2C2Loss(RegularizedLoss):
         _check_terms(type(base_loss).__name__, self._l2c2_policies, self._l2c2_values, beta)
         self.declare_networks([*self._l2c2_policies, *self._l2c2_values])
         policies, values = self._l2c2_policies, self._l2c2_values
+        for _ in policies:
+            name = distance_name(policy_distance, self.has_stochastic_policy())
+            self._l2c2_policy_diagnostic = f"l2c2_{name}"
         self.declare_terms(
             policy=["loss_l2c2_actor" for _ in policies],
             value=[_value_term(network) for network in values],
             diagnostics=[
                 *("l2c2_distance", "l2c2_gain"),
-                *(self._policy_diagnostic() for _ in policies),
+                *(self._l2c2_policy_diagnostic for _ in policies),
                 *(["l2c2_value_distance"] if values else []),
             ],
         )
@@ -171,35 +210,31 @@ class L2C2Loss(RegularizedLoss):
         terms = super().policy_regularizer(tensordict)
         if not self._l2c2_policies:
             return terms
-        states, distance = self._neighbors(tensordict)
-        here, there = self.policies_at(tensordict, states)
-        if isinstance(here, Tensor) and isinstance(there, Tensor):
-            difference = squared_error(here, there)
-        else:
-            assert isinstance(here, Distribution) and isinstance(there, Distribution)
-            difference = squared_hellinger(here, there, num_samples=self.l2c2_hellinger_samples)
-        terms.set("loss_l2c2_actor", self._penalty(difference, distance, tensordict))
-        terms.set(self._policy_diagnostic(), self.reduce_diagnostic(difference.mean(0), tensordict))
-        return terms.update(self._gain_diagnostics(distance, tensordict))
+        near = self._neighbors(tensordict)
+        policies = self.policies_at(tensordict, near.states, near.rows)
+        difference = compare_policies(self._l2c2_distance, *policies)
+        terms.set("loss_l2c2_actor", self._penalty(difference, near, tensordict))
+        terms.set(self._l2c2_policy_diagnostic, self._diagnostic(difference, near, tensordict))
+        return terms.update(self._gain_diagnostics(near, tensordict))
 
     def value_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
         terms = super().value_regularizer(tensordict)
         if not self._l2c2_values:
             return terms
-        states, distance = self._neighbors(tensordict)
+        near = self._neighbors(tensordict)
         diagnostics = []
         for network in self._l2c2_values:
-            difference = self._value_difference(network, tensordict, states)
-            penalty = self._penalty(difference, distance, tensordict)
+            difference = self._value_difference(network, tensordict, near)
+            penalty = self._penalty(difference, near, tensordict)
             terms.set(_value_term(network), self.l2c2_beta * penalty)
-            diagnostics.append(self.reduce_diagnostic(difference.mean(0), tensordict))
+            diagnostics.append(self._diagnostic(difference, near, tensordict))
         terms.set("l2c2_value_distance", sum(diagnostics))
-        return terms.update(self._gain_diagnostics(distance, tensordict))
+        return terms.update(self._gain_diagnostics(near, tensordict))
 
     def known_states(self, tensordict: TensorDictBase) -> TensorDictBase | None:
-        if tensordict.get(self.l2c2_neighbor_key, None) is None:
+        if self.l2c2_fraction < 1 or tensordict.get(self.l2c2_neighbor_key, None) is None:
             return super().known_states(tensordict)
-        return self._neighbors(tensordict)[0]
+        return self._neighbors(tensordict).states
 
     def compare_neighbors(self, neighborhood: Neighborhood, num_samples: int) -> None:
         """Warns, once, where neighbors are drawn otherwise than this loss counts them.
@@ -214,29 +249,18 @@ class L2C2Loss(RegularizedLoss):
         Warns:
             UserWarning: the neighborhood or the number is not that of this loss.
         """
-        self._compare(astuple(neighborhood), num_samples)
+        self._compare(neighborhood.numbers, num_samples)
 
     def _compare(self, drawn: Sequence[float], num_samples: int) -> None:
         if self._l2c2_compared or not drawn:  # an empty batch
             return
         self._l2c2_compared = True
-        own = astuple(self.l2c2_neighborhood)
-        # The batch has them in its own precision.
-        same = all(isclose(a, b, rel_tol=0.01) for a, b in zip(drawn, own, strict=True))
-        if not same or num_samples != self.l2c2_num_samples:
-            names = ("sigma", "lambda_min", "lambda_max", "num_samples")
-            pairs = zip(names, (*drawn, num_samples), (*own, self.l2c2_num_samples), strict=True)
-            each = ", ".join(f"{name} {a:.4g} and {b:.4g}" for name, a, b in pairs)
-            warnings.warn(
-                f"neighbors are drawn otherwise than L2C2Loss counts them: {each}. Give the same "
-                "neighborhood and num_samples to NeighborTransform and L2C2Loss.",
-                stacklevel=3,
-            )
+        warn_of_other_neighbors(drawn, num_samples, self.l2c2_neighborhood, self.l2c2_num_samples)
 
     def _value_difference(
-        self, network: str, tensordict: TensorDictBase, states: TensorDictBase
+        self, network: str, tensordict: TensorDictBase, near: Neighbors
     ) -> Tensor:
-        here, there = self.values_at(network, tensordict, states)
+        here, there = self.values_at(network, tensordict, near.states, near.rows)
         if isinstance(self, DistributionalDQNLoss):
             # Logarithms of the atoms' probabilities, [K, *B, atoms, actions].
             policies = (Categorical(logits=value.transpose(-1, -2)) for value in (here, there))
@@ -244,73 +268,47 @@ class L2C2Loss(RegularizedLoss):
         difference = squared_error(here, there)
         return difference.sum(0) if self.is_ensemble(network) else difference
 
-    def _penalty(self, difference: Tensor, distance: Tensor, tensordict: TensorDictBase) -> Tensor:
-        penalty = l2c2_penalty(difference, self.l2c2_neighborhood.gain(distance))
+    def _penalty(self, difference: Tensor, near: Neighbors, tensordict: TensorDictBase) -> Tensor:
+        gain = self.l2c2_neighborhood.gain(near.distance)
+        penalty = l2c2_penalty(difference, gain, self.l2c2_over_neighbors)
+        penalty = near.to_batch(penalty, tensordict.batch_size)
         return self.l2c2_coeff * self.reduce_term(penalty, tensordict)
 
-    def _neighbors(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
-        """The neighbors and their distances, both ``[K, *B]``."""
+    def _neighbors(self, tensordict: TensorDictBase) -> Neighbors:
         return self.made_once("l2c2_neighbors", lambda: self._make_neighbors(tensordict))
 
-    def _make_neighbors(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
+    def _make_neighbors(self, tensordict: TensorDictBase) -> Neighbors:
+        rows = draw_rows(tensordict, self.l2c2_fraction, self.l2c2_coeff.device)
         neighbor = tensordict.get(self.l2c2_neighbor_key, None)
         if neighbor is None:
-            neighbor = self._draw(tensordict)
-        entries = {
-            key: value.movedim(tensordict.batch_dims, 0)
-            for key, value in neighbor.items(include_nested=True, leaves_only=True)
-        }
-        if "distance" not in entries:
-            raise KeyError(
-                f"{self.l2c2_neighbor_key!r} holds {list(entries)}, but no 'distance': write it "
-                "with NeighborTransform, or name another neighbor_key."
-            )
-        distance, drawn = entries.pop("distance"), entries.pop("neighborhood", None)
+            neighbor = self._draw(tensordict, rows)
+        elif rows is not None:
+            neighbor = at_rows(neighbor, rows)
+        states, distance, drawn = read_neighbors(neighbor, self.l2c2_neighbor_key)
         if drawn is not None and not (self._l2c2_compared or torch.compiler.is_compiling()):
-            self._compare(drawn.reshape(3, -1)[:, :1].flatten().tolist(), len(distance))
-        return TensorDict(entries, batch_size=distance.shape), distance
+            self._compare(drawn.flatten(1)[:, :1].flatten().tolist(), len(distance))
+        return Neighbors(states, distance, rows)
 
-    def _draw(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def _draw(self, tensordict: TensorDictBase, rows: Tensor | None) -> TensorDictBase:
         """What NeighborTransform would have written."""
-        keys = list(self.transitions(tensordict, [*self._l2c2_policies, *self._l2c2_values]))
-        states = tensordict.select(*keys, *map(next_key, keys)).detach()
+        networks = [*self._l2c2_policies, *self._l2c2_values]
+        keys = self.l2c2_moved_keys or list(self.transitions(tensordict, networks))
+        states = tensordict.select(*keys, *map(next_key, keys), strict=False).detach()
+        states = states if rows is None else at_rows(states, rows)
         return draw_neighbors(states, self.l2c2_neighborhood, keys, self.l2c2_num_samples)
 
-    def _gain_diagnostics(self, distance: Tensor, tensordict: TensorDictBase) -> dict[str, Tensor]:
-        gain = self.l2c2_coeff * self.l2c2_neighborhood.gain(distance)
+    def _diagnostic(self, value: Tensor, near: Neighbors, tensordict: TensorDictBase) -> Tensor:
+        value = near.to_batch(value.detach().mean(0), tensordict.batch_size)
+        return self.reduce_diagnostic(value, tensordict)
+
+    def _gain_diagnostics(self, near: Neighbors, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        gain = self.l2c2_coeff * self.l2c2_neighborhood.gain(near.distance)
+        # Of a transition that counts nothing it is infinite.
+        finite = near.distance.masked_fill(near.distance.isinf(), 0.0)
         return {
-            "l2c2_distance": self.reduce_diagnostic(distance.mean(0), tensordict),
-            "l2c2_gain": self.reduce_diagnostic(gain.mean(0), tensordict),
+            "l2c2_distance": self._diagnostic(finite, near, tensordict),
+            "l2c2_gain": self._diagnostic(gain, near, tensordict),
         }
-
-    def _policy_diagnostic(self) -> str:
-        return "l2c2_hellinger" if self.has_stochastic_policy() else "l2c2_action_distance"
-
-
-def l2c2_penalty(
-    difference: Tensor,  # shape: [K, *B, ...]
-    gain: Tensor,  # shape: [K, *B]
-) -> Tensor:  # shape: [*B, ...]
-    r"""The mean over ``K`` neighbors of the gain times the difference, before the reduction.
-
-    .. math::
-        \frac1K \sum_k \frac{\lambda}{d(s, \tilde s_k; s')}\, d_f(f(s), f(\tilde s_k))
-
-    of a policy or a value function :math:`f` (Kobayashi, L2C2, 2022).
-
-    Args:
-        difference: :math:`d_f`, at least 0; it may have more dimensions, those of agents.
-        gain: :math:`\lambda / d`, as :meth:`Neighborhood.gain <torchrl_l2c2.Neighborhood.gain>`
-            gives it.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_l2c2.objectives.l2c2 import l2c2_penalty
-        >>> l2c2_penalty(torch.tensor([[1.0, 2.0], [3.0, 4.0]]), torch.tensor([[1.0], [0.5]]))
-        tensor([1.2500, 2.0000])
-    """
-    gain = gain[(...,) + (None,) * (difference.ndim - gain.ndim)]
-    return (gain * difference).mean(0)
 
 
 def _value_term(network: str) -> str:

@@ -257,22 +257,27 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         return find_transitions(tensordict, {name: wiring[name].states for name in networks})
 
     def policies_at(
-        self, tensordict: TensorDictBase, states: TensorDictBase
+        self, tensordict: TensorDictBase, states: TensorDictBase, rows: Tensor | None = None
     ) -> tuple[Policy, Policy]:
         """The policy at the batch's states and at others, in one evaluation.
 
         Args:
             tensordict: the batch, ``[*B]``.
             states: entries that take the place of the batch's, ``[K, *B]``.
+            rows: ``[M]``, of the batch as one row, if these states, ``[K, M]``, are theirs alone.
 
         Returns:
             The policy at the one and at the other: distributions ``[K, *B]`` or, where it is
             deterministic, actions ``[K, *B, A]``.
         """
-        return self._evaluation.policies_at(self, tensordict, states)
+        return self._evaluation.policies_at(self, tensordict, states, rows)
 
     def values_at(
-        self, network: str, tensordict: TensorDictBase, states: TensorDictBase
+        self,
+        network: str,
+        tensordict: TensorDictBase,
+        states: TensorDictBase,
+        rows: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """A value function at the batch's states and at others, in one evaluation.
 
@@ -280,12 +285,13 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             network: the name of a declared one.
             tensordict: the batch, ``[*B]``. Action values are taken at its actions.
             states: entries that take the place of the batch's, ``[K, *B]``.
+            rows: as for :meth:`policies_at`.
 
         Returns:
             Values ``[1, *B, ...]`` and ``[K, *B, ...]``, with the ensemble's dimension in front of
             both where :meth:`is_ensemble`.
         """
-        return self._evaluation.values_at(self, network, tensordict, states)
+        return self._evaluation.values_at(self, network, tensordict, states, rows)
 
     def known_states(self, tensordict: TensorDictBase) -> TensorDictBase | None:
         """Other states, ``[K, *B]``, that are in the batch; ``None`` if they are drawn later.

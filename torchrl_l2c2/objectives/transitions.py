@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
+import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import (
@@ -96,6 +97,11 @@ def find_transitions(
             )
         pairs.update(present)
     return {key: pairs[key] for key in keys if key in pairs}
+
+
+def finite_successor(state: Tensor, successor: Tensor) -> Tensor:
+    """The successor, with the state's own coordinates where it is not finite, as at some ends."""
+    return torch.where(successor.isfinite(), successor, state)
 
 
 def next_key(key: NestedKey) -> NestedKey:

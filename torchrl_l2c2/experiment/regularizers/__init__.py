@@ -1,15 +1,31 @@
 """What is added to the loss: a file for each regularizer, and a line here for each choice."""
 
-from torchrl_l2c2.experiment.regularizers.base import RegularizerConfig
+from torchrl_l2c2.experiment.regularizers.base import GainConfig, RegularizerConfig
 from torchrl_l2c2.experiment.regularizers.caps import CAPSConfig
+from torchrl_l2c2.experiment.regularizers.cats import CATSConfig
 from torchrl_l2c2.experiment.regularizers.l2c2 import L2C2Config
+from torchrl_l2c2.experiment.regularizers.lcp import LCPConfig
 from torchrl_l2c2.experiment.regularizers.none import NoRegularizerConfig
+from torchrl_l2c2.experiment.regularizers.sr2l import SR2LConfig
 
-__all__ = ["REGULARIZERS", "CAPSConfig", "L2C2Config", "NoRegularizerConfig", "RegularizerConfig"]
+__all__ = [
+    "REGULARIZERS",
+    "CAPSConfig",
+    "CATSConfig",
+    "GainConfig",
+    "L2C2Config",
+    "LCPConfig",
+    "NoRegularizerConfig",
+    "RegularizerConfig",
+    "SR2LConfig",
+]
 
 REGULARIZERS: dict[str, RegularizerConfig] = {
     "none": NoRegularizerConfig(),
     "caps": CAPSConfig(),
+    "cats": CATSConfig(),
+    "sr2l": SR2LConfig(),
+    "lcp": LCPConfig(),
     "l2c2": L2C2Config(),
     # The paper's ablation: the policy alone is regularized.
     "l2c2_policy": L2C2Config(name="l2c2_policy", beta=0.0),

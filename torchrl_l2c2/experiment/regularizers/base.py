@@ -1,8 +1,12 @@
-"""What every regularizer's settings make."""
+"""What every regularizer's settings make, and how those say what sets the gain."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+from pydantic import Field
+
+from torchrl_l2c2.experiment.settings import SettingError, settings
 
 if TYPE_CHECKING:
     import torch
@@ -11,7 +15,13 @@ if TYPE_CHECKING:
 
 
 class RegularizerConfig:
-    """Makes a regularized loss and, where batches are to hold more for it, a transform."""
+    """Makes a regularized loss and, where batches are to hold more for it, a transform.
+
+    Attributes:
+        compilable: whether the regularized loss compiles into one graph where the plain one does.
+    """
+
+    compilable: ClassVar[bool] = True
 
     name: str
 
@@ -22,3 +32,55 @@ class RegularizerConfig:
     def transform(self, generator: torch.Generator) -> Transform | None:
         """What the replay buffer's batches go through; ``None`` where the loss needs nothing."""
         return None
+
+
+@settings
+class GainConfig(RegularizerConfig):
+    """A regularizer whose terms have a gain: how it is set in the course of a run."""
+
+    gain: Literal["constant", "ramp", "gradient", "target"] = Field(
+        default="constant",
+        description="what multiplies the regularizer's gains: 1, a linear ramp from 0 to 1, what "
+        "keeps the terms' gradients at gain_target of the loss's own, network by network, or what "
+        "keeps gain_of at gain_target or below; set after every episode",
+    )
+    gain_target: float | None = Field(
+        default=None, gt=0, description="of gain=gradient, a ratio of norms, or gain=target"
+    )
+    gain_of: str = Field(
+        default="action_variation",
+        description="of gain=target: the column of metrics.csv that is to be at most gain_target",
+    )
+    gain_rate: float = Field(
+        default=0.1,
+        gt=0,
+        le=1,
+        description="of gain=gradient and gain=target: how fast the gain's logarithm follows",
+    )
+    gain_limit: float = Field(
+        default=1000.0,
+        gt=1,
+        description="of gain=gradient and gain=target: the gain is at most this, and at least 1 "
+        "over this",
+    )
+    gain_length: float = Field(
+        default=1.0,
+        gt=0,
+        le=1,
+        description="of gain=ramp: share of the whole training after which the gain is 1",
+    )
+
+    def __post_init__(self) -> None:
+        needs = self.gain in ("gradient", "target")
+        if needs and self.gain_target is None:
+            raise SettingError("gain_target", f"must be given with gain={self.gain}, got null.")
+        if not needs and self.gain_target is not None:
+            raise SettingError(
+                "gain_target",
+                f"is of gain=gradient and gain=target alone, got {self.gain_target} with "
+                f"gain={self.gain}: choose one of these, or leave gain_target at null.",
+            )
+
+    def set_gains(self, loss: LossModule, policy: float, value: float) -> None:
+        """Multiplies the terms that train the policy and the values, from what the settings say."""
+        raise NotImplementedError

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
-from torchrl_l2c2.experiment.regularizers.base import RegularizerConfig
+from torchrl_l2c2.experiment.regularizers.base import GainConfig
 from torchrl_l2c2.experiment.settings import settings
 
 if TYPE_CHECKING:
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 @settings
-class CAPSConfig(RegularizerConfig):
+class CAPSConfig(GainConfig):
     """The baseline, :class:`~torchrl_l2c2.CAPSLoss`."""
 
     name: str = "caps"
@@ -35,3 +35,7 @@ class CAPSConfig(RegularizerConfig):
         from torchrl_l2c2.objectives import CAPSLoss
 
         return CAPSLoss(loss, self.sigma, self.lambda_temporal, self.lambda_spatial, mean=self.mean)
+
+    def set_gains(self, loss: LossModule, policy: float, value: float) -> None:
+        loss.caps_lambda_temporal = policy * self.lambda_temporal
+        loss.caps_lambda_spatial = policy * self.lambda_spatial

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
-from torchrl_l2c2.experiment.regularizers.base import RegularizerConfig
-from torchrl_l2c2.experiment.settings import settings
+from torchrl_l2c2.experiment.regularizers.base import GainConfig
+from torchrl_l2c2.experiment.settings import SettingError, settings
 
 if TYPE_CHECKING:
     import torch
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @settings
-class L2C2Config(RegularizerConfig):
+class L2C2Config(GainConfig):
     """The paper's method, :class:`~torchrl_l2c2.L2C2Loss`."""
 
     name: str = "l2c2"
@@ -31,19 +31,57 @@ class L2C2Config(RegularizerConfig):
         default=0.01, gt=0, description="gain at the edge of the neighborhood [paper]"
     )
     lambda_max: float = Field(default=1.0, gt=0, description="gain at its center [paper]")
+    shared: bool = Field(
+        default=False,
+        description="one draw for all dimensions of the state, and not one for each [paper: each]",
+    )
+    max_step: float | None = Field(
+        default=None,
+        gt=0,
+        description="longest step from s to s' that counts, in the observation's units: a reset or "
+        "a teleport is longer; null: all [paper]",
+    )
     beta: float = Field(
         default=0.1,
         ge=0,
         description="gain of the value's regularization relative to the policy's [paper]",
     )
     num_samples: int = Field(default=1, ge=1, description="neighbors per transition [inferred: 1]")
+    over_neighbors: Literal["mean", "max"] = Field(
+        default="mean",
+        description="mean over a transition's neighbors [paper], or the largest of them, which "
+        "needs num_samples above 1",
+    )
+    fraction: float = Field(
+        default=1.0,
+        gt=0,
+        le=1,
+        description="share of the batch that has neighbors; smaller ones cost less in large "
+        "batches, and are noisier [paper: all]",
+    )
+    policy_distance: Literal["hellinger", "mean", "kl"] = Field(
+        default="hellinger",
+        description="how policies are compared: hellinger [paper], half the squared distance of "
+        "their means before the squashing, or the KL divergence; they need other gains",
+    )
+
+    def __post_init__(self) -> None:
+        GainConfig.__post_init__(self)
+        if self.over_neighbors == "max" and self.num_samples == 1:
+            raise SettingError("num_samples", "must be above 1 with over_neighbors=max, got 1.")
 
     @property
     def neighborhood(self) -> Neighborhood:
         """Where neighbors are drawn, for the loss and the transform alike."""
         from torchrl_l2c2.neighborhood import Neighborhood
 
-        return Neighborhood(self.sigma, self.lambda_min, self.lambda_max)
+        return Neighborhood(
+            self.sigma,
+            self.lambda_min,
+            self.lambda_max,
+            shared=self.shared,
+            max_step=self.max_step,
+        )
 
     def wrap(self, loss: LossModule) -> LossModule:
         from torchrl_l2c2.objectives import L2C2Loss
@@ -53,6 +91,9 @@ class L2C2Config(RegularizerConfig):
             neighborhood=self.neighborhood,
             beta=self.beta,
             num_samples=self.num_samples,
+            over_neighbors=self.over_neighbors,
+            fraction=self.fraction,
+            policy_distance=self.policy_distance,
         )
 
     def transform(self, generator: torch.Generator) -> NeighborTransform:
@@ -61,3 +102,9 @@ class L2C2Config(RegularizerConfig):
         return NeighborTransform(
             self.neighborhood, num_samples=self.num_samples, generator=generator
         )
+
+    def set_gains(self, loss: LossModule, policy: float, value: float) -> None:
+        loss.l2c2_coeff = policy
+        if self.beta:
+            # Both gains are of the value terms.
+            loss.l2c2_beta = self.beta * value / policy if policy else self.beta

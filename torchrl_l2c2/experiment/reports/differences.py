@@ -12,6 +12,7 @@ from torchrl_l2c2.experiment.config import (
     FREE_TASK_SETTINGS,
     GROUPS,
     ExperimentConfig,
+    is_neutral,
 )
 from torchrl_l2c2.experiment.tasks import TASKS
 
@@ -25,8 +26,8 @@ def fingerprint(config: Mapping[str, Any]) -> str:
     """Ten hexadecimal digits that two runs share if, and only if, they may be pooled.
 
     They stand for every setting but the seed, the logger, the task's name, and those that change
-    none of the numbers or only the length of the training. A setting that is off (null or false)
-    does not count: one that is added later, off by default, leaves the codes of older runs.
+    none of the numbers or only the length of the training. A setting that is off (null, false, or
+    as older runs had it) does not count: one that is added later leaves the codes of older runs.
 
     Args:
         config (Mapping): of ``config.json``; settings that it lacks have their defaults.
@@ -37,7 +38,7 @@ def fingerprint(config: Mapping[str, Any]) -> str:
     compared = {
         name: value
         for name, value in _flat(ExperimentConfig.from_dict(config)).items()
-        if _counts(name) and name != "task.name" and value is not None and value is not False
+        if _counts(name) and name != "task.name" and not is_neutral(name, value)
     }
     return hashlib.sha256(json.dumps(compared, sort_keys=True).encode()).hexdigest()[:10]
 

@@ -1,0 +1,278 @@
+"""Gains that set themselves: by hand, in closed loops, and in a run that is continued."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import warnings
+
+import pytest
+
+from torchrl_l2c2.experiment import (
+    AdamConfig,
+    CAPSConfig,
+    DQNConfig,
+    Experiment,
+    ExperimentConfig,
+    L2C2Config,
+    PPOConfig,
+    PPORPEConfig,
+    SACConfig,
+    TaskConfig,
+    UniformReplayConfig,
+)
+from torchrl_l2c2.experiment.config import GROUPS
+from torchrl_l2c2.experiment.influence import gradient_shares
+from torchrl_l2c2.experiment.settings import SettingError
+from torchrl_l2c2.gains import ConstantGain, GradientGain, RampGain, TargetGain
+
+
+class TestByHand:
+    def test_a_constant_stays(self):
+        """Whatever is measured."""
+        gain = ConstantGain(2.0)
+        assert [gain.step(), gain.step(7.0)] == [2.0, 2.0]
+
+    def test_a_ramp_rises_linearly_and_stays_at_its_end(self):
+        """Half of 3 where a quarter of training is over and it is to rise over half."""
+        ramp = RampGain(3.0, length=0.5)
+        assert ramp.value == 0.0
+        assert [ramp.step(k) for k in (0.0, 0.25, 0.5, 1.0, 1.1)] == [0.0, 1.5, 3.0, 3.0, 3.0]
+
+    def test_a_gradients_share_is_met_at_once_with_rate_1(self):
+        """A share of .02 at the gain 1 is .1 at the gain 5; sqrt(5) with rate 1/2."""
+        assert GradientGain(0.1, rate=1.0).step(0.02) == pytest.approx(5.0)
+        assert GradientGain(0.1, rate=0.5).step(0.02) == pytest.approx(math.sqrt(5))
+
+    def test_gradients_are_averaged_on_the_logarithm(self):
+        """Shares at the gain 1 of .1 and of .1 * 4^-n: the mean of the logarithms counts."""
+        gain, value = GradientGain(0.1, rate=0.1), 1.0
+        for unit in (0.05, 0.2, 0.4):
+            expected = math.exp(0.9 * math.log(value) + 0.1 * math.log(0.1 / unit))
+            value = gain.step(value * unit)
+            assert value == pytest.approx(expected)
+
+    @pytest.mark.parametrize("share", [0.0, math.inf, math.nan])
+    def test_a_share_that_says_nothing_changes_nothing(self, share):
+        """Where one of the gradients vanishes."""
+        assert GradientGain(0.1, value=3.0).step(share) == 3.0
+
+    def test_dual_ascent(self):
+        """exp(rate * relative excess); no step is larger than the rate; nan changes nothing."""
+        gain = TargetGain(2.0, rate=0.5)
+        assert gain.step(3.0) == pytest.approx(math.exp(0.25))
+        assert gain.step(100.0) == pytest.approx(math.exp(0.75))
+        assert gain.step(0.0) == pytest.approx(math.exp(0.25))
+        assert gain.step(math.nan) == pytest.approx(math.exp(0.25))
+
+    @pytest.mark.parametrize(
+        "gain", [GradientGain(1.0, 1.0, 8.0, 2.0), TargetGain(1.0, 1.0, 8.0, 2.0)]
+    )
+    def test_the_gain_stays_within_its_bounds(self, gain):
+        """value * 8 and value / 8."""
+        up, down = (1e-9, 1e9) if isinstance(gain, GradientGain) else (1e9, 1e-9)
+        assert [gain.step(up) for _ in range(9)][-1] == 16.0
+        assert [gain.step(down) for _ in range(9)][-1] == 0.25
+
+    def test_dual_ascent_finds_the_gain_that_meets_the_target(self):
+        """Of a measure 1 / (1 + gain), which is 1/4 at the gain 3."""
+        gain = TargetGain(0.25, rate=0.1)
+        for _ in range(300):
+            gain.step(1.0 / (1.0 + gain.value))
+        assert gain.value == pytest.approx(3.0, rel=1e-3)
+
+    @pytest.mark.parametrize(
+        "make", [lambda: RampGain(), lambda: GradientGain(0.1), lambda: TargetGain(0.1)]
+    )
+    def test_a_restored_gain_goes_on_as_the_other(self, make):
+        """From its state_dict."""
+        gain, again = make(), make()
+        gain.step(0.7)
+        again.load_state_dict(gain.state_dict())
+        assert again.value == gain.value != make().value
+        assert again.step(0.9) == gain.step(0.9)
+
+    @pytest.mark.parametrize(
+        ("make", "message"),
+        [
+            (lambda: ConstantGain(-1.0), "value must be finite and at least 0, got -1"),
+            (lambda: RampGain(length=0.0), r"length must be in \(0, 1\], got 0"),
+            (lambda: GradientGain(0.0), "share must be finite and greater than 0, got 0"),
+            (lambda: TargetGain(-0.1), "target must be finite and greater than 0"),
+            (lambda: TargetGain(0.1, rate=2.0), r"rate must be in \(0, 1\], got 2"),
+            (lambda: GradientGain(0.1, limit=1.0), "limit must be finite and greater than 1"),
+        ],
+    )
+    def test_wrong_settings_are_refused(self, make, message):
+        """With what is allowed."""
+        with pytest.raises(ValueError, match=message):
+            make()
+
+
+TASK = TaskConfig("pendulum", "Pendulum-v1", episodes=6, max_steps=40)
+KINDS = {
+    "ramp": {"gain": "ramp"},
+    "gradient": {"gain": "gradient", "gain_target": 0.3},
+    "target": {"gain": "target", "gain_target": 0.05, "gain_of": "l2c2_hellinger"},
+}
+
+
+def small(regularizer=None, **settings):
+    return ExperimentConfig(
+        **{
+            "task": TASK,
+            "algorithm": PPORPEConfig(hidden=(8,)),
+            "regularizer": regularizer or L2C2Config(),
+            "replay": UniformReplayConfig(batch_size=8),
+            "optimizer": AdamConfig(),
+            "compile": False,
+            "checkpoint_interval": 0.0,
+            **settings,
+        }
+    )
+
+
+def timeless(metrics):
+    """What does not depend on the clock, as text: nan is nan."""
+    return [str({k: v for k, v in row.items() if "per_second" not in k}) for row in metrics]
+
+
+class TestInARun:
+    def test_a_constant_gain_adds_nothing_to_the_log(self):
+        """Nor do other settings of the gain count then."""
+        rows = Experiment(small()).train(1)
+        assert not [name for name in rows[0] if name.startswith("gain")]
+
+    def test_a_ramp_follows_the_training_that_was_asked_for(self):
+        """0 in the first of six episodes, 5/6 in the last; and the loss has it."""
+        run = Experiment(small(L2C2Config(**KINDS["ramp"])))
+        rows = run.train(3) and run.train()
+        assert [row["gain"] for row in rows] == pytest.approx([k / 6 for k in range(6)])
+        assert rows[0]["loss_l2c2_actor"] == 0.0 < rows[-1]["loss_l2c2_actor"]
+        assert run.agent.loss.l2c2_coeff == 1.0
+
+    def test_a_target_is_approached_from_above(self):
+        """An action variation far above it lets the gain rise by its rate in every episode."""
+        settings = {"gain": "target", "gain_target": 1e-9, "gain_rate": 0.5}
+        run = Experiment(small(L2C2Config(**settings)))
+        rows = run.train()
+        assert [row["gain"] for row in rows] == pytest.approx([math.exp(k / 2) for k in range(6)])
+        assert [row["gain_measured"] for row in rows] == [row["action_variation"] for row in rows]
+        assert rows[0]["gain_target"] == 1e-9
+        assert run.agent.loss.l2c2_coeff.item() == pytest.approx(math.exp(3.0))
+        assert run.agent.loss.l2c2_beta.item() == pytest.approx(0.1)
+
+    def test_each_network_gets_its_share_of_the_gradient(self):
+        """With rate 1, the next measurement on the same batch gives it for policy and values."""
+        regularizer = L2C2Config(gain="gradient", gain_target=0.3, gain_rate=1.0, gain_limit=1e6)
+        run = Experiment(small(regularizer))
+        rows = run.train()
+        shares = gradient_shares(run.agent.loss, run.learner.update.example())
+        assert shares["loss_l2c2_actor"] == pytest.approx(0.3, rel=1e-4)
+        assert shares["loss_l2c2_critic"] == pytest.approx(0.3, rel=1e-4)
+        assert rows[-1]["gain_policy"] != pytest.approx(rows[-1]["gain_value"])
+
+    def test_several_terms_of_a_network_share_their_gain(self):
+        """CAPS has two of the policy: the larger counts, and neither changes beside the other."""
+        run = Experiment(small(CAPSConfig(gain="gradient", gain_target=0.3, gain_rate=1.0)))
+        rows = run.train()
+        loss = run.agent.loss
+        assert "gain_value" not in rows[0]
+        ratio = loss.caps_lambda_spatial / loss.caps_lambda_temporal
+        assert ratio.item() == pytest.approx(5.0)
+        assert loss.caps_lambda_temporal.item() != pytest.approx(0.01)
+
+    @pytest.mark.parametrize("kind", KINDS)
+    def test_a_continued_run_is_the_uninterrupted_one(self, tmp_path, kind):
+        """Parameters, gains and metrics, to the last bit."""
+        config = small(L2C2Config(**KINDS[kind]), late_share=0.0)
+        whole = Experiment(config, tmp_path / "whole")
+        whole.train()
+        first = Experiment(config, tmp_path / "parts")
+        first.train(3)
+        first.close()
+        second = Experiment(config, tmp_path / "parts")
+        assert len(second.metrics) == 3
+        second.train()
+        assert timeless(second.metrics) == timeless(whole.metrics)
+        state, expected = second.agent.loss.state_dict(), whole.agent.loss.state_dict()
+        assert all((state[name] == value).all() for name, value in expected.items())
+        first, last = whole.metrics[0], whole.metrics[-1]
+        assert any(first[name] != last[name] for name in first if name.startswith("gain"))
+
+    @pytest.mark.parametrize("kind", ["constant", "ramp"])
+    def test_only_a_constant_gain_is_told_to_be_faint(self, kind):
+        """After 100 updates; one that sets itself may be small for now."""
+        regularizer = L2C2Config(lambda_min=1e-9, lambda_max=1e-8, gain=kind)
+        run = Experiment(small(regularizer, algorithm=PPORPEConfig(hidden=(8,), updates=60)))
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            run.train(2)
+        told = [w for w in caught if "regularizer's terms are less" in str(w.message)]
+        assert len(told) == (kind == "constant")
+
+    @pytest.mark.slow
+    def test_a_compiled_update_follows_the_gain(self):
+        """The term is 0 in the first episode of a ramp and grows with it."""
+        run = Experiment(small(L2C2Config(gain="ramp"), compile=True))
+        rows = run.train()
+        gains = [row["loss_l2c2_actor"] / row["l2c2_hellinger"] for row in rows]
+        assert gains[0] == 0.0 and gains == sorted(gains) and gains[-1] > 0
+
+    def test_a_loss_without_a_policy_has_the_gain_of_its_values(self):
+        """Q-learning."""
+        task = dataclasses.replace(TASK, env_id="CartPole-v1")
+        regularizer = L2C2Config(gain="gradient", gain_target=0.3, gain_rate=1.0)
+        with pytest.warns(UserWarning, match="leaves out the policy term"):
+            run = Experiment(
+                small(regularizer, task=task, algorithm=DQNConfig(hidden=(8,), random_frames=10))
+            )
+        row = run.train()[-1]
+        assert "gain_policy" not in row and row["gain_value"] != 1.0
+        assert run.agent.loss.l2c2_coeff == 1.0
+
+    def test_before_the_first_update_nothing_is_measured(self):
+        """Random frames leave the gain at 1."""
+        config = small(
+            L2C2Config(**KINDS["gradient"]), algorithm=SACConfig(hidden=(8,), random_frames=90)
+        )
+        rows = Experiment(config).train(3)
+        assert [row["gain_policy"] for row in rows] == [1.0, 1.0, 1.0]
+        assert [math.isnan(row["gain_measured_policy"]) for row in rows] == [True, True, False]
+
+
+class TestRefusals:
+    def test_a_column_that_is_not_logged_is_named(self):
+        """With those that are."""
+        run = Experiment(small(L2C2Config(gain="target", gain_target=1.0, gain_of="jerk")))
+        with pytest.raises(
+            SettingError, match=r"gain_of must be one of .*'action_variation'.*'jerk'"
+        ):
+            run.train(1)
+
+    @pytest.mark.parametrize(
+        ("settings", "message"),
+        [
+            ({"gain": "target"}, "gain_target must be given with gain=target, got null"),
+            ({"gain": "gradient"}, "gain_target must be given with gain=gradient"),
+            (
+                {"gain_target": 0.1},
+                "gain_target is of gain=gradient and gain=target alone, got 0.1",
+            ),
+            ({"gain": "pid"}, "gain must be 'constant', 'ramp', 'gradient' or 'target'"),
+        ],
+    )
+    def test_settings_that_do_not_go_together_are_refused(self, settings, message):
+        """With what would."""
+        with pytest.raises(SettingError, match=message):
+            L2C2Config(**settings)
+
+    def test_gradients_are_not_measured_on_rollouts(self):
+        """They are gone when it is time to."""
+        regularizer = L2C2Config(**KINDS["gradient"])
+        with pytest.raises(
+            SettingError, match="must be constant, ramp or target with algorithm 'ppo'"
+        ):
+            ExperimentConfig(
+                algorithm=PPOConfig(), replay=GROUPS["replay"]["rollout"], regularizer=regularizer
+            )

@@ -1,0 +1,209 @@
+"""The distance of means and the KL divergence, against hand-computed numbers and integrals."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from losses import composite_actor, transitions
+from scipy import integrate
+from tensordict import TensorDict
+from tensordict.nn import CompositeDistribution
+from torch import distributions as d
+from torchrl import modules as rl
+
+from torchrl_l2c2 import make_actor
+from torchrl_l2c2.policy_distances import (
+    choose_policy_distance,
+    kl_divergence,
+    mean_distance,
+    policy_mean,
+)
+
+
+@pytest.fixture(autouse=True)
+def seed():
+    torch.manual_seed(0)
+
+
+LOC = torch.tensor([[0.5, -3.0], [1.0, 2.0]])
+KINDS = {
+    "normal": lambda loc: d.Normal(loc, 0.7),
+    "independent": lambda loc: d.Independent(d.Normal(loc, 0.7), 1),
+    "independent_normal": lambda loc: rl.IndependentNormal(loc, torch.full_like(loc, 0.7)),
+    "tanh_normal": lambda loc: rl.TanhNormal(loc, torch.full_like(loc, 0.7), low=-2.0, high=4.0),
+    "truncated_normal": lambda loc: rl.TruncatedNormal(loc, torch.full_like(loc, 0.7)),
+    "transformed": lambda loc: d.TransformedDistribution(
+        d.Independent(d.Normal(loc, 0.7), 1), [d.TanhTransform(), d.AffineTransform(1.0, 2.0)]
+    ),
+}
+
+
+class TestMeanDistance:
+    @pytest.mark.parametrize("kind", KINDS)
+    def test_it_is_that_of_the_normals_before_they_are_squashed_or_truncated(self, kind):
+        """1/2 (1^2 + 0^2) and 1/2 (0^2 + 2^2), wherever the squashing saturates."""
+        moved = LOC + torch.tensor([[1.0, 0.0], [0.0, -2.0]])
+        found = mean_distance(KINDS[kind](LOC), KINDS[kind](moved))
+        torch.testing.assert_close(found, torch.tensor([0.5, 2.0]))
+
+    def test_the_papers_own_policy_is_compared_before_its_squashing(self):
+        """That of make_actor, whose body is of Squish."""
+        actor, batch = make_actor(3, 2, hidden=(8,)), transitions(4)
+        p, q = (actor.get_dist(td) for td in (batch.clone(), batch["next"].clone()))
+        here, there = (actor.get_dist_params(td)["loc"] for td in (batch, batch["next"]))
+        torch.testing.assert_close(mean_distance(p, q), 0.5 * (here - there).square().sum(-1))
+
+    def test_of_discrete_policies_the_probabilities_are_compared(self):
+        """(.5, .5) and (.9, .1): 1/2 (.16 + .16)."""
+        for kind in (d.Categorical, d.OneHotCategorical, rl.OneHotCategorical):
+            p, q = (kind(probs=torch.tensor([[x, 1 - x]])) for x in (0.5, 0.9))
+            torch.testing.assert_close(mean_distance(p, q), torch.tensor([0.16]))
+
+    def test_the_heads_of_a_composite_policy_are_one_vector(self):
+        """Their squared distances add up, also those of heads without a dimension of their own."""
+        params = TensorDict(
+            {
+                "wide": {"loc": torch.zeros(4, 2), "scale": torch.ones(4, 2)},
+                "thin": {"loc": torch.zeros(4), "scale": torch.ones(4)},
+            },
+            [4],
+        )
+        kinds = {"wide": rl.TanhNormal, "thin": d.Normal}
+        p, q = (CompositeDistribution(params + x, kinds) for x in (0.0, 1.0))
+        torch.testing.assert_close(mean_distance(p, q), torch.full((4,), 1.5))
+
+    def test_actions_are_their_own_mean(self):
+        """A deterministic policy."""
+        assert policy_mean(LOC) is LOC
+
+    def test_the_scale_does_not_count(self):
+        """A wide policy is as far away as a narrow one."""
+        p, q = (rl.TanhNormal(LOC, torch.full_like(LOC, scale)) for scale in (0.1, 5.0))
+        assert mean_distance(p, q).tolist() == [0.0, 0.0]
+
+
+def kl_by_quadrature(p: d.Distribution, q: d.Distribution, low: float, high: float) -> float:
+    def integrand(action: float) -> float:
+        log_p, log_q = (x.log_prob(torch.tensor([[action]])).item() for x in (p, q))
+        return math.exp(log_p) * (log_p - log_q)
+
+    return integrate.quad(integrand, low, high, epsabs=1e-6, limit=400)[0]
+
+
+class TestKLDivergence:
+    def test_of_two_normals(self):
+        """ln(t/s) + (s^2 + m^2) / (2 t^2) - 1/2, from the one at s to the one at s~."""
+        p, q = d.Normal(torch.tensor([0.0]), 1.0), d.Normal(torch.tensor([3.0]), 2.0)
+        expected = math.log(2.0) + (1 + 9) / 8 - 0.5
+        assert kl_divergence(p, q).item() == pytest.approx(expected)
+        backward = math.log(0.5) + (4 + 9) / 2 - 0.5
+        assert kl_divergence(q, p).item() == pytest.approx(backward)
+
+    def test_squashing_changes_nothing(self):
+        """Two TanhNormals of the same bounds have the divergence of their normals, compiled too."""
+        scales = torch.tensor([[0.5, 1.0], [2.0, 1.0]])
+
+        def divergence(loc, scale):
+            return kl_divergence(
+                rl.TanhNormal(loc, scale, low=-3.0, high=1.0),
+                rl.TanhNormal(loc + 1.0, 2 * scale, low=-3.0, high=1.0),
+            )
+
+        normals = d.Normal(LOC, scales), d.Normal(LOC + 1.0, 2 * scales)
+        expected = d.kl_divergence(*normals).sum(-1)
+        torch.testing.assert_close(divergence(LOC, scales), expected)
+        compiled = torch.compile(divergence, fullgraph=True, backend="eager")
+        torch.testing.assert_close(compiled(LOC, scales), expected)
+
+    def test_heads_add_up(self):
+        """Of a squashed normal and a categorical one."""
+        actor, batch = composite_actor(), transitions(4)
+        p, q = (actor.get_dist(td) for td in (batch.clone(), batch["next"].clone()))
+        parts = [
+            d.kl_divergence(p.dists["move"].base_dist, q.dists["move"].base_dist),
+            d.kl_divergence(p.dists["pick"], q.dists["pick"]),
+        ]
+        torch.testing.assert_close(kl_divergence(p, q), sum(parts))
+
+    @pytest.fixture
+    def truncated(self):
+        """Two policies without a closed form, as many times as there are to be estimates."""
+
+        def make(count: int, shift: torch.Tensor | float = 0.4):
+            loc = torch.zeros(count, 1)
+            return (
+                rl.TruncatedNormal(loc, torch.full_like(loc, 0.5)),
+                rl.TruncatedNormal(loc + shift, torch.full_like(loc, 0.6)),
+            )
+
+        return make
+
+    def test_without_a_closed_form_it_is_estimated_without_a_bias(self, truncated):
+        """No estimate is negative, and their mean is the integral."""
+        found = kl_divergence(*truncated(20_000))
+        assert found.min() >= 0 and found.std() > 0.01
+        expected = kl_by_quadrature(*truncated(1), -1.0, 1.0)
+        assert found.mean().item() == pytest.approx(expected, rel=0.02)
+
+    @pytest.mark.parametrize("which", [0, 1])
+    def test_the_gradient_of_the_estimate_is_unbiased(self, which):
+        """Into the policy that is sampled, and into the other."""
+        loc = [torch.tensor(0.0, requires_grad=True), torch.tensor(0.5, requires_grad=True)]
+        batch = torch.ones(200_000)
+        p, q = (rl.TruncatedNormal((x * batch)[:, None], 0.5 * batch[:, None]) for x in loc)
+        kl_divergence(p, q, num_samples=4).mean().backward()
+
+        def at(shift: float) -> float:
+            values = [0.0, 0.5]
+            values[which] += shift
+            pair = (rl.TruncatedNormal(torch.tensor([[x]]), torch.tensor([[0.5]])) for x in values)
+            return kl_by_quadrature(*pair, -1.0, 1.0)
+
+        slope = (at(0.02) - at(-0.02)) / 0.04
+        assert loc[which].grad.item() == pytest.approx(slope, rel=0.05)
+
+    def test_deterministic_policies_are_refused(self):
+        """The error says what to use."""
+        p = rl.Delta(torch.zeros(3, 2))
+        with pytest.raises(TypeError, match=r"no density.*squared_error"):
+            kl_divergence(p, p)
+
+    def test_what_cannot_be_sampled_is_refused(self):
+        """With the way out."""
+
+        class Silent(d.Distribution):
+            arg_constraints = {}  # noqa: RUF012
+
+        p = Silent(torch.Size([2]), validate_args=False)
+        with pytest.raises(TypeError, match="a function of your own"):
+            kl_divergence(p, p)
+
+
+class TestChoice:
+    @pytest.mark.parametrize(
+        ("chosen", "samples", "error", "message"),
+        [
+            (
+                "wasserstein",
+                None,
+                ValueError,
+                "'hellinger' or 'mean' or 'kl', got 'wasserstein'. Or",
+            ),
+            (2.0, None, TypeError, "policy_distance must be .* Or give a function"),
+            ("kl", 4, ValueError, "hellinger_samples is for policy_distance='hellinger' alone"),
+            ("hellinger", 0, ValueError, "hellinger_samples must be at least 1"),
+        ],
+    )
+    def test_others_are_refused(self, chosen, samples, error, message):
+        """With what there is."""
+        with pytest.raises(error, match=message):
+            choose_policy_distance(chosen, samples)
+
+    def test_a_function_must_return_one_number_a_pair(self):
+        """One number for each coordinate of the action would be averaged in silence."""
+        p = d.Independent(d.Normal(torch.zeros(4, 2), 1.0), 1)
+        distance = choose_policy_distance(lambda p, q: (p.mean - q.mean).abs())
+        with pytest.raises(ValueError, match=r"shape \(4,\), got \(4, 2\)"):
+            distance(p, p)

@@ -1,0 +1,434 @@
+"""Rivals: by hand, around every loss that can be regularized, and in a run."""
+
+from __future__ import annotations
+
+import copy
+import math
+import pickle
+
+import pytest
+import torch
+from losses import (
+    CASES,
+    action_values,
+    deterministic_actor,
+    gaussian_actor,
+    on_policy,
+    qvalue,
+    transitions,
+)
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.envs import CatFrames, GymEnv, TransformedEnv
+from torchrl.modules import Actor, IndependentNormal, ProbabilisticActor
+from torchrl.objectives import DDPGLoss, DQNLoss, PPOLoss
+
+from torchrl_l2c2 import CAPSLoss, CATSLoss, GradCAPSLoss, L2C2Loss, LCPLoss, SR2LLoss
+from torchrl_l2c2.experiment import (
+    AdamConfig,
+    CATSConfig,
+    Experiment,
+    ExperimentConfig,
+    LCPConfig,
+    PPORPEConfig,
+    SR2LConfig,
+    TaskConfig,
+    UniformReplayConfig,
+)
+from torchrl_l2c2.objectives.cats import cats_term
+from torchrl_l2c2.objectives.grad_caps import grad_caps_term
+from torchrl_l2c2.objectives.lcp import lcp_term
+from torchrl_l2c2.objectives.sr2l import ascend, jeffreys_divergence
+
+pytestmark = pytest.mark.filterwarnings("ignore")
+
+WEIGHT = torch.tensor([[1.0, -2.0, 0.5], [0.0, 1.0, 1.0]])
+
+
+def linear_base() -> DDPGLoss:
+    """A deterministic policy W s."""
+    net = nn.Linear(3, 2, bias=False)
+    net.weight.data = WEIGHT.clone()
+    return DDPGLoss(Actor(net), qvalue())
+
+
+def linear_normal(scale: float = 0.5) -> PPOLoss:
+    """A normal policy with the mean W s."""
+
+    class Linear(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.weight = nn.Parameter(WEIGHT.clone())
+
+        def forward(self, observation):
+            loc = observation @ self.weight.T
+            return loc, torch.full_like(loc, scale)
+
+    actor = ProbabilisticActor(
+        TensorDictModule(Linear(), ["observation"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=IndependentNormal,
+        return_log_prob=True,
+    )
+    return PPOLoss(actor, None)
+
+
+class TestCATS:
+    def test_the_term_is_the_squared_distance_of_means(self):
+        """Not half of it: 3^2 + 4^2."""
+        assert cats_term(torch.zeros(1, 2), torch.tensor([[3.0, 4.0]])).tolist() == [25.0]
+
+    def test_of_a_linear_policy(self):
+        """lambda times the mean of |W (s' - s)|^2; where s' is not finite, it has not moved."""
+        batch = transitions(2)
+        batch["observation"] = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
+        batch["next", "observation"] = torch.tensor([[1.0, 0.0, 0.0], [math.nan, 2.0, 2.0]])
+        loss = CATSLoss(linear_base(), 0.3)
+        found = loss.policy_regularizer(batch)["loss_cats"]
+        assert found.item() == pytest.approx(0.3 * (1.0 + (1.5**2 + 2.0**2)) / 2)
+        loss.cats_lambda = 0.6
+        assert loss.policy_regularizer(batch)["loss_cats"].item() == pytest.approx(2 * found.item())
+
+    def test_it_is_twice_the_temporal_term_of_caps(self):
+        """On the same side of the squashing."""
+        batch = transitions(4)
+        for mean in ("loc", "action"):
+            base = PPOLoss(gaussian_actor(), None)
+            caps = CAPSLoss(base, lambda_temporal=1.0, mean=mean)
+            expected = 2 * caps.policy_regularizer(batch)["loss_caps_temporal"]
+            found = CATSLoss(base, 1.0, mean=mean).policy_regularizer(batch)["loss_cats"]
+            torch.testing.assert_close(found, expected)
+
+
+class TestGradCAPS:
+    def batch(self) -> TensorDict:
+        """Two transitions with the states before: along a line, and back and forth."""
+        batch = transitions(2)
+        state = torch.tensor([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+        batch["observation"] = state
+        batch["next", "observation"] = torch.tensor([[2.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+        batch["frames"] = torch.cat((torch.zeros(2, 3), state), -1)
+        return batch
+
+    def test_a_steady_motion_is_free_and_a_zigzag_is_not(self):
+        """0 for the line; (-2 / 0.1)^2 for there and back."""
+        loss = GradCAPSLoss(linear_base(), 0.3, epsilon=0.1)
+        found = loss.policy_regularizer(self.batch())["loss_grad_caps"]
+        assert found.item() == pytest.approx(0.3 * (0.0 + 400.0) / 2, rel=1e-4)
+
+    def test_what_the_action_moved_over_both_steps_is_what_counts(self):
+        """(1 - 0) / (tanh 1 + .5) for actions 0, 0, 1."""
+        term = grad_caps_term(torch.zeros(1, 1), torch.zeros(1, 1), torch.ones(1, 1), 0.5)
+        assert term.item() == pytest.approx((1.0 / (math.tanh(1.0) + 0.5)) ** 2)
+
+    def test_catframes_gives_what_it_needs(self):
+        """The state before, and the state itself in the first step of an episode."""
+        frames = CatFrames(N=2, dim=-1, in_keys=["observation"], out_keys=["frames"])
+        played = TransformedEnv(GymEnv("Pendulum-v1"), frames).rollout(5)
+        states = played["observation"]
+        torch.testing.assert_close(played["frames"][1:, :3], states[:-1])
+        torch.testing.assert_close(played["frames"][0, :3], states[0])
+        net = nn.Linear(3, 1, bias=False)
+        loss = GradCAPSLoss(DDPGLoss(Actor(net), qvalue()), 1.0)
+        found = loss.policy_regularizer(played)["loss_grad_caps"]
+        with torch.no_grad():
+            actions = net(torch.cat((states[:1], states, played["next", "observation"][-1:])))
+            expected = grad_caps_term(actions[:-2], actions[1:-1], actions[2:], 0.1).mean()
+        torch.testing.assert_close(found.detach(), expected)
+
+    def test_other_batches_are_refused_with_what_to_do(self):
+        """Without frames, or with three."""
+        loss, batch = GradCAPSLoss(linear_base()), self.batch()
+        frames = batch.pop("frames")
+        with pytest.raises(KeyError, match=r"no 'frames': append CatFrames\(N=2, dim=-1"):
+            loss.policy_regularizer(batch)
+        batch["frames"] = torch.cat((frames, frames[:, :3]), -1)
+        with pytest.raises(ValueError, match=r"of shape \(2, 6\), got \(2, 9\)"):
+            loss.policy_regularizer(batch)
+
+    def test_a_loss_without_a_policy_is_refused(self):
+        """As for the others."""
+        base = DQNLoss(action_values(), action_space="one-hot")
+        with pytest.raises(TypeError, match="GradCAPSLoss needs a policy: DQNLoss has none"):
+            GradCAPSLoss(base)
+
+
+class TestSR2L:
+    def test_of_a_linear_policy_the_worst_state_is_a_corner(self):
+        """1/2 max |W d|^2 over the corners of the box."""
+        corners = torch.cartesian_prod(*[torch.tensor([-0.1, 0.1])] * 3)
+        expected = 0.5 * (corners @ WEIGHT.T).square().sum(-1).max()
+        loss = SR2LLoss(linear_base(), epsilon=0.1, coeff=0.3)
+        found = loss.policy_regularizer(transitions(64))["loss_sr2l"]
+        # Some starts end in another corner, which is a local maximum.
+        assert 0.8 * expected < found / 0.3 <= 1.0001 * expected
+
+    def test_of_a_normal_policy_by_jeffreys_divergence(self):
+        """|W d|^2 / (2 s^2), the same either way."""
+        corners = torch.cartesian_prod(*[torch.tensor([-0.1, 0.1])] * 3)
+        expected = ((corners @ WEIGHT.T).square().sum(-1) / (2 * 0.5**2)).max()
+        loss = SR2LLoss(linear_normal(), epsilon=0.1, coeff=1.0)
+        found = loss.policy_regularizer(transitions(64))["loss_sr2l"]
+        assert 0.8 * expected < found <= 1.0001 * expected
+
+    def test_jeffreys_divergence_is_symmetric(self):
+        """The mean of both: of two normals of scale 1 and 2 at one place (ln terms cancel)."""
+        p, q = (torch.distributions.Normal(torch.zeros(1), s) for s in (1.0, 2.0))
+        assert jeffreys_divergence(p, q).item() == pytest.approx(0.5 * (1 / 8 + 4 / 2 - 1))
+        assert jeffreys_divergence(p, q) == jeffreys_divergence(q, p)
+
+    def test_the_ascent_stays_in_the_box_and_finds_more_than_chance(self):
+        """Of a smooth function of two parts of a state."""
+        torch.manual_seed(0)
+        states = {"a": torch.randn(100, 2), "b": torch.randn(100, 1)}
+
+        def distance(moved):
+            return sum((3.0 * (moved[k] - states[k])).sin().square().sum(-1) for k in states)
+
+        chance = {k: s + 0.2 * (2 * torch.rand_like(s) - 1) for k, s in states.items()}
+        found = ascend(distance, states, 0.2, 10)
+        for key, state in states.items():
+            assert ((found[key] - state).abs() <= 0.2 + 1e-6).all()
+            assert not found[key].requires_grad
+        assert distance(found).mean() > 2 * distance(chance).mean()
+
+    def test_other_distances_can_be_chosen(self):
+        """Half the squared distance of means in the place of the divergence."""
+        loss = SR2LLoss(linear_normal(), epsilon=0.1, coeff=1.0, policy_distance="mean")
+        corners = torch.cartesian_prod(*[torch.tensor([-0.1, 0.1])] * 3)
+        expected = 0.5 * (corners @ WEIGHT.T).square().sum(-1).max()
+        found = loss.policy_regularizer(transitions(64))["loss_sr2l"]
+        assert 0.8 * expected < found <= 1.0001 * expected
+        with pytest.raises(TypeError, match="deterministic policy"):
+            SR2LLoss(linear_base(), policy_distance="kl")
+
+    @pytest.mark.parametrize("settings", [{"epsilon": 0.0}, {"steps": 0}, {"coeff": -1.0}])
+    def test_wrong_settings_are_refused(self, settings):
+        """At construction."""
+        with pytest.raises(ValueError, match=f"{next(iter(settings))} must be"):
+            SR2LLoss(linear_base(), **settings)
+
+
+class TestLCP:
+    def test_the_term_is_the_squared_gradient(self):
+        """Of s^2 and of 3 t, parts of one state: (2 s)^2 + 9."""
+        s = torch.tensor([[1.0, 2.0]], requires_grad=True)
+        t = torch.tensor([[5.0]], requires_grad=True)
+        value = s.square().sum(-1) + 3.0 * t.squeeze(-1)
+        assert lcp_term(value, [s, t], 1).tolist() == [4.0 + 16.0 + 9.0]
+
+    def test_of_a_linear_normal_policy(self):
+        """The gradient of ln pi is W^T (a - W s) / s^2."""
+        batch = transitions(8)
+        error = batch["action"] - batch["observation"] @ WEIGHT.T
+        expected = (error @ WEIGHT / 0.5**2).square().sum(-1).mean()
+        found = LCPLoss(linear_normal(), 0.002).policy_regularizer(batch)["loss_lcp"]
+        torch.testing.assert_close(found, 0.002 * expected)
+
+    def test_its_gradient_is_that_of_the_penalty(self):
+        """A second derivative, against differences."""
+        batch, base = transitions(8), linear_normal()
+        loss, weight = LCPLoss(base, 1.0).double(), base.actor_network.module[0].module.weight
+        batch = batch.apply(lambda x: x.double() if x.is_floating_point() else x)
+        (found,) = torch.autograd.grad(
+            loss.policy_regularizer(batch)["loss_lcp"],
+            [p for n, p in loss.named_parameters() if "actor" in n],
+        )
+        (parameter,) = (p for n, p in loss.named_parameters() if "actor" in n)
+        assert weight.shape == parameter.shape
+        values = []
+        for shift in (1e-5, -1e-5):
+            with torch.no_grad():
+                parameter[0, 0] += shift
+            values.append(loss.policy_regularizer(batch)["loss_lcp"].item())
+            with torch.no_grad():
+                parameter[0, 0] -= shift
+        assert found[0, 0].item() == pytest.approx((values[0] - values[1]) / 2e-5, rel=1e-6)
+
+    def test_a_deterministic_policy_is_refused(self):
+        """With the regularizers that take it."""
+        with pytest.raises(TypeError, match=r"DDPGLoss has no likelihood. CAPSLoss, CATSLoss"):
+            LCPLoss(linear_base())
+
+
+RIVALS = {
+    "cats": (lambda base: CATSLoss(base), "loss_cats", "cats_lambda"),
+    "sr2l": (lambda base: SR2LLoss(base, steps=2), "loss_sr2l", "sr2l_coeff"),
+    "lcp": (lambda base: LCPLoss(base), "loss_lcp", "lcp_coeff"),
+}
+
+
+@pytest.fixture(params=RIVALS)
+def rival(request):
+    return RIVALS[request.param]
+
+
+def has_likelihood(case) -> bool:
+    return case.policy == "l2c2_hellinger"
+
+
+@pytest.fixture(params=CASES, ids=str)
+def case(request):
+    return request.param
+
+
+def plain(case, **kwargs):
+    torch.manual_seed(0)
+    return case.make(**kwargs)
+
+
+def batch_of(case, *shape):
+    torch.manual_seed(1)
+    return case.batch(*(shape or (6,)))
+
+
+def run(loss, batch):
+    torch.manual_seed(2)
+    return loss(batch)
+
+
+@pytest.fixture
+def wrapped(case, rival):
+    """The regularized loss; refusals are tested first."""
+    make, term, coefficient = rival
+    if case.policy is None:
+        with pytest.raises(TypeError, match=r"needs a policy: \w+ has none"):
+            make(plain(case))
+        pytest.skip("refused")
+    if term == "loss_lcp" and not has_likelihood(case):
+        with pytest.raises(TypeError, match="needs a stochastic policy"):
+            make(plain(case))
+        pytest.skip("refused")
+    return make, term, coefficient
+
+
+class TestAroundEveryLoss:
+    """What holds of L2C2 in test_loss_contract.py holds of them."""
+
+    def test_one_term_is_added_and_the_rest_is_the_plain_losss(self, case, wrapped):
+        """Bit for bit; the term is finite, positive and among out_keys and policy_terms."""
+        make, term, _ = wrapped
+        loss = make(plain(case))
+        expected, found = run(plain(case), batch_of(case)), run(loss, batch_of(case))
+        assert set(found.keys()) - set(expected.keys()) == {term}
+        assert all(bool((value == found[key]).all()) for key, value in expected.items())
+        assert found[term].isfinite() and found[term] > 0
+        assert term in loss.out_keys and term in loss.policy_terms
+
+    def test_the_policy_alone_is_trained(self, case, wrapped):
+        """With finite gradients; and not at all at a gain of 0."""
+        make, term, coefficient = wrapped
+        loss = make(plain(case))
+        names, parameters = zip(*loss.named_parameters(), strict=True)
+        gradients = torch.autograd.grad(
+            run(loss, batch_of(case))[term], parameters, allow_unused=True
+        )
+        touched = {
+            name.split("_network_params")[0]
+            for name, gradient in zip(names, gradients, strict=True)
+            if gradient is not None and gradient.abs().sum() > 0
+        }
+        assert touched == {"actor"}
+        assert all(g is None or g.isfinite().all() for g in gradients)
+        setattr(loss, coefficient, 0.0)
+        assert run(loss, batch_of(case))[term] == 0
+
+    def test_it_alone_gives_what_forward_gives(self, case, wrapped):
+        """For loops that call actor_loss themselves, also in batches [B, T]."""
+        make, term, _ = wrapped
+        loss, batch = make(plain(case)), batch_of(case)
+        torch.manual_seed(3)
+        alone = loss.policy_regularizer(batch)[term]
+        rows = batch.reshape(2, 3) if case.trajectories else batch
+        torch.manual_seed(3)
+        torch.testing.assert_close(loss.policy_regularizer(rows)[term], alone)
+
+    def test_reductions_and_masks_are_the_losss(self, case, wrapped):
+        """Mean and sum are those of the unreduced values; masked ones do not count."""
+        if "none" not in case.reductions:
+            pytest.skip("the plain loss has no choice of reductions")
+        make, term, _ = wrapped
+        found, batch = {}, batch_of(case)
+        for reduction in case.reductions:
+            torch.manual_seed(3)
+            loss = make(plain(case, reduction=reduction))
+            found[reduction] = loss.policy_regularizer(batch)[term]
+        assert found["none"].shape[:1] == batch.shape
+        torch.testing.assert_close(found["mean"], found["none"].mean())
+        torch.testing.assert_close(found["sum"], found["none"].sum())
+        mask = torch.tensor([True, False, True, True, False, False])
+        batch["collector"] = TensorDict({"mask": mask.unsqueeze(-1)}, batch_size=[6])
+        torch.manual_seed(3)
+        masked = make(plain(case)).policy_regularizer(batch)[term]
+        torch.testing.assert_close(masked, found["none"][mask].mean())
+
+    def test_checkpoints_copies_and_pickles(self, case, wrapped):
+        """state_dict has the plain loss's keys; copies give the same."""
+        make, term, _ = wrapped
+        base, loss = plain(case), make(plain(case))
+        assert list(loss.state_dict()) == list(base.state_dict())
+        twins = [copy.deepcopy(loss)]
+        try:
+            pickle.dumps(base)
+        except (AttributeError, pickle.PicklingError):
+            pass
+        else:
+            twins.append(pickle.loads(pickle.dumps(loss)))
+        for twin in twins:
+            assert type(twin) is type(loss)
+            assert run(twin, batch_of(case))[term] == run(loss, batch_of(case))[term]
+
+
+def test_rivals_combine_with_l2c2(rival):
+    """Each adds its term; a second of the same kind is refused."""
+    make, term, _ = rival
+    loss = make(L2C2Loss(PPOLoss(gaussian_actor(), None), beta=0))
+    assert {"loss_l2c2_actor", term} <= set(loss.out_keys)
+    with pytest.raises(TypeError, match="already wrapped"):
+        make(loss)
+
+
+def test_cats_compiles_into_one_graph():
+    """With the eager numbers, whatever its gain."""
+    torch._dynamo.reset()
+    loss, batch = CATSLoss(DDPGLoss(deterministic_actor(), qvalue())), transitions(4)
+    compiled = torch.compile(loss.policy_regularizer, fullgraph=True, backend="eager")
+    for gain in (0.1, 0.2):
+        loss.cats_lambda = gain
+        expected = loss.policy_regularizer(batch)["loss_cats"]
+        torch.testing.assert_close(compiled(batch)["loss_cats"], expected)
+
+
+@pytest.mark.parametrize(
+    ("regularizer", "compiled"),
+    [(CATSConfig(), True), (SR2LConfig(steps=2), False), (LCPConfig(), False)],
+    ids=lambda value: getattr(value, "name", ""),
+)
+def test_they_run(regularizer, compiled):
+    """With their terms in the log; those that do not compile are not compiled."""
+    config = ExperimentConfig(
+        task=TaskConfig("pendulum", "Pendulum-v1", episodes=2, max_steps=40),
+        algorithm=PPORPEConfig(hidden=(8,)),
+        regularizer=regularizer,
+        replay=UniformReplayConfig(batch_size=8),
+        optimizer=AdamConfig(),
+        compile=not compiled,  # What cannot compile is asked to; the other's graph is tested above.
+    )
+    run = Experiment(config)
+    assert run.agent.compilable == compiled
+    first, second = run.train()
+    assert math.isfinite(second[f"loss_{regularizer.name}"])
+    if regularizer.name == "cats":
+        assert (first["gain"], second["gain"]) == (0.0, 0.5)
+        assert run.agent.loss.cats_lambda.item() == pytest.approx(0.1)
+
+
+def test_on_policy_actions_are_scored():
+    """LCP reads the action that the loss reads, under its name."""
+    base = PPOLoss(gaussian_actor(), None)
+    batch = on_policy(4)
+    expected = LCPLoss(base).policy_regularizer(batch)["loss_lcp"]
+    base.set_keys(action="taken")
+    found = LCPLoss(base).policy_regularizer(batch.rename_key_("action", "taken"))["loss_lcp"]
+    torch.testing.assert_close(found, expected)

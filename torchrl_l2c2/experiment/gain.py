@@ -1,0 +1,125 @@
+"""How strong the regularizer is during a run, where its gain sets itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from torchrl_l2c2.experiment.config import ExperimentConfig
+from torchrl_l2c2.experiment.influence import gradient_shares
+from torchrl_l2c2.experiment.learner import Learner
+from torchrl_l2c2.experiment.regularizers import GainConfig
+from torchrl_l2c2.experiment.settings import SettingError
+from torchrl_l2c2.experiment.update import ReplayUpdate
+from torchrl_l2c2.gains import ConstantGain, GradientGain, RampGain, TargetGain
+
+
+class GainControl:
+    """Sets the regularizer's gains between the updates of two episodes, and reports them.
+
+    Args:
+        config (ExperimentConfig): whose regularizer says how, and whose task says how long training
+            is; a constant gain is none of this class's business.
+        learner (Learner): whose loss has the gains.
+
+    Attributes:
+        gains: of the networks that have one of their own, ``"policy"`` and ``"value"``, or of all.
+    """
+
+    def __init__(self, config: ExperimentConfig, learner: Learner) -> None:
+        regularizer = config.regularizer
+        self._learner, self._updates, self._budget = learner, 0, config.task.budget
+        self._config = regularizer if isinstance(regularizer, GainConfig) else None
+        self.gains: dict[str, ConstantGain] = {}
+        if self._config is not None and self._config.gain != "constant":
+            names = self._terms() if self._config.gain == "gradient" else ["all"]
+            self.gains = {name: _make_gain(self._config) for name in names}
+            # A gain that is faint for now is no mistake.
+            learner.tells_faint_regularizer = False
+            self._apply()
+
+    def after(self, row: Mapping[str, float]) -> dict[str, float]:
+        """Sets the gains for what follows an episode; gives what they were and were set from.
+
+        Without an update since the last time nothing is set.
+
+        Args:
+            row (Mapping): what is logged of the episode.
+
+        Returns:
+            dict: the gains that were applied, what was measured, and the target; empty where the
+            gain is constant.
+        """
+        logged = {}
+        measured = self._measure(row)
+        for name, gain in self.gains.items():
+            suffix = "" if name == "all" else f"_{name}"
+            logged[f"gain{suffix}"] = gain.value
+            logged[f"gain_measured{suffix}"] = measured[name]
+        if self.gains and self._config is not None and self._config.gain_target is not None:
+            logged["gain_target"] = self._config.gain_target
+        if self.gains and self._learner.updates > self._updates:
+            self._updates = self._learner.updates
+            for name, gain in self.gains.items():
+                gain.step(measured[name])
+            self._apply()
+        return logged
+
+    def state_dict(self) -> dict[str, Any]:
+        """The gains, and the updates that they have followed."""
+        gains = {name: gain.state_dict() for name, gain in self.gains.items()}
+        return {"gains": gains, "updates": self._updates}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restores what :meth:`state_dict` gave; the loss has the gains then, too."""
+        for name, gain in self.gains.items():
+            gain.load_state_dict(state["gains"][name])
+        self._updates = state["updates"]
+        self._apply()
+
+    def _apply(self) -> None:
+        if self._config is None or not self.gains:
+            return
+        for_all = self.gains.get("all")
+        values = {
+            name: (for_all or self.gains.get(name) or ConstantGain()).value
+            for name in ("policy", "value")
+        }
+        self._config.set_gains(self._learner.agent.loss, **values)
+
+    def _terms(self) -> dict[str, list[str]]:
+        """The regularizer's terms, by what they train."""
+        loss = self._learner.agent.loss
+        added, of_policy = loss.added_terms, loss.policy_terms
+        terms = {"policy": sorted(added & of_policy), "value": sorted(added - of_policy)}
+        return {name: keys for name, keys in terms.items() if keys}
+
+    def _measure(self, row: Mapping[str, float]) -> dict[str, float]:
+        if self._config is None or not self.gains:
+            return {}
+        if self._config.gain == "ramp":
+            spent = self._budget.spent(int(row["episode"]), int(row["frames"]))
+            return {"all": spent / self._budget.total}
+        if self._config.gain == "target":
+            return {"all": self._column(row, self._config.gain_of)}
+        update = self._learner.update
+        if not self._learner.updates or not isinstance(update, ReplayUpdate):
+            return dict.fromkeys(self.gains, float("nan"))
+        shares = gradient_shares(self._learner.agent.loss, update.example())
+        return {name: max(shares[key] for key in keys) for name, keys in self._terms().items()}
+
+    @staticmethod
+    def _column(row: Mapping[str, float], name: str) -> float:
+        if name not in row:
+            raise SettingError(
+                "regularizer.gain_of", f"must be one of {sorted(row)}, got {name!r}."
+            )
+        return row[name]
+
+
+def _make_gain(config: GainConfig) -> ConstantGain:
+    if config.gain == "ramp":
+        return RampGain(length=config.gain_length)
+    assert config.gain_target is not None
+    kind = GradientGain if config.gain == "gradient" else TargetGain
+    return kind(config.gain_target, config.gain_rate, config.gain_limit)

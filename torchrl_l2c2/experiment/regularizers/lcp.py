@@ -1,0 +1,31 @@
+"""LCP, a rival: a penalty on the gradient of the log-likelihood."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+from pydantic import Field
+
+from torchrl_l2c2.experiment.regularizers.base import GainConfig
+from torchrl_l2c2.experiment.settings import settings
+
+if TYPE_CHECKING:
+    from torchrl.objectives import LossModule
+
+
+@settings
+class LCPConfig(GainConfig):
+    """A rival, :class:`~torchrl_l2c2.LCPLoss`; its update is not compiled."""
+
+    compilable: ClassVar[bool] = False
+
+    name: str = "lcp"
+    coeff: float = Field(default=0.002, ge=0, description="gain of the squared gradient")
+
+    def wrap(self, loss: LossModule) -> LossModule:
+        from torchrl_l2c2.objectives import LCPLoss
+
+        return LCPLoss(loss, self.coeff)
+
+    def set_gains(self, loss: LossModule, policy: float, value: float) -> None:
+        loss.lcp_coeff = policy * self.coeff

@@ -1,0 +1,41 @@
+"""SR2L, a rival: the worst state in a small box."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+from pydantic import Field
+
+from torchrl_l2c2.experiment.regularizers.base import GainConfig
+from torchrl_l2c2.experiment.settings import settings
+
+if TYPE_CHECKING:
+    from torchrl.objectives import LossModule
+
+
+@settings
+class SR2LConfig(GainConfig):
+    """A rival, :class:`~torchrl_l2c2.SR2LLoss`; its update is not compiled."""
+
+    compilable: ClassVar[bool] = False
+
+    name: str = "sr2l"
+    epsilon: float = Field(
+        default=0.05, gt=0, description="half the width of the box, in the observation's units"
+    )
+    coeff: float = Field(default=0.1, ge=0, description="gain of the largest distance in it")
+    steps: int = Field(default=10, ge=1, description="of the ascent to it")
+    policy_distance: Literal["jeffreys", "hellinger", "mean", "kl"] = Field(
+        default="jeffreys",
+        description="how policies are compared; deterministic ones always by their actions",
+    )
+
+    def wrap(self, loss: LossModule) -> LossModule:
+        from torchrl_l2c2.objectives import SR2LLoss
+
+        return SR2LLoss(
+            loss, self.epsilon, self.coeff, steps=self.steps, policy_distance=self.policy_distance
+        )
+
+    def set_gains(self, loss: LossModule, policy: float, value: float) -> None:
+        loss.sr2l_coeff = policy * self.coeff

@@ -1,0 +1,182 @@
+r"""Gains that set themselves: how strong a regularizer is, from what comes of it.
+
+A gain has a ``value`` that multiplies a term, a ``step`` that is told something between updates and
+returns the next value, and a ``state_dict``. A regularized loss's coefficients are assigned to,
+also between calls of a compiled loss::
+
+    loss.l2c2_coeff = gain.step(measured)
+"""
+
+from __future__ import annotations
+
+import math
+
+from torchrl_l2c2._checks import check_real
+
+
+class ConstantGain:
+    """A gain that stays as it is.
+
+    Args:
+        value (float): at least 0. Larger values regularize more. Defaults to ``1.0``.
+
+    Raises:
+        TypeError: if it is not a real number.
+        ValueError: if it is out of its range.
+
+    Examples:
+        >>> ConstantGain(0.5).step()
+        0.5
+    """
+
+    def __init__(self, value: float = 1.0) -> None:
+        check_real("value", value, at_least=0)
+        self.value = float(value)
+
+    def step(self, measured: float = math.nan) -> float:
+        """The value, whatever was measured."""
+        return self.value
+
+    def state_dict(self) -> dict[str, float]:
+        """What the next steps depend on."""
+        return {"value": self.value}
+
+    def load_state_dict(self, state: dict[str, float]) -> None:
+        """Restores what :meth:`state_dict` gave."""
+        self.value = state["value"]
+
+
+class RampGain(ConstantGain):
+    r"""A gain that rises linearly from 0 over a part of training, and stays there.
+
+    .. math::
+        \lambda = \lambda_{\mathrm{end}} \min(1, k / K)
+
+    for the share :math:`k` of training that is over: the schedule of CATS (arXiv 2610.07910), with
+    :math:`K = 1`. A policy is found before it is smoothed.
+
+    Args:
+        end (float): the last value, at least 0. Defaults to ``1.0``.
+        length (float): :math:`K`, the share of training over which it rises, in (0, 1]. Smaller
+            values smooth earlier. Defaults to ``1.0``.
+
+    Raises:
+        TypeError: if a value is not a real number.
+        ValueError: if it is out of its range.
+
+    Examples:
+        >>> ramp = RampGain(2.0, length=0.5)
+        >>> ramp.value, ramp.step(0.25), ramp.step(0.9)
+        (0.0, 1.0, 2.0)
+    """
+
+    def __init__(self, end: float = 1.0, length: float = 1.0) -> None:
+        check_real("end", end, at_least=0)
+        check_real("length", length, above=0, at_most=1)
+        super().__init__(0.0)
+        self.end, self.length = float(end), float(length)
+
+    def step(self, measured: float = math.nan) -> float:
+        """The value where a share of training, ``measured``, is over, in [0, 1]."""
+        check_real("measured", measured, at_least=0)
+        self.value = self.end * min(1.0, measured / self.length)
+        return self.value
+
+
+class GradientGain(ConstantGain):
+    r"""A gain that keeps a term's gradient at a share of that of the loss's own terms.
+
+    .. math::
+        \lambda \leftarrow \lambda\, \left(\frac{c}{\rho}\right)^{\eta}, \qquad
+        \rho = \frac{\lVert \nabla_\theta\, \lambda L_r \rVert}{\lVert \nabla_\theta L \rVert},
+
+    a moving average, on the logarithm, of the gains at which the share would have been :math:`c`;
+    kept within bounds. Norms of gradients are compared, as the value of an actor's loss has no
+    natural zero. A gain for each network: :math:`\theta` is what the term trains.
+
+    Args:
+        share (float): :math:`c`, greater than 0. Larger values regularize more.
+        rate (float): :math:`\eta`, in (0, 1]. Smaller values average over more steps. Defaults to
+            ``0.1``.
+        limit (float): the gain stays between ``value / limit`` and ``value * limit``, greater
+            than 1. Defaults to ``1000``.
+        value (float): the first gain, greater than 0. Defaults to ``1.0``.
+
+    Raises:
+        TypeError: if a value is not a real number.
+        ValueError: if it is out of its range.
+
+    Examples:
+        >>> gain = GradientGain(0.1, rate=0.5)
+        >>> gain.step(0.001), gain.step(0.1)  # a hundredth of it: the root of that; then all of it
+        (10.0, 10.0)
+    """
+
+    def __init__(
+        self, share: float, rate: float = 0.1, limit: float = 1000.0, value: float = 1.0
+    ) -> None:
+        check_real("share", share, above=0)
+        check_real("rate", rate, above=0, at_most=1)
+        self.share, self.rate = float(share), float(rate)
+        self._low, self._high = _bounds(value, limit)
+        super().__init__(value)
+
+    def step(self, measured: float = math.nan) -> float:
+        """The next value after a share :math:`\\rho`; 0 and what is not finite change nothing."""
+        if 0.0 < measured < math.inf:
+            value = self.value * (self.share / measured) ** self.rate
+            self.value = min(max(value, self._low), self._high)
+        return self.value
+
+
+class TargetGain(ConstantGain):
+    r"""A gain that rises while a measure is above its target, and falls while it is below.
+
+    .. math::
+        \ln\lambda \leftarrow \ln\lambda
+            + \eta\, \mathrm{clip}\left(\frac{m - x}{x}, -1, 1\right)
+
+    is dual ascent on the constraint :math:`m \le x`, on the gain's logarithm, within bounds: the
+    form in which SAC sets its temperature. :math:`m` is what the term is there to lower, such as
+    the variation of the actions in an episode.
+
+    Args:
+        target (float): :math:`x`, the largest value wanted, greater than 0. Smaller values
+            regularize more.
+        rate (float): :math:`\eta`, in (0, 1]: the largest change of the logarithm in a step.
+            Larger values reach the target sooner, and overshoot. Defaults to ``0.1``.
+        limit (float): as for :class:`GradientGain`. At the upper bound the target is out of reach.
+        value (float): likewise.
+
+    Raises:
+        TypeError: if a value is not a real number.
+        ValueError: if it is out of its range.
+
+    Examples:
+        >>> gain = TargetGain(0.5)
+        >>> round(gain.step(0.75), 4), round(gain.step(0.25), 4)
+        (1.0513, 1.0)
+    """
+
+    def __init__(
+        self, target: float, rate: float = 0.1, limit: float = 1000.0, value: float = 1.0
+    ) -> None:
+        check_real("target", target, above=0)
+        check_real("rate", rate, above=0, at_most=1)
+        self.target, self.rate = float(target), float(rate)
+        self._low, self._high = _bounds(value, limit)
+        super().__init__(value)
+
+    def step(self, measured: float = math.nan) -> float:
+        """The next value after a measure :math:`m`; one that is not finite changes nothing."""
+        if math.isfinite(measured):
+            excess = min(max(measured / self.target - 1.0, -1.0), 1.0)
+            value = self.value * math.exp(self.rate * excess)
+            self.value = min(max(value, self._low), self._high)
+        return self.value
+
+
+def _bounds(value: float, limit: float) -> tuple[float, float]:
+    check_real("value", value, above=0)
+    check_real("limit", limit, above=1)
+    return value / limit, value * limit

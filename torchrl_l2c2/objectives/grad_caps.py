@@ -1,0 +1,155 @@
+"""Grad-CAPS: policies whose mean does not zigzag over three successive states."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.objectives import LossModule
+
+from torchrl_l2c2._checks import check_choice, check_real
+from torchrl_l2c2.objectives.regularized import RegularizedLoss
+from torchrl_l2c2.objectives.transitions import finite_successor
+from torchrl_l2c2.policy_distances import policy_mean
+
+
+class GradCAPSLoss(RegularizedLoss):
+    r"""A loss with the second-order temporal term of Grad-CAPS (arXiv 2407.04315).
+
+    Adds to any TorchRL loss with a policy, as ``loss_grad_caps``,
+
+    .. math::
+        \lambda\, \mathbb E\left[\left\lVert \frac{\mu(s_{t+1}) - 2 \mu(s_t) + \mu(s_{t-1})}
+            {\tanh\lvert\mu(s_{t+1}) - \mu(s_{t-1})\rvert + \epsilon} \right\rVert_2^2\right],
+
+    the change of the action's change, by coordinates relative to what the action moved over both
+    steps: a steady motion is free, a zigzag is not. [inferred] The absolute value, which keeps the
+    denominator positive, and that it has a gradient as well.
+
+    Batches need the observation before each state, which
+    :class:`~torchrl.envs.transforms.CatFrames` writes::
+
+        CatFrames(N=2, dim=-1, in_keys=["observation"], out_keys=["frames"])
+
+    appended to the environment: the first half of ``frames`` is that observation, in the first step
+    of an episode the state itself. Runs of this package's experiment do not collect it.
+
+    Args:
+        base_loss (LossModule): the loss; see :class:`RegularizedLoss` for how it is wrapped. Its
+            policy reads one observation, a vector.
+        lambda_temporal (float): :math:`\lambda`, at least 0. Larger values straighten the actions.
+            Scheduled as ``grad_caps_lambda``. Defaults to ``0.01``.
+        epsilon (float): :math:`\epsilon`, greater than 0. Smaller values punish zigzags around one
+            place more. Defaults to ``0.1``.
+
+    Keyword Args:
+        frames_key (NestedKey): the entry that ``CatFrames`` writes. Defaults to ``"frames"``.
+        mean (str): ``"loc"`` compares means before the squashing, ``"action"`` deterministic
+            actions. Defaults to ``"loc"``.
+
+    Raises:
+        TypeError: the loss has no policy or cannot be regularized, or an argument has the wrong
+            type.
+        ValueError: an argument is out of its range; in use, the policy reads several observations,
+            or the frames are not two of them.
+        KeyError: in use, if the batch has no frames.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.modules import Actor, ValueOperator
+        >>> from torchrl.objectives import DDPGLoss
+        >>> from torchrl_l2c2 import GradCAPSLoss
+        >>> value = ValueOperator(torch.nn.Bilinear(3, 1, 1), in_keys=["observation", "action"])
+        >>> loss = GradCAPSLoss(DDPGLoss(Actor(torch.nn.Linear(3, 1)), value))
+        >>> before, state, later = torch.zeros(1, 3), torch.ones(1, 3), 2 * torch.ones(1, 3)
+        >>> batch = TensorDict({"observation": state, "next": {"observation": later}}, [1])
+        >>> batch["frames"] = torch.cat((before, state), -1)  # a straight line
+        >>> loss.policy_regularizer(batch)["loss_grad_caps"].item() < 1e-6
+        True
+    """
+
+    def __init__(
+        self,
+        base_loss: LossModule,
+        lambda_temporal: float = 0.01,
+        epsilon: float = 0.1,
+        *,
+        frames_key: NestedKey = "frames",
+        mean: Literal["loc", "action"] = "loc",
+    ) -> None:
+        check_choice("mean", mean, ("loc", "action"))
+        check_real("epsilon", epsilon, above=0)
+        if not self.policy_networks():
+            raise TypeError(f"GradCAPSLoss needs a policy: {type(base_loss).__name__} has none.")
+        self.grad_caps_epsilon, self.grad_caps_mean = float(epsilon), mean
+        self.grad_caps_frames_key = frames_key
+        self.register_coefficient("grad_caps_lambda", lambda_temporal)
+        self.declare_networks(self.policy_networks())
+        self.declare_terms(policy=["loss_grad_caps"])
+
+    def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
+        terms = super().policy_regularizer(tensordict)
+        squashed = self.grad_caps_mean == "action"
+        policies = self.policies_at(tensordict, self._states(tensordict))
+        here, there = (policy_mean(policy, squashed=squashed) for policy in policies)
+        term = grad_caps_term(there[0], here[0], there[1], self.grad_caps_epsilon)
+        term = self.reduce_term(term, tensordict)
+        return terms.set("loss_grad_caps", self.grad_caps_lambda * term)
+
+    def _states(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The state before and the next one, ``[2, *B]``."""
+        transitions = self.transitions(tensordict, self.policy_networks())
+        if len(transitions) != 1:
+            raise ValueError(
+                f"GradCAPSLoss needs a policy of one observation, got {list(transitions)}: join "
+                "them with CatTensors."
+            )
+        ((key, (state, successor)),) = transitions.items()
+        frames = tensordict.get(self.grad_caps_frames_key, None)
+        if frames is None:
+            raise KeyError(
+                f"GradCAPSLoss needs the observation before each state, and the batch has no "
+                f"{self.grad_caps_frames_key!r}: append CatFrames(N=2, dim=-1, in_keys=[{key!r}], "
+                f"out_keys=[{self.grad_caps_frames_key!r}]) to the environment."
+            )
+        if frames.shape != (*state.shape[:-1], 2 * state.shape[-1]):
+            raise ValueError(
+                f"{self.grad_caps_frames_key!r} must be two frames of {key!r}, of shape "
+                f"{(*state.shape[:-1], 2 * state.shape[-1])}, got {tuple(frames.shape)}: make them "
+                "with CatFrames(N=2, dim=-1)."
+            )
+        before = frames[..., : state.shape[-1]].detach()
+        states = torch.stack((before, finite_successor(state, successor)))
+        return TensorDict({key: states}, batch_size=[2, *tensordict.batch_size])
+
+
+def grad_caps_term(
+    before: Tensor,  # shape: [*B, A]
+    mean: Tensor,  # shape: [*B, A]
+    later: Tensor,  # shape: [*B, A]
+    epsilon: float,
+) -> Tensor:  # shape: [*B]
+    r"""The term of Grad-CAPS, before its gain and its reduction.
+
+    .. math::
+        \left\lVert \frac{\mu_+ - 2 \mu + \mu_-}{\tanh\lvert\mu_+ - \mu_-\rvert + \epsilon}
+        \right\rVert_2^2
+
+    Args:
+        before: the policy's means :math:`\mu_-` at the states before.
+        mean: those at the states.
+        later: those at the next states, :math:`\mu_+`.
+        epsilon: :math:`\epsilon`, greater than 0.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_l2c2.objectives.grad_caps import grad_caps_term
+        >>> zigzag = torch.zeros(1, 1), torch.ones(1, 1), torch.zeros(1, 1)
+        >>> grad_caps_term(*zigzag, epsilon=0.5)  # (2 / 0.5)^2
+        tensor([16.])
+    """
+    moved = (later - before).abs().tanh() + epsilon
+    return ((later - 2.0 * mean + before) / moved).square().sum(-1)

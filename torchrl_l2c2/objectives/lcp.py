@@ -1,0 +1,109 @@
+"""LCP: policies whose log-likelihood has a small gradient in the state."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import CompositeDistribution
+from torch import Tensor
+from torch.distributions import Distribution
+from torchrl.objectives import LossModule
+
+from torchrl_l2c2.distances import log_prob_of
+from torchrl_l2c2.objectives.regularized import RegularizedLoss
+
+
+class LCPLoss(RegularizedLoss):
+    r"""A loss with the gradient penalty of Lipschitz-constrained policies (Chen et al., 2024).
+
+    Adds to any TorchRL loss with a stochastic policy, as ``loss_lcp``,
+
+    .. math::
+        \lambda\, \mathbb E\left[\lVert \nabla_s \ln\pi(a|s) \rVert_2^2\right]
+
+    at the states and actions of the batch ("Learning Smooth Humanoid Locomotion through
+    Lipschitz-Constrained Policies", arXiv 2410.11825). Nothing is drawn, and no next state is
+    needed. Gradients flow into the policy alone.
+
+    .. note:: It does not compile, as it differentiates twice. A narrow policy has a steep
+        likelihood: as the policy's scale falls, the same slope of its mean costs more.
+
+    Args:
+        base_loss (LossModule): the loss; see :class:`RegularizedLoss` for how it is wrapped.
+        coeff (float): :math:`\lambda`, at least 0. Larger values flatten the policy. Scheduled as
+            ``lcp_coeff``. Defaults to ``0.002``.
+
+    Raises:
+        TypeError: the loss has no stochastic policy or cannot be regularized, or an argument has
+            the wrong type.
+        ValueError: an argument is out of its range.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.objectives import PPOLoss
+        >>> from torchrl_l2c2 import LCPLoss, make_actor
+        >>> loss = LCPLoss(PPOLoss(make_actor(3, 1, hidden=(8,)), None))
+        >>> batch = TensorDict({"observation": torch.randn(32, 3)}, batch_size=[32])
+        >>> batch["next", "observation"] = batch["observation"]
+        >>> batch["action"] = torch.zeros(32, 1)
+        >>> bool(loss.policy_regularizer(batch)["loss_lcp"] > 0)
+        True
+    """
+
+    def __init__(self, base_loss: LossModule, coeff: float = 0.002) -> None:
+        if not self.policy_networks():
+            raise TypeError(f"LCPLoss needs a policy: {type(base_loss).__name__} has none.")
+        self.register_coefficient("lcp_coeff", coeff)
+        self.declare_networks(self.policy_networks())
+        if not self.has_stochastic_policy():
+            raise TypeError(
+                f"LCPLoss needs a stochastic policy: that of {type(base_loss).__name__} has no "
+                "likelihood. CAPSLoss, CATSLoss, SR2LLoss and L2C2Loss take deterministic ones."
+            )
+        self.declare_terms(policy=["loss_lcp"])
+
+    def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
+        terms = super().policy_regularizer(tensordict)
+        transitions = self.transitions(tensordict, self.policy_networks())
+        with torch.enable_grad():
+            states = {k: s.unsqueeze(0).requires_grad_() for k, (s, _) in transitions.items()}
+            others = TensorDict(states, batch_size=[1, *tensordict.batch_size])
+            _, policy = self.policies_at(tensordict, others)
+            assert isinstance(policy, Distribution)
+            actions = tensordict.unsqueeze(0)
+            if not isinstance(policy, CompositeDistribution):
+                actions = actions.get(self.tensor_keys.action)
+            log_prob = log_prob_of(policy, actions)
+            term = lcp_term(log_prob, list(states.values()), tensordict.batch_dims + 1)
+        term = self.reduce_term(term.squeeze(0), tensordict)
+        return terms.set("loss_lcp", self.lcp_coeff * term)
+
+
+def lcp_term(
+    log_prob: Tensor,  # shape: [*B, ...]
+    states: list[Tensor],  # shape: [*B, *F] each
+    batch_dims: int,
+) -> Tensor:  # shape: [*B]
+    r"""The gradient penalty of LCP, before its gain and its reduction.
+
+    .. math::
+        \lVert \nabla_s \ln\pi(a|s) \rVert_2^2
+
+    over all parts of the state. Its gradient is that of a second derivative.
+
+    Args:
+        log_prob: :math:`\ln\pi(a|s)`, made of the states; it may have the dimension of agents.
+        states: the parts of the state, which require a gradient.
+        batch_dims: how many dimensions ``[*B]`` are.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_l2c2.objectives.lcp import lcp_term
+        >>> state = torch.tensor([[3.0, 4.0]], requires_grad=True)
+        >>> lcp_term(state.square().sum(-1), [state], 1)
+        tensor([100.], grad_fn=<SumBackward1>)
+    """
+    gradients = torch.autograd.grad(log_prob.sum(), states, create_graph=True)
+    squares = [gradient.square().flatten(batch_dims).sum(-1) for gradient in gradients]
+    return torch.stack(squares).sum(0)

@@ -1,0 +1,157 @@
+"""The neighbors of a batch, or of a random share of it, as a loss compares with them."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import fields
+from math import isclose
+from typing import Literal, NamedTuple
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchrl_l2c2.neighborhood import Neighborhood
+
+
+class Neighbors(NamedTuple):
+    """The neighbors of the states in a batch ``[*B]``, or of ``M`` of them.
+
+    Attributes:
+        states: the neighbors, ``[K, *B]``, or ``[K, M]``.
+        distance: how far away they count, of the same shape.
+        rows: whose neighbors they are, ``[M]``, in the batch written as one row; ``None``: all.
+    """
+
+    states: TensorDictBase
+    distance: Tensor
+    rows: Tensor | None = None
+
+    def to_batch(self, value: Tensor, shape: torch.Size) -> Tensor:
+        """One number for each transition of the batch, of those for the rows.
+
+        Drawn rows stand for the others: they count ``B / M`` times, the others 0. That leaves the
+        expectation of every sum and mean over the batch, with weights and masks or without, as it
+        is.
+
+        Args:
+            value: ``[M, ...]``.
+            shape: of the batch, ``[*B]``.
+
+        Returns:
+            ``[*B, ...]``.
+        """
+        if self.rows is None:
+            return value
+        count, rest = shape.numel(), value.shape[1:]
+        spread = value.new_zeros(count, *rest)
+        spread = spread.index_copy(0, self.rows, value * (count / len(self.rows)))
+        return spread.reshape(*shape, *rest)
+
+
+def draw_rows(
+    tensordict: TensorDictBase, fraction: float, device: torch.device | None = None
+) -> Tensor | None:
+    """A random share of a batch, with torch's global generator: no row twice, each as likely.
+
+    Args:
+        tensordict (TensorDictBase): the batch, ``[*B]``.
+        fraction (float): its share, in (0, 1]; rounded to whole rows, at least one.
+        device (torch.device, optional): of the batch's tensors.
+
+    Returns:
+        Tensor: ``[M]``, in the batch written as one row; ``None`` stands for all of them.
+    """
+    count = tensordict.numel()
+    drawn = max(1, round(fraction * count))
+    if drawn >= count:
+        return None
+    return torch.randperm(count, device=device)[:drawn]
+
+
+def read_neighbors(
+    neighbor: TensorDictBase, key: NestedKey
+) -> tuple[TensorDictBase, Tensor, Tensor | None]:
+    """What :class:`~torchrl_l2c2.NeighborTransform` has written, with ``K`` in front.
+
+    Args:
+        neighbor (TensorDictBase): the entry, ``[*B]``, of states ``[*B, K, *F]``.
+        key (NestedKey): its name, for errors.
+
+    Returns:
+        tuple: the neighbors, ``[K, *B]``; their distances, ``[K, *B]``; and the numbers of the
+        neighborhood that they were drawn in, ``[n, *B]``, if the entry has them.
+
+    Raises:
+        KeyError: it has no distances.
+    """
+    entries = {
+        key: value.movedim(neighbor.batch_dims, 0)
+        for key, value in neighbor.items(include_nested=True, leaves_only=True)
+    }
+    if "distance" not in entries:
+        raise KeyError(
+            f"{key!r} holds {list(entries)}, but no 'distance': write it with NeighborTransform, "
+            "or name another neighbor_key."
+        )
+    distance, drawn = entries.pop("distance"), entries.pop("neighborhood", None)
+    return TensorDict(entries, batch_size=distance.shape), distance, drawn
+
+
+def l2c2_penalty(
+    difference: Tensor,  # shape: [K, *B, ...]
+    gain: Tensor,  # shape: [K, *B]
+    over_neighbors: Literal["mean", "max"] = "mean",
+) -> Tensor:  # shape: [*B, ...]
+    r"""The mean over ``K`` neighbors of the gain times the difference, before the reduction.
+
+    .. math::
+        \frac1K \sum_k \frac{\lambda}{d(s, \tilde s_k; s')}\, d_f(f(s), f(\tilde s_k))
+
+    of a policy or a value function :math:`f` (Kobayashi, L2C2, 2022).
+
+    Args:
+        difference: :math:`d_f`, at least 0; it may have more dimensions, those of agents.
+        gain: :math:`\lambda / d`, as :meth:`Neighborhood.gain <torchrl_l2c2.Neighborhood.gain>`
+            gives it.
+        over_neighbors: ``"max"`` takes the largest of the ``K`` in the place of their mean.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_l2c2.objectives.neighbors import l2c2_penalty
+        >>> l2c2_penalty(torch.tensor([[1.0, 2.0], [3.0, 4.0]]), torch.tensor([[1.0], [0.5]]))
+        tensor([1.2500, 2.0000])
+    """
+    gain = gain[(...,) + (None,) * (difference.ndim - gain.ndim)]
+    penalty = gain * difference
+    return penalty.mean(0) if over_neighbors == "mean" else penalty.amax(0)
+
+
+def warn_of_other_neighbors(
+    drawn: Sequence[float], num_drawn: int, neighborhood: Neighborhood, num_samples: int
+) -> None:
+    """Says where neighbors are drawn otherwise than a loss counts them.
+
+    Args:
+        drawn (Sequence of float): the numbers of the neighborhood that they are drawn in.
+        num_drawn (int): neighbors per state.
+        neighborhood (Neighborhood): that of the loss.
+        num_samples (int): likewise.
+
+    Warns:
+        UserWarning: the neighborhood or the number is not that of the loss.
+    """
+    own = neighborhood.numbers
+    # The batch has them in its own precision.
+    same = all(isclose(a, b, rel_tol=0.01) for a, b in zip(drawn, own, strict=True))
+    if same and num_drawn == num_samples:
+        return
+    names = (*(field.name for field in fields(neighborhood)), "num_samples")
+    pairs = zip(names, (*drawn, num_drawn), (*own, num_samples), strict=True)
+    each = ", ".join(f"{name} {a:.4g} and {b:.4g}" for name, a, b in pairs)
+    warnings.warn(
+        f"neighbors are drawn otherwise than L2C2Loss counts them: {each}. Give the same "
+        "neighborhood and num_samples to NeighborTransform and L2C2Loss.",
+        stacklevel=4,
+    )

@@ -1,0 +1,161 @@
+"""SR2L: policies that change little in the worst direction of a small box around the state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Literal
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor
+from torch.distributions import Distribution
+from torchrl.objectives import LossModule
+
+from torchrl_l2c2._checks import check_positive_int, check_real
+from torchrl_l2c2.objectives.regularized import RegularizedLoss
+from torchrl_l2c2.policy_distances import (
+    PolicyDistance,
+    choose_policy_distance,
+    compare_policies,
+    distance_name,
+    kl_divergence,
+)
+
+States = Mapping[NestedKey, Tensor]
+
+
+class SR2LLoss(RegularizedLoss):
+    r"""A loss with the smoothness-inducing adversarial term of SR2L (Shen et al., 2020).
+
+    Adds to any TorchRL loss with a policy, as ``loss_sr2l``,
+
+    .. math::
+        \lambda\, \mathbb E\left[\max_{\lVert \delta \rVert_\infty \le \epsilon}
+            D\big(\pi(\cdot|s), \pi(\cdot|s + \delta)\big)\right]
+
+    ("Deep Reinforcement Learning with Robust and Smooth Policy", arXiv 2003.09423). The maximum is
+    sought by projected gradient ascent on the signs, from a random point of the box, with steps of
+    :math:`2.5\,\epsilon` over their number [inferred]. Gradients flow into the policy alone,
+    through both states and not through the search.
+
+    .. note:: It does not compile: the search takes gradients of its own. It costs a forward and a
+        backward pass of the policy for each of its ``steps``.
+
+    Args:
+        base_loss (LossModule): the loss; see :class:`RegularizedLoss` for how it is wrapped.
+        epsilon (float): half the width of the box, in the observation's units, greater than 0.
+            Usual are 0.01 to 0.05 of normalized observations. Defaults to ``0.05``.
+        coeff (float): :math:`\lambda`, at least 0; usual are 0.03 to 0.3. Scheduled as
+            ``sr2l_coeff``. Defaults to ``0.1``.
+
+    Keyword Args:
+        steps (int): of the ascent, at least 1. More come nearer to the maximum. Defaults to ``10``.
+        policy_distance (str or callable): :math:`D`. ``"jeffreys"``, the mean of the KL divergences
+            either way, the paper's; or as for :class:`L2C2Loss`. Of deterministic
+            policies half the squared distance of the actions, the paper's but for the half.
+            Defaults to ``"jeffreys"``.
+
+    Raises:
+        TypeError: the loss has no policy or cannot be regularized, or an argument has the wrong
+            type.
+        ValueError: an argument is out of its range.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.modules import Actor, ValueOperator
+        >>> from torchrl.objectives import DDPGLoss
+        >>> from torchrl_l2c2 import SR2LLoss
+        >>> actor = Actor(torch.nn.Linear(3, 1, bias=False))
+        >>> _ = torch.nn.init.ones_(actor.module.weight)
+        >>> value = ValueOperator(torch.nn.Bilinear(3, 1, 1), in_keys=["observation", "action"])
+        >>> loss = SR2LLoss(DDPGLoss(actor, value), epsilon=0.1, coeff=1.0)
+        >>> batch = TensorDict({"observation": torch.randn(32, 3)}, batch_size=[32])
+        >>> batch["next", "observation"] = batch["observation"]
+        >>> loss.policy_regularizer(batch)["loss_sr2l"]  # (3 * 0.1)^2 / 2, in a corner
+        tensor(0.0450, grad_fn=<MulBackward0>)
+    """
+
+    def __init__(
+        self,
+        base_loss: LossModule,
+        epsilon: float = 0.05,
+        coeff: float = 0.1,
+        *,
+        steps: int = 10,
+        policy_distance: Literal["jeffreys", "hellinger", "mean", "kl"]
+        | PolicyDistance = "jeffreys",
+    ) -> None:
+        check_real("epsilon", epsilon, above=0)
+        check_positive_int("steps", steps)
+        if not self.policy_networks():
+            raise TypeError(f"SR2LLoss needs a policy: {type(base_loss).__name__} has none.")
+        self.sr2l_epsilon, self.sr2l_steps = float(epsilon), steps
+        self.register_coefficient("sr2l_coeff", coeff)
+        self.declare_networks(self.policy_networks())
+        if policy_distance == "jeffreys":
+            self._sr2l_distance: PolicyDistance = jeffreys_divergence
+        else:
+            self._sr2l_distance = choose_policy_distance(policy_distance)
+            distance_name(policy_distance, self.has_stochastic_policy())
+        self.declare_terms(policy=["loss_sr2l"])
+
+    def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
+        terms = super().policy_regularizer(tensordict)
+        transitions = self.transitions(tensordict, self.policy_networks())
+        states = {key: state for key, (state, _) in transitions.items()}
+
+        def distance(moved: States) -> Tensor:
+            batch = {key: state.unsqueeze(0) for key, state in moved.items()}
+            others = TensorDict(batch, batch_size=[1, *tensordict.batch_size])
+            policies = self.policies_at(tensordict, others)
+            return compare_policies(self._sr2l_distance, *policies).squeeze(0)
+
+        farthest = ascend(distance, states, self.sr2l_epsilon, self.sr2l_steps)
+        term = self.reduce_term(distance(farthest), tensordict)
+        return terms.set("loss_sr2l", self.sr2l_coeff * term)
+
+
+def jeffreys_divergence(p: Distribution, q: Distribution) -> Tensor:
+    r"""The mean of the KL divergences either way, :math:`\tfrac12 D(p \Vert q) + \tfrac12 D(q \Vert p)`.
+
+    Args:
+        p: one policy, batch shape ``[*B]``.
+        q: the other, of the same actions.
+
+    Returns:
+        The divergences, shape ``[*B]``, at least 0.
+
+    Examples:
+        >>> import torch
+        >>> from torch.distributions import Normal
+        >>> from torchrl_l2c2.objectives.sr2l import jeffreys_divergence
+        >>> jeffreys_divergence(Normal(torch.tensor([3.0]), 1.0), Normal(torch.zeros(1), 1.0))
+        tensor([4.5000])
+    """  # noqa: E501
+    return 0.5 * (kl_divergence(p, q) + kl_divergence(q, p))
+
+
+def ascend(
+    distance: Callable[[States], Tensor], states: States, epsilon: float, steps: int
+) -> States:
+    """States in a box around others at which a function is large.
+
+    Args:
+        distance: one number, ``[*B]``, for each of the states, differentiable in these.
+        states: by their keys, ``[*B, *F]``.
+        epsilon: half the width of the box.
+        steps: of the ascent.
+
+    Returns:
+        The states that were found, without a gradient.
+    """
+    moved = {k: s + epsilon * (2.0 * torch.rand_like(s) - 1.0) for k, s in states.items()}
+    for _ in range(steps):
+        with torch.enable_grad():
+            moved = {key: state.detach().requires_grad_() for key, state in moved.items()}
+            gradients = torch.autograd.grad(distance(moved).sum(), list(moved.values()))
+        for (key, state), gradient in zip(states.items(), gradients, strict=True):
+            found = moved[key].detach() + 2.5 * epsilon / steps * gradient.sign()
+            moved[key] = found.clamp(state - epsilon, state + epsilon)
+    return moved

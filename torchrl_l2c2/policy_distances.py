@@ -1,0 +1,260 @@
+"""Distances between policies other than Hellinger's: that of their means, and the KL divergence."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+
+import torch
+from tensordict.nn import CompositeDistribution
+from torch import Tensor
+from torch.distributions import (
+    Bernoulli,
+    Categorical,
+    Distribution,
+    OneHotCategorical,
+    TransformedDistribution,
+)
+from torch.distributions import kl_divergence as closed_kl_divergence
+from torchrl.modules import TanhNormal, TruncatedNormal
+from torchrl.modules.distributions import has_analytic_kl
+
+from torchrl_l2c2._checks import check_choice, check_positive_int
+from torchrl_l2c2.affinities import same_bounds, sum_to
+from torchrl_l2c2.distances import (
+    MONTE_CARLO_SAMPLES,
+    check_pair,
+    log_prob_of,
+    squared_error,
+    squared_hellinger,
+)
+
+PolicyDistance = Callable[[Distribution, Distribution], Tensor]
+"""A distance of two policies of batch shape ``[*B]``: a tensor of that shape, at least 0."""
+
+# What a distance is called where it is logged.
+_NAMES = {"hellinger": "hellinger", "mean": "mean_distance", "kl": "kl"}
+
+
+def choose_policy_distance(
+    chosen: str | PolicyDistance, hellinger_samples: int | None = None
+) -> PolicyDistance:
+    """The function that a name stands for, or one's own with the shape of its result checked.
+
+    Args:
+        chosen: ``"hellinger"``, ``"mean"``, ``"kl"`` or a function.
+        hellinger_samples: actions drawn from each policy for an estimate of the first; ``None``
+            for its closed form.
+
+    Raises:
+        TypeError: neither a string nor a function, or ``hellinger_samples`` is no integer.
+        ValueError: another name, or ``hellinger_samples`` is below 1 or for another distance.
+
+    Examples:
+        >>> import torch
+        >>> from torch.distributions import Normal
+        >>> distance = choose_policy_distance(lambda p, q: (p.mean - q.mean).abs())
+        >>> distance(Normal(torch.zeros(2), 1.0), Normal(torch.ones(2), 1.0))
+        tensor([1., 1.])
+    """
+    if hellinger_samples is not None:
+        check_positive_int("hellinger_samples", hellinger_samples)
+        if chosen != "hellinger":
+            raise ValueError(
+                "hellinger_samples is for policy_distance='hellinger' alone, got policy_distance="
+                f"{chosen!r}: leave hellinger_samples at None."
+            )
+    if not isinstance(chosen, str) and callable(chosen):
+        return functools.partial(_checked, chosen)
+    hint = "Or give a function of two distributions."
+    check_choice("policy_distance", chosen, tuple(_NAMES), hint=hint)
+    if chosen == "hellinger":
+        return functools.partial(squared_hellinger, num_samples=hellinger_samples)
+    return mean_distance if chosen == "mean" else kl_divergence
+
+
+def _checked(distance: PolicyDistance, p: Distribution, q: Distribution) -> Tensor:
+    found = distance(p, q)
+    if found.shape != p.batch_shape:
+        raise ValueError(
+            "policy_distance must return one number for each pair of policies, a tensor of shape "
+            f"{tuple(p.batch_shape)}, got {tuple(found.shape)}: sum over the action's dimensions, "
+            "and over nothing else."
+        )
+    return found
+
+
+def compare_policies(
+    distance: PolicyDistance, p: Distribution | Tensor, q: Distribution | Tensor
+) -> Tensor:
+    """A distance of two policies; of actions, half the squared one."""
+    if isinstance(p, Distribution) and isinstance(q, Distribution):
+        return distance(p, q)
+    assert isinstance(p, Tensor) and isinstance(q, Tensor)
+    return squared_error(p, q)
+
+
+def distance_name(chosen: str | PolicyDistance, stochastic: bool) -> str:
+    """How the distance of :func:`choose_policy_distance` is called where it is logged.
+
+    Args:
+        chosen: as there.
+        stochastic: whether the policies are distributions; otherwise their actions are compared.
+
+    Raises:
+        TypeError: deterministic policies, and a distance that has no counterpart for actions.
+    """
+    if stochastic:
+        return _NAMES[chosen] if isinstance(chosen, str) else "policy_distance"
+    if chosen not in ("hellinger", "mean"):
+        raise TypeError(
+            "the loss has a deterministic policy, which is no distribution to compare by "
+            f"policy_distance={chosen!r}: leave it at its default, which then is half the squared "
+            "distance of the actions."
+        )
+    return "action_distance"
+
+
+def policy_mean(policy: Distribution | Tensor, *, squashed: bool = False) -> Tensor:
+    r"""The mean action of a policy, before it is squashed into the action's bounds or after.
+
+    Args:
+        policy: a distribution of batch shape ``[*B]``. Of discrete ones the probabilities are the
+            mean, that of an action written as one-hot vector; the heads of a composite one are put
+            behind one another. Actions ``[*B, A]`` are their own mean.
+        squashed: ``False`` takes the mean of the distribution that is squashed or truncated, so
+            that saturated policies differ as well; ``True`` the deterministic action.
+
+    Returns:
+        The means, shape ``[*B, A]``.
+
+    Raises:
+        NotImplementedError: the distribution has no mean.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl.modules import TanhNormal
+        >>> policy = TanhNormal(torch.tensor([[2.0]]), 1.0)
+        >>> policy_mean(policy), policy_mean(policy, squashed=True)
+        (tensor([[2.]]), tensor([[0.9640]]))
+    """
+    if isinstance(policy, Tensor):
+        return policy
+    if isinstance(policy, CompositeDistribution):
+        ndim = len(policy.batch_shape)
+        heads = (policy_mean(head, squashed=squashed) for head in policy.dists.values())
+        # A head may have no dimension of its own, or several.
+        return torch.cat([head.reshape(*head.shape[:ndim], -1) for head in heads], -1)
+    if isinstance(policy, Bernoulli | Categorical | OneHotCategorical):
+        return policy.probs
+    if not squashed:
+        while isinstance(policy, TransformedDistribution):
+            policy = policy.base_dist
+        if isinstance(policy, TruncatedNormal):
+            return policy.loc
+    mean = getattr(policy, "deterministic_sample", None)
+    return policy.mean if mean is None else mean
+
+
+def mean_distance(p: Distribution, q: Distribution) -> Tensor:
+    r"""Half the squared distance of two policies' means before they are squashed.
+
+    .. math::
+        d(p, q) = \frac 1 2 \lVert \mu_p - \mu_q \rVert_2^2,
+
+    with the means of :func:`policy_mean`: the distance of CAPS (Mysore et al., 2021), and what
+    implementations of L2C2 for robots put in the place of Hellinger's. It does not see how wide the
+    policies are, and grows with their distance without a bound, in squared units of the action
+    before the squashing. Its gradient flows into both policies.
+
+    Args:
+        p: one policy, batch shape ``[*B]``.
+        q: the other, of the same actions.
+
+    Returns:
+        The distances, shape ``[*B]``, at least 0.
+
+    Raises:
+        NotImplementedError: a policy has no mean.
+        ValueError: the means have other shapes.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl.modules import TanhNormal
+        >>> p, q = TanhNormal(torch.zeros(1, 2), 1.0), TanhNormal(torch.ones(1, 2), 3.0)
+        >>> mean_distance(p, q)
+        tensor([1.])
+    """
+    return squared_error(policy_mean(p), policy_mean(q))
+
+
+def kl_divergence(
+    p: Distribution, q: Distribution, *, num_samples: int = MONTE_CARLO_SAMPLES
+) -> Tensor:
+    r"""Kullback-Leibler divergence of two policies, in closed form or as a non-negative estimate.
+
+    .. math::
+        D(p \Vert q) = \int p(a) \ln\frac{p(a)}{q(a)}\, da
+
+    lies in ``[0, inf)`` and is not symmetric. Squashing both policies alike does not change it.
+    Closed forms are torch's; the heads of composite policies add up. A pair without one is
+    estimated from actions of :math:`p`, by
+
+    .. math::
+        \mathbb E_{a \sim p}\left[r - 1 - \ln r\right], \qquad r = q(a) / p(a),
+
+    no term of which is negative (Schulman, "Approximating KL divergence", 2020: k3). The estimate
+    and its gradient, into both policies, are unbiased.
+
+    Args:
+        p: one policy, batch shape ``[*B]``.
+        q: the other, of the same actions.
+        num_samples: actions drawn where there is no closed form, at least 1; the standard deviation
+            falls with its square root. Defaults to ``16``.
+
+    Returns:
+        The divergences, shape ``[*B]``.
+
+    Raises:
+        TypeError: a policy is deterministic, or can neither be sampled nor scored.
+        ValueError: the event shapes differ, or ``num_samples`` is below 1.
+
+    Examples:
+        >>> import torch
+        >>> from torch.distributions import Normal
+        >>> kl_divergence(Normal(torch.tensor([0.0, 3.0]), 1.0), Normal(torch.zeros(2), 1.0))
+        tensor([0.0000, 4.5000])
+    """
+    check_pair(p, q)
+    check_positive_int("num_samples", num_samples)
+    if isinstance(p, CompositeDistribution) and isinstance(q, CompositeDistribution):
+        heads = (
+            kl_divergence(head, q.dists[name], num_samples=num_samples)
+            for name, head in p.dists.items()
+        )
+        return functools.reduce(torch.add, (sum_to(head, len(p.batch_shape)) for head in heads))
+    if isinstance(p, TanhNormal) and isinstance(q, TanhNormal):
+        # Torch would compare the bounds, in a way that does not compile.
+        same = same_bounds(p, q)
+        base = closed_kl_divergence(p.base_dist, q.base_dist)
+        if isinstance(same, Tensor):
+            return torch.where(same, base, torch.nan)
+        return base if same else _monte_carlo(p, q, num_samples)
+    if has_analytic_kl(p, q):
+        return closed_kl_divergence(p, q)
+    return _monte_carlo(p, q, num_samples)
+
+
+def _monte_carlo(p: Distribution, q: Distribution, num_samples: int) -> Tensor:
+    try:
+        sample = p.sample(torch.Size([num_samples]))
+        log_p, log_q = log_prob_of(p, sample), log_prob_of(q, sample)
+    except NotImplementedError as error:
+        raise TypeError(
+            f"{type(p).__name__} and {type(q).__name__} have no closed-form divergence and cannot "
+            "be sampled and scored: give a function of your own instead."
+        ) from error
+    log_ratio = log_q - log_p
+    # 1 in value; its gradient is that of the distribution that the actions are drawn from.
+    drawn = (log_p - log_p.detach()).exp()
+    return (drawn * (torch.expm1(log_ratio) - log_ratio)).mean(0)
