@@ -22,7 +22,7 @@ objectives.regularized
 objectives.l2c2 objectives.caps objectives.ppo_rpe
 objectives.__init__
 trainers __init__
-experiment.settings experiment.compilation experiment.spaces
+experiment.settings experiment.compilation experiment.spaces experiment.tracing
 experiment.loggers
 experiment.folder
 experiment.environments experiment.lock experiment.signals

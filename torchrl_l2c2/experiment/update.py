@@ -16,9 +16,8 @@ from torchrl.data import TensorDictPrioritizedReplayBuffer, TensorDictReplayBuff
 
 from torchrl_l2c2.experiment.algorithms.agent import Agent
 from torchrl_l2c2.experiment.compilation import compiled
-from torchrl_l2c2.optim import AdaTerm
+from torchrl_l2c2.experiment.tracing import traceable_step, traceable_targets
 from torchrl_l2c2.transforms import NeighborTransform
-from torchrl_l2c2.updaters import TSoftUpdate
 
 Step = Callable[..., tuple[Tensor, Tensor | None] | None]
 """A gradient step: the means of the loss's entries and new priorities, or ``None`` if skipped."""
@@ -40,9 +39,10 @@ def make_update(
 
     Args:
         agent (Agent): what is updated, in place. Compiled, the step is made for the agent's tensors
-            and settings as they are at its first call: make another after replacing any.
-        compile (bool): whether to compile: with AdaTerm and the t-soft update the whole step is
-            one graph; with others, loss and gradients are.
+            and settings as they are at its first call: make another after replacing any. Learning
+            rates become tensors, and what is written into them is followed.
+        compile (bool): whether to compile. The whole step is one graph where the optimizer's and
+            the target networks' steps are :mod:`~.tracing`'s; with others, loss and gradients are.
         skip_nonfinite (bool): whether a batch with a loss or gradient that is NaN or infinite
             changes nothing and gives ``None``. The step is two graphs then.
         read (Callable, optional): makes the batch of other things, as the first part of the graph.
@@ -54,6 +54,12 @@ def make_update(
     """
     parameters = [p for group in agent.optimizer.param_groups for p in group["params"]]
     keys = agent.loss.out_keys
+    compile = compile and agent.compilable
+    step: Callable[[], object] | None = None
+    if compile and traceable_targets(agent.target_updater):
+        step = traceable_step(agent.optimizer)
+    whole = step is not None
+    step = step or agent.optimizer.step
 
     def differentiate(
         with_policy: bool, *drawn: Any
@@ -76,7 +82,7 @@ def make_update(
             parameter.grad = gradient
         if agent.max_grad_norm is not None:
             torch.nn.utils.clip_grad_norm_(parameters, agent.max_grad_norm)
-        agent.optimizer.step()
+        step()
         if agent.target_updater is not None:
             agent.target_updater.step()
         # Kept, they would be outputs of the graph, and each output takes time.
@@ -88,9 +94,6 @@ def make_update(
         apply(gradients)
         return values, priority
 
-    # torch's own optimizers and TorchRL's updaters break the graph.
-    compile = compile and agent.compilable
-    whole = isinstance(agent.optimizer, AdaTerm) and isinstance(agent.target_updater, TSoftUpdate)
     if compile and whole and not skip_nonfinite:
         return compiled(update, takes_gradients=True, constant_closure=True)
     if compile:
