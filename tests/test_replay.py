@@ -14,8 +14,10 @@ from torchrl_l2c2.experiment import (
     ExperimentConfig,
     L2C2Config,
     NoRegularizerConfig,
+    PPOConfig,
     PPORPEConfig,
     PrioritizedReplayConfig,
+    RolloutReplayConfig,
     SACConfig,
     TaskConfig,
     UniformReplayConfig,
@@ -38,6 +40,11 @@ CASES = {
     "without neighbors": replace(PAPER, regularizer=NoRegularizerConfig()),
     "several neighbors": replace(PAPER, regularizer=L2C2Config(num_samples=3)),
     "uniform": replace(PAPER, replay=UniformReplayConfig(capacity=50, batch_size=8)),
+    "rollout": replace(
+        PAPER,
+        algorithm=PPOConfig(hidden=(8,), frames=1000),
+        replay=RolloutReplayConfig(batch_size=25),
+    ),
     "sac": replace(
         PAPER,
         algorithm=SACConfig(hidden=(8,), random_frames=0),
@@ -51,7 +58,8 @@ def by_hand(experiment: Experiment) -> None:
     batch = experiment.learner.replay.sample()
     _, priority = make_update(experiment.agent, compile=False)(True, batch)
     assert all(parameter.grad is None for parameter in experiment.agent.loss.parameters())
-    experiment.learner.replay.update_tensordict_priority(batch.set("td_error", priority))
+    if priority is not None:
+        experiment.learner.replay.update_tensordict_priority(batch.set("td_error", priority))
 
 
 def learned(experiment: Experiment) -> dict[str, torch.Tensor]:

@@ -12,7 +12,11 @@ from typing import Any, NamedTuple
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import TensorDictPrioritizedReplayBuffer, TensorDictReplayBuffer
+from torchrl.data import (
+    SamplerWithoutReplacement,
+    TensorDictPrioritizedReplayBuffer,
+    TensorDictReplayBuffer,
+)
 
 from torchrl_l2c2.experiment.algorithms.agent import Agent
 from torchrl_l2c2.experiment.compilation import compiled
@@ -132,6 +136,8 @@ class Draw(NamedTuple):
 class ReplayUpdate:
     """Updates from a replay buffer: as ``sample``, update and ``update_tensordict_priority``.
 
+    A buffer that is gone through without repetition is drawn from in that order.
+
     The numbers are the same, to rounding where the update is compiled. But the batch is gathered
     from the storage, and its neighbors are placed, within the update: compiled, they are a part of
     its graph, which then costs next to nothing, whereas making the batch's TensorDicts takes about
@@ -158,6 +164,8 @@ class ReplayUpdate:
         self._prioritized = isinstance(replay, TensorDictPrioritizedReplayBuffer)
         transforms = list(replay.transform.transforms)
         self._neighbors: NeighborTransform | None = transforms[0] if transforms else None
+        # The last of a rollout's batches is smaller: one graph is to serve all sizes.
+        self._sizes_vary = isinstance(replay.sampler, SamplerWithoutReplacement)
         self._source: TensorDictBase | None = None
         self._names: tuple[NestedKey, ...] = ()
         self._stored: tuple[Tensor, ...] = ()
@@ -188,9 +196,12 @@ class ReplayUpdate:
             self._names, self._stored = zip(*self._source.items(True, True), strict=True)
         index, info = self._replay.sampler.sample(storage, self._replay.batch_size)
         generator = None if self._neighbors is None else self._neighbors.generator
-        return Draw(
-            self._stored, index, info.get("priority_weight"), self._uniform(len(index), generator)
-        )
+        uniform = self._uniform(len(index), generator)
+        if self._sizes_vary:
+            for tensor in (index, uniform):
+                if tensor is not None:
+                    torch._dynamo.maybe_mark_dynamic(tensor, 0)
+        return Draw(self._stored, index, info.get("priority_weight"), uniform)
 
     def example(self) -> TensorDictBase:
         """A batch from all over the storage, for which nothing that runs depend on is drawn."""
