@@ -23,6 +23,7 @@ objectives.l2c2 objectives.caps objectives.ppo_rpe
 objectives.__init__
 trainers __init__
 experiment.settings experiment.compilation experiment.spaces experiment.tracing
+experiment.priorities
 experiment.loggers
 experiment.folder
 experiment.environments experiment.lock experiment.signals

@@ -20,6 +20,7 @@ from torchrl.data import (
 
 from torchrl_l2c2.experiment.algorithms.agent import Agent
 from torchrl_l2c2.experiment.compilation import compiled
+from torchrl_l2c2.experiment.priorities import draw_by_priority, set_priorities
 from torchrl_l2c2.experiment.tracing import traceable_step, traceable_targets
 from torchrl_l2c2.transforms import NeighborTransform
 
@@ -160,12 +161,14 @@ class ReplayUpdate:
         compile: bool,
         skip_nonfinite: bool = False,
     ) -> None:
-        self._replay = replay
+        # TorchRL's properties of a buffer take long.
+        self._storage, self._sampler = replay.storage, replay.sampler
+        self._batch_size = replay.batch_size
         self._prioritized = isinstance(replay, TensorDictPrioritizedReplayBuffer)
         transforms = list(replay.transform.transforms)
         self._neighbors: NeighborTransform | None = transforms[0] if transforms else None
         # The last of a rollout's batches is smaller: one graph is to serve all sizes.
-        self._sizes_vary = isinstance(replay.sampler, SamplerWithoutReplacement)
+        self._sizes_vary = isinstance(self._sampler, SamplerWithoutReplacement)
         self._source: TensorDictBase | None = None
         self._names: tuple[NestedKey, ...] = ()
         self._stored: tuple[Tensor, ...] = ()
@@ -190,23 +193,28 @@ class ReplayUpdate:
 
     def draw(self) -> Draw:
         """Draws the rows of a batch, and the random numbers for their neighbors."""
-        storage = self._replay.storage
-        if storage._storage is not self._source:
-            self._source = storage._storage
+        if self._storage._storage is not self._source:
+            self._source = self._storage._storage
             self._names, self._stored = zip(*self._source.items(True, True), strict=True)
-        index, info = self._replay.sampler.sample(storage, self._replay.batch_size)
+        rows, weight = self._rows()
         generator = None if self._neighbors is None else self._neighbors.generator
-        uniform = self._uniform(len(index), generator)
+        uniform = self._uniform(len(rows), generator)
         if self._sizes_vary:
-            for tensor in (index, uniform):
+            for tensor in (rows, uniform):
                 if tensor is not None:
                     torch._dynamo.maybe_mark_dynamic(tensor, 0)
-        return Draw(self._stored, index, info.get("priority_weight"), uniform)
+        return Draw(self._stored, rows, weight, uniform)
+
+    def _rows(self) -> tuple[Tensor, Tensor | None]:
+        """What the buffer's sampler draws: rows, and their weights where they have priorities."""
+        if self._prioritized:
+            return draw_by_priority(self._sampler, len(self._storage), self._batch_size)
+        return self._sampler.sample(self._storage, self._batch_size)[0], None
 
     def example(self) -> TensorDictBase:
         """A batch from all over the storage, for which nothing that runs depend on is drawn."""
-        size = self._replay.batch_size
-        rows = torch.linspace(0, len(self._replay) - 1, size).long()
+        size = self._batch_size
+        rows = torch.linspace(0, len(self._storage) - 1, size).long()
         weight = torch.ones(size) if self._prioritized else None
         uniform = self._uniform(size, torch.Generator().manual_seed(0))
         return self.read(self._stored, rows, weight, uniform)
@@ -222,7 +230,7 @@ class ReplayUpdate:
     def prioritize(self, index: Tensor, priority: Tensor | None) -> None:
         """Sets the priorities of rows, where the buffer has any."""
         if self._prioritized and priority is not None:
-            self._replay.sampler.update_priority(index, priority, storage=self._replay.storage)
+            set_priorities(self._sampler, index, priority)
 
     def read(
         self,
