@@ -20,7 +20,7 @@ def traceable_step(optimizer: Optimizer) -> Callable[[], object] | None:
     """The optimizer's step as a function that compiles; ``None`` where there is none.
 
     Learning rates become tensors, so that a compiled step follows what is written into them, as
-    torch's schedulers do. In double precision, which leaves a step's numbers as they are.
+    torch's schedulers do.
 
     Args:
         optimizer (Optimizer): :class:`~torchrl_l2c2.AdaTerm` or ``torch.optim.Adam``.
@@ -29,7 +29,8 @@ def traceable_step(optimizer: Optimizer) -> Callable[[], object] | None:
         return None
     for group in optimizer.param_groups:
         if not isinstance(group["lr"], Tensor):
-            group["lr"] = torch.tensor(group["lr"], dtype=torch.float64)
+            # Not in double precision, with which torch traces everything a second time.
+            group["lr"] = torch.tensor(group["lr"], dtype=torch.float32)
     if isinstance(optimizer, Adam):
         _begin(optimizer)
         return partial(adam_step, optimizer)
