@@ -32,6 +32,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torchrl.envs import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
+from benchmarks.peers import against
 from benchmarks.timing import Row, alternate, machine, to_markdown, to_text
 from torchrl_l2c2.experiment import (
     TASKS,
@@ -41,6 +42,7 @@ from torchrl_l2c2.experiment import (
     L2C2Config,
     MultiEpisodeCollector,
     NoRegularizerConfig,
+    PPOConfig,
     PPORPEConfig,
     PrioritizedReplayConfig,
     SACConfig,
@@ -60,11 +62,12 @@ REGULARIZERS = {"vanilla": NoRegularizerConfig(), "l2c2": L2C2Config()}
 
 @dataclass(frozen=True)
 class Effort:
-    """How long to measure, and whether anything is compiled."""
+    """How long to measure, whether anything is compiled, and the interpreter of the peers."""
 
     rounds: int = 15
     steps: int = 1000
     compile: bool = True
+    peer_python: str = sys.executable
 
 
 # Shows that everything runs; its numbers say nothing.
@@ -94,13 +97,39 @@ def update_rows(effort: Effort) -> Iterable[Row]:
         at_least=4.0,
         parts={"eager us": us["eager"], "compiled us": us["l2c2"]},
     )
-    yield _smoothing_row("update", 32, us, 1.25)
+    yield _smoothing_row("update", 32, us, 1.2)
     yield Row(
         "update",
         "compiled update / its matrix products alone, batch 32",
         us["l2c2"] / us["products"],
-        at_most=5.0,
+        at_most=3.0,
         parts={"compiled us": us["l2c2"], "products us": us["products"]},
+    )
+
+
+def ppo_update_rows(effort: Effort) -> Iterable[Row]:
+    """PPO's update at batch 64, two layers of 64."""
+    config = ExperimentConfig(
+        task=TaskConfig(max_steps=effort.steps, episodes=1),
+        algorithm=PPOConfig(),
+        regularizer=NoRegularizerConfig(),
+        compile=False,
+    )
+    actions = {}
+    for name, compile in {"eager": False, "compiled": effort.compile}.items():
+        experiment = Experiment(config)
+        experiment.learner.remember(experiment.player.collector.rollout())
+        update = ReplayUpdate(experiment.agent, experiment.learner.replay, compile=compile)
+        draw = update.draw()
+        actions[name] = partial(update.update, True, *draw)
+    times = alternate(actions, repeats=effort.rounds, calls=20, warm_up=5)
+    us = {f"{name} us": 1e6 * seconds for name, seconds in times.items()}
+    yield Row(
+        "ppo_update",
+        "eager PPO update / compiled PPO update, batch 64",
+        us["eager us"] / us["compiled us"],
+        at_least=3.0,
+        parts=us,
     )
 
 
@@ -109,7 +138,7 @@ def large_update_rows(effort: Effort) -> Iterable[Row]:
     actions = {name: updates(effort, 4096, name, effort.compile) for name in REGULARIZERS}
     times = alternate(actions, repeats=effort.rounds, calls=2)
     us = {name: 1e6 * seconds for name, seconds in times.items()}
-    yield _smoothing_row("update_4096", 4096, us, 1.8)
+    yield _smoothing_row("update_4096", 4096, us, 1.9)
 
 
 def _smoothing_row(group: str, size: int, us: dict[str, float], at_most: float) -> Row:
@@ -243,6 +272,65 @@ def run_rows(effort: Effort) -> Iterable[Row]:
         at_most=1.15,
         parts={f"{name} us": 1e6 * seconds for name, seconds in times.items()},
     )
+    yield Row(
+        "run",
+        "drawing rows and setting priorities / update",
+        (times["draw"] + times["prioritize"]) / times["update"],
+        at_most=0.15,
+        parts={f"{name} us": 1e6 * times[name] for name in detail},
+    )
+
+
+def start_rows(effort: Effort) -> Iterable[Row]:
+    """How long a run waits for its first update, where one like it was compiled before."""
+    command = [sys.executable, "-c", START, "" if effort.compile else "--quick"]
+
+    def seconds() -> float:
+        done = subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT)
+        return float(done.stdout.splitlines()[-1])
+
+    first, later = seconds(), median(seconds() for _ in range(max(1, effort.rounds // 5)))
+    yield Row(
+        "start",
+        "second run, from having imported torch to the first update",
+        later,
+        unit="s",
+        at_most=8.0,
+        # What was compiled on this machine before helps it, too.
+        parts={"first run s": first, "second run s": later},
+    )
+
+
+START = """
+import sys, time
+import torch
+start = time.perf_counter()
+from benchmarks.speed import QUICK, Effort, paper_config
+from torchrl_l2c2.experiment import Experiment
+experiment = Experiment(paper_config(QUICK if sys.argv[1] else Effort(steps=100)))
+experiment.learner.remember(experiment.player.collector.rollout())
+experiment.learner.update(True)
+print(time.perf_counter() - start)
+"""
+
+
+def peer_rows(effort: Effort) -> Iterable[Row]:
+    """Whole training by other libraries, on the same task, networks and batches."""
+    steps = min(512, effort.steps)
+    settings = {
+        "env_id": TASKS["swingup"].env_id,
+        "frames": steps,
+        "turn": 4 * steps,
+        "compile": effort.compile,
+    }
+    how = {"rounds": max(1, effort.rounds // 3), "python": effort.peer_python}
+    for layer, batch in ((100, 32), (256, 256)):
+        same = {**settings, "layers": [layer, layer], "batch": batch}
+        what = f"SAC here / SBX SAC, layers of {layer}, batch {batch}"
+        yield from against(what, "sac", "sbx sac", same, at_most=0.9, **how)
+    same = {**settings, "layers": [64, 64], "batch": 64}
+    what = "PPO here / Stable-Baselines3 PPO, layers of 64, batch 64"
+    yield from against(what, "ppo", "sb3 ppo", same, at_most=0.4, **how)
 
 
 def baseline_rows(effort: Effort) -> Iterable[Row]:
@@ -400,11 +488,14 @@ def _synchronized(action: Callable[[], object]) -> None:
 ROWS: dict[str, Callable[[Effort], Iterable[Row]]] = {
     "import": import_rows,
     "update": update_rows,
+    "ppo_update": ppo_update_rows,
     "update_4096": large_update_rows,
     "collection": collection_rows,
     "workers": worker_rows,
     "run": run_rows,
+    "start": start_rows,
     "sb3": baseline_rows,
+    "peers": peer_rows,
     "processes": process_rows,
     "cuda": cuda_rows,
 }
@@ -503,6 +594,9 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--quick", action="store_true", help="one short uncompiled round: shows that it runs"
     )
+    parser.add_argument(
+        "--peer-python", default=sys.executable, help="interpreter that has SBX (default: this)"
+    )
     parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
     return parser.parse_args(arguments)
 
@@ -514,7 +608,9 @@ def main(arguments: list[str] | None = None) -> None:
         logging.getLogger(chatty).setLevel(logging.ERROR)
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
-    effort = QUICK if options.quick else Effort()
+    effort = dataclasses.replace(
+        QUICK if options.quick else Effort(), peer_python=options.peer_python
+    )
     if options.worker:
         _work(effort)
         return

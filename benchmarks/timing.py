@@ -15,7 +15,17 @@ from typing import Any
 
 import torch
 
-PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "pybullet", "numpy", "stable-baselines3")
+PACKAGES = (
+    "torch",
+    "torchrl",
+    "tensordict",
+    "gymnasium",
+    "pybullet",
+    "numpy",
+    "stable-baselines3",
+    "sbx-rl",
+    "jax",
+)
 
 
 @dataclass

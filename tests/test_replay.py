@@ -1,6 +1,7 @@
 """Updates from the replay buffer: the same as sampling, updating and setting priorities by hand."""
 
 import copy
+import json
 import logging
 from dataclasses import replace
 
@@ -13,8 +14,10 @@ from torchrl_l2c2.experiment import (
     ExperimentConfig,
     L2C2Config,
     NoRegularizerConfig,
+    PPOConfig,
     PPORPEConfig,
     PrioritizedReplayConfig,
+    RolloutReplayConfig,
     SACConfig,
     TaskConfig,
     UniformReplayConfig,
@@ -37,6 +40,11 @@ CASES = {
     "without neighbors": replace(PAPER, regularizer=NoRegularizerConfig()),
     "several neighbors": replace(PAPER, regularizer=L2C2Config(num_samples=3)),
     "uniform": replace(PAPER, replay=UniformReplayConfig(capacity=50, batch_size=8)),
+    "rollout": replace(
+        PAPER,
+        algorithm=PPOConfig(hidden=(8,), frames=1000),
+        replay=RolloutReplayConfig(batch_size=25),
+    ),
     "sac": replace(
         PAPER,
         algorithm=SACConfig(hidden=(8,), random_frames=0),
@@ -50,7 +58,8 @@ def by_hand(experiment: Experiment) -> None:
     batch = experiment.learner.replay.sample()
     _, priority = make_update(experiment.agent, compile=False)(True, batch)
     assert all(parameter.grad is None for parameter in experiment.agent.loss.parameters())
-    experiment.learner.replay.update_tensordict_priority(batch.set("td_error", priority))
+    if priority is not None:
+        experiment.learner.replay.update_tensordict_priority(batch.set("td_error", priority))
 
 
 def learned(experiment: Experiment) -> dict[str, torch.Tensor]:
@@ -101,19 +110,27 @@ def test_the_batch_has_the_entries_and_neighbors_that_the_buffer_gives():
 
 
 @pytest.mark.skipif(not compiler_available(), reason="no C++ compiler")
-def test_compiled_it_learns_the_same_and_follows_what_may_change():
-    """A gain that is scheduled, a policy left out, and a state that is loaded over its tensors."""
+@pytest.mark.parametrize("name", ["prioritized", "sac"])
+def test_compiled_it_learns_the_same_and_follows_what_may_change(name):
+    """Gain, learning rate, a policy left out, and an older state, loaded over its tensors."""
     seen = []
+    played = Experiment(CASES[name])
+    played.train()
+    state = played.state_dict()
     for compile in (True, False):
-        experiment = Experiment(replace(PAPER, compile=compile))
-        experiment.train()
-        start, values = copy.deepcopy(experiment.state_dict()), []
+        experiment, values = Experiment(replace(CASES[name], compile=compile)), []
+        # With a learning rate that is a number, as it was in earlier checkpoints.
+        state["config"] = json.dumps(experiment.config.to_dict())
+        begin(experiment, state)
         values.append(experiment.learner.update(True)[0])
         experiment.agent.loss.l2c2_coeff = 100.0
         values.append(experiment.learner.update(True)[0])
-        values.append(experiment.learner.update(False)[0])
+        scale_rates(experiment.agent.optimizer, 10.0)
+        # Without the policy it is another graph: once will do.
+        turns = (False, True) if name == "prioritized" else (True,)
+        values += [experiment.learner.update(with_policy)[0] for with_policy in turns]
         # Loading replaces the optimizer's tensors: a step that kept the old ones would go wrong.
-        experiment.load_state_dict(start)
+        begin(experiment, state)
         experiment.agent.loss.l2c2_coeff = 1.0
         values += [experiment.learner.update(True)[0] for _ in range(3)]
         seen.append((torch.stack(values), learned(experiment)))
@@ -122,3 +139,18 @@ def test_compiled_it_learns_the_same_and_follows_what_may_change():
     same(ours, plain, rtol=1e-3, atol=1e-4)
     actor = experiment.agent.loss.out_keys.index("loss_l2c2_actor")
     assert compiled[1, actor] > 30.0 * compiled[0, actor]
+
+
+def begin(experiment, state):
+    """At a state, with the random numbers that SAC's actions are drawn with."""
+    experiment.load_state_dict(copy.deepcopy(state))
+    torch.manual_seed(0)
+
+
+def scale_rates(optimizer, factor):
+    """As torch's schedulers do, into a learning rate that is a tensor."""
+    for group in optimizer.param_groups:
+        if isinstance(group["lr"], torch.Tensor):
+            group["lr"].mul_(factor)
+        else:
+            group["lr"] *= factor

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 import warnings
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -12,7 +11,7 @@ from torchrl.data import TensorDictReplayBuffer
 
 from torchrl_l2c2.experiment.algorithms.agent import Agent
 from torchrl_l2c2.experiment.influence import gradient_shares
-from torchrl_l2c2.experiment.update import ReplayUpdate, Step, is_loss, make_update
+from torchrl_l2c2.experiment.update import ReplayUpdate, is_loss
 from torchrl_l2c2.objectives import L2C2Loss
 from torchrl_l2c2.transforms import NeighborTransform
 
@@ -49,7 +48,6 @@ class Learner:
 
     Keyword Args:
         reward_factor (float): what rewards are multiplied with when they are remembered.
-        on_policy (bool): whether updates go through all that is remembered, instead of drawing.
         compile (bool): as for :func:`~.update.make_update`.
         skip_nonfinite (bool): as for :func:`~.update.make_update`.
 
@@ -66,7 +64,6 @@ class Learner:
         replay: TensorDictReplayBuffer,
         *,
         reward_factor: float,
-        on_policy: bool,
         compile: bool,
         skip_nonfinite: bool,
     ) -> None:
@@ -77,7 +74,6 @@ class Learner:
         self.first_update_seconds: float | None = None
         self.tells_faint_regularizer = True
         self._reward_factor = reward_factor
-        self._on_policy = on_policy
         self._compile = compile
         self._skip_nonfinite = skip_nonfinite
         self._terms: list[torch.Tensor] = []
@@ -90,11 +86,8 @@ class Learner:
     def renew(self) -> None:
         """Makes the update anew: a compiled one is made for the tensors that were there."""
         self.agent.refresh_policy()
-        how: Any = {"compile": self._compile, "skip_nonfinite": self._skip_nonfinite}
-        self.update: Step = (
-            make_update(self.agent, **how)
-            if self._on_policy
-            else ReplayUpdate(self.agent, self.replay, **how)
+        self.update = ReplayUpdate(
+            self.agent, self.replay, compile=self._compile, skip_nonfinite=self._skip_nonfinite
         )
 
     @torch.no_grad()
@@ -117,15 +110,16 @@ class Learner:
     def learn_rollout(self, epochs: int) -> None:
         """Goes so many times through all that is remembered, and forgets it."""
         for _ in range(epochs):
-            for batch in self.replay:
-                self._update(batch)
+            self.replay.sampler.ran_out = False
+            while not self.replay.sampler.ran_out:
+                self._update()
         self.replay.empty()
         self.agent.refresh_policy()
 
-    def _update(self, *batch: TensorDictBase) -> None:
+    def _update(self) -> None:
         with_policy = (self.updates + 1) % self.agent.policy_delay == 0
         started = time.monotonic()
-        result = self.update(with_policy, *batch)
+        result = self.update(with_policy)
         if self.first_update_seconds is None:
             self.first_update_seconds = time.monotonic() - started
         if result is None:
@@ -134,12 +128,10 @@ class Learner:
         self.updates += 1
         self._terms.append(result[0])
         if self.updates == MEASURED_AFTER and self.tells_faint_regularizer:
-            self._tell_faint_regularizer(*batch)
+            self._tell_faint_regularizer()
 
-    def _tell_faint_regularizer(self, *batch: TensorDictBase) -> None:
-        if isinstance(self.update, ReplayUpdate):
-            batch = (self.update.example(),)
-        shares = gradient_shares(self.agent.loss, *batch)
+    def _tell_faint_regularizer(self) -> None:
+        shares = gradient_shares(self.agent.loss, self.update.example())
         if shares and max(shares.values()) < FAINT:
             each = ", ".join(f"{key}: {share:.1g}" for key, share in shares.items())
             warnings.warn(

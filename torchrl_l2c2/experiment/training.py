@@ -106,7 +106,6 @@ class Experiment:
                 self.agent,
                 config.make_replay(),
                 reward_factor=config.algorithm.reward_factor,
-                on_policy=config.algorithm.schedule == "rollout",
                 compile=self._compile,
                 skip_nonfinite=config.on_nonfinite == "skip",
             )

@@ -12,13 +12,17 @@ from typing import Any, NamedTuple
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import TensorDictPrioritizedReplayBuffer, TensorDictReplayBuffer
+from torchrl.data import (
+    SamplerWithoutReplacement,
+    TensorDictPrioritizedReplayBuffer,
+    TensorDictReplayBuffer,
+)
 
 from torchrl_l2c2.experiment.algorithms.agent import Agent
 from torchrl_l2c2.experiment.compilation import compiled
-from torchrl_l2c2.optim import AdaTerm
+from torchrl_l2c2.experiment.priorities import draw_by_priority, set_priorities
+from torchrl_l2c2.experiment.tracing import traceable_step, traceable_targets
 from torchrl_l2c2.transforms import NeighborTransform
-from torchrl_l2c2.updaters import TSoftUpdate
 
 Step = Callable[..., tuple[Tensor, Tensor | None] | None]
 """A gradient step: the means of the loss's entries and new priorities, or ``None`` if skipped."""
@@ -40,9 +44,10 @@ def make_update(
 
     Args:
         agent (Agent): what is updated, in place. Compiled, the step is made for the agent's tensors
-            and settings as they are at its first call: make another after replacing any.
-        compile (bool): whether to compile: with AdaTerm and the t-soft update the whole step is
-            one graph; with others, loss and gradients are.
+            and settings as they are at its first call: make another after replacing any. Learning
+            rates become tensors, and what is written into them is followed.
+        compile (bool): whether to compile. The whole step is one graph where the optimizer's and
+            the target networks' steps are :mod:`~.tracing`'s; with others, loss and gradients are.
         skip_nonfinite (bool): whether a batch with a loss or gradient that is NaN or infinite
             changes nothing and gives ``None``. The step is two graphs then.
         read (Callable, optional): makes the batch of other things, as the first part of the graph.
@@ -54,6 +59,12 @@ def make_update(
     """
     parameters = [p for group in agent.optimizer.param_groups for p in group["params"]]
     keys = agent.loss.out_keys
+    compile = compile and agent.compilable
+    step: Callable[[], object] | None = None
+    if compile and traceable_targets(agent.target_updater):
+        step = traceable_step(agent.optimizer)
+    whole = step is not None
+    step = step or agent.optimizer.step
 
     def differentiate(
         with_policy: bool, *drawn: Any
@@ -76,7 +87,7 @@ def make_update(
             parameter.grad = gradient
         if agent.max_grad_norm is not None:
             torch.nn.utils.clip_grad_norm_(parameters, agent.max_grad_norm)
-        agent.optimizer.step()
+        step()
         if agent.target_updater is not None:
             agent.target_updater.step()
         # Kept, they would be outputs of the graph, and each output takes time.
@@ -88,9 +99,6 @@ def make_update(
         apply(gradients)
         return values, priority
 
-    # torch's own optimizers and TorchRL's updaters break the graph.
-    compile = compile and agent.compilable
-    whole = isinstance(agent.optimizer, AdaTerm) and isinstance(agent.target_updater, TSoftUpdate)
     if compile and whole and not skip_nonfinite:
         return compiled(update, takes_gradients=True, constant_closure=True)
     if compile:
@@ -129,6 +137,8 @@ class Draw(NamedTuple):
 class ReplayUpdate:
     """Updates from a replay buffer: as ``sample``, update and ``update_tensordict_priority``.
 
+    A buffer that is gone through without repetition is drawn from in that order.
+
     The numbers are the same, to rounding where the update is compiled. But the batch is gathered
     from the storage, and its neighbors are placed, within the update: compiled, they are a part of
     its graph, which then costs next to nothing, whereas making the batch's TensorDicts takes about
@@ -151,11 +161,15 @@ class ReplayUpdate:
         compile: bool,
         skip_nonfinite: bool = False,
     ) -> None:
-        self._replay = replay
+        # TorchRL's properties of a buffer take long.
+        self._storage, self._sampler = replay.storage, replay.sampler
+        self._batch_size = replay.batch_size
         self._prioritized = isinstance(replay, TensorDictPrioritizedReplayBuffer)
         transforms = list(replay.transform.transforms)
         self._neighbors: NeighborTransform | None = transforms[0] if transforms else None
         self._device = agent.device
+        # The last of a rollout's batches is smaller: one graph is to serve all sizes.
+        self._sizes_vary = isinstance(self._sampler, SamplerWithoutReplacement)
         self._source: TensorDictBase | None = None
         self._names: tuple[NestedKey, ...] = ()
         self._stored: tuple[Tensor, ...] = ()
@@ -180,20 +194,30 @@ class ReplayUpdate:
 
     def draw(self) -> Draw:
         """Draws the rows of a batch, and the random numbers for their neighbors."""
-        storage = self._replay.storage
-        if storage._storage is not self._source:
-            self._source = storage._storage
+        if self._storage._storage is not self._source:
+            self._source = self._storage._storage
             self._names, self._stored = zip(*self._source.items(True, True), strict=True)
-        index, info = self._replay.sampler.sample(storage, self._replay.batch_size)
-        index, weight = index.to(self._device), info.get("priority_weight")
+        rows, weight = self._rows()
+        rows = rows.to(self._device)
         weight = None if weight is None else weight.to(self._device)
         generator = None if self._neighbors is None else self._neighbors.generator
-        return Draw(self._stored, index, weight, self._uniform(len(index), generator))
+        uniform = self._uniform(len(rows), generator)
+        if self._sizes_vary:
+            for tensor in (rows, uniform):
+                if tensor is not None:
+                    torch._dynamo.maybe_mark_dynamic(tensor, 0)
+        return Draw(self._stored, rows, weight, uniform)
+
+    def _rows(self) -> tuple[Tensor, Tensor | None]:
+        """What the buffer's sampler draws: rows, and their weights where they have priorities."""
+        if self._prioritized:
+            return draw_by_priority(self._sampler, len(self._storage), self._batch_size)
+        return self._sampler.sample(self._storage, self._batch_size)[0], None
 
     def example(self) -> TensorDictBase:
         """A batch from all over the storage, for which nothing that runs depend on is drawn."""
-        size, device = self._replay.batch_size, self._device
-        rows = torch.linspace(0, len(self._replay) - 1, size, device=device).long()
+        size, device = self._batch_size, self._device
+        rows = torch.linspace(0, len(self._storage) - 1, size, device=device).long()
         weight = torch.ones(size, device=device) if self._prioritized else None
         uniform = self._uniform(size, torch.Generator(device).manual_seed(0))
         return self.read(self._stored, rows, weight, uniform)
@@ -209,8 +233,7 @@ class ReplayUpdate:
     def prioritize(self, index: Tensor, priority: Tensor | None) -> None:
         """Sets the priorities of rows, where the buffer has any."""
         if self._prioritized and priority is not None:
-            index, priority = index.to("cpu"), priority.to("cpu")
-            self._replay.sampler.update_priority(index, priority, storage=self._replay.storage)
+            set_priorities(self._sampler, index.to("cpu"), priority.to("cpu"))
 
     def read(
         self,

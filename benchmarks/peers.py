@@ -1,0 +1,96 @@
+"""Rows against other libraries, each in a process of its own, by the clock and by the processor."""
+
+from __future__ import annotations
+
+import json
+import statistics
+import subprocess
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from benchmarks.timing import Row
+
+HERE = Path(__file__).parent
+CLOCKS = ("wall", "CPU")
+
+
+class Peer:
+    """A process of ``benchmarks/peer.py``.
+
+    Args:
+        name (str): what trains.
+        settings (dict): as the process takes them.
+        python (str): the interpreter that has what is to train.
+
+    Attributes:
+        note: why it does not train; empty if it does.
+    """
+
+    def __init__(self, name: str, settings: dict[str, Any], python: str) -> None:
+        pipe = subprocess.PIPE
+        self._process = subprocess.Popen(
+            [python, str(HERE / "peer.py"), name, json.dumps(settings)],
+            stdin=pipe,
+            stdout=pipe,
+            stderr=subprocess.DEVNULL,
+            text=True,
+            cwd=HERE.parent,
+        )
+        answer = self._answer()
+        failed = f"not measured: benchmarks/peer.py {name!r} ended; it says why when run alone"
+        self.note = "" if answer == "ready" else answer or failed
+
+    def turn(self) -> list[float]:
+        """Seconds of one turn, by each of ``CLOCKS``."""
+        assert self._process.stdin is not None
+        print("go", file=self._process.stdin, flush=True)
+        return json.loads(self._answer())
+
+    def close(self) -> None:
+        """Lets the process end."""
+        self._process.communicate()
+
+    def _answer(self) -> str:
+        assert self._process.stdout is not None
+        return self._process.stdout.readline().strip()
+
+
+def against(
+    what: str,
+    ours: str,
+    peer: str,
+    settings: dict[str, Any],
+    *,
+    rounds: int,
+    at_most: float,
+    python: str = sys.executable,
+) -> Iterable[Row]:
+    """Time per frame here by a peer's, in turns; a row for each clock.
+
+    Args:
+        what (str): name of the rows.
+        ours (str): what trains here.
+        peer (str): what trains there.
+        settings (dict): of both.
+
+    Keyword Args:
+        rounds (int): turns of each.
+        at_most (float): the limit.
+        python (str): the peer's interpreter. Default: this one.
+    """
+    both = [Peer(ours, settings, sys.executable), Peer(peer, settings, python)]
+    note = next((each.note for each in both if each.note), "")
+    turns = [] if note else [[each.turn() for each in both] for _ in range(rounds)]
+    for each in both:
+        each.close()
+    for column, clock in enumerate(CLOCKS):
+        row = Row("peers", f"{what}, {clock} time per frame", at_most=at_most, note=note)
+        if turns:
+            us = [
+                1e6 * statistics.median(turn[side][column] for turn in turns) / settings["turn"]
+                for side in (0, 1)
+            ]
+            row.value, row.parts = us[0] / us[1], {"ours us": us[0], "theirs us": us[1]}
+        yield row

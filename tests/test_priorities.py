@@ -1,0 +1,81 @@
+"""Drawing by priority and setting priorities: what TorchRL's sampler does, to the bit."""
+
+import logging
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, TensorDictPrioritizedReplayBuffer
+
+from torchrl_l2c2.experiment.priorities import draw_by_priority, set_priorities
+from torchrl_l2c2.experiment.replay import replay_state
+
+logging.getLogger("torchrl").setLevel(logging.ERROR)
+
+
+def filled(stored, capacity=50, alpha=0.7):
+    """A buffer with so many rows, whose priorities are set."""
+    buffer = TensorDictPrioritizedReplayBuffer(
+        alpha=alpha,
+        beta=0.5,
+        priority_key="td_error",
+        storage=LazyTensorStorage(capacity),
+        batch_size=16,
+        generator=torch.Generator().manual_seed(3),
+    )
+    buffer.extend(TensorDict({"row": torch.arange(stored)}, [stored]))
+    generator = torch.Generator().manual_seed(1)
+    buffer.update_priority(torch.arange(stored), torch.rand(stored, generator=generator) ** 4)
+    return buffer
+
+
+@pytest.mark.parametrize("alpha", [1.0, 0.7, 0.0])
+def test_rows_weights_and_state_are_the_samplers_own(alpha):
+    """Over rounds in which priorities are set, one of them higher than any before."""
+    ours, theirs = filled(40, alpha=alpha), filled(40, alpha=alpha)
+    for number in range(20):
+        rows, weight = draw_by_priority(ours.sampler, 40, 16)
+        expected, info = theirs.sampler.sample(theirs.storage, 16)
+        assert torch.equal(rows, expected) and torch.equal(weight, info["priority_weight"])
+        priority = torch.rand(16, generator=torch.Generator().manual_seed(number)) * (1 + number)
+        set_priorities(ours.sampler, rows, priority)
+        theirs.sampler.update_priority(expected, priority)
+    state, other = replay_state(ours)["_sampler"], replay_state(theirs)["_sampler"]
+    assert torch.equal(state["_sum_tree"], other["_sum_tree"])
+    assert torch.equal(state["_min_tree"], other["_min_tree"])
+    assert ours.sampler._max_priority == theirs.sampler._max_priority
+    # What the buffer gives by itself then, and the priority of what is new.
+    assert torch.equal(ours.sample()["row"], theirs.sample()["row"])
+    assert ours.sampler.default_priority == theirs.sampler.default_priority
+
+
+class Misled:
+    """A tree whose search ends in the middle of rows that have no priority."""
+
+    def __init__(self, tree):
+        self.query, self._tree = tree.query, tree
+        tree[torch.arange(20, 30)] = 0.0
+
+    def __getitem__(self, rows):
+        return self._tree[rows]
+
+    def scan_lower_bound(self, mass):
+        return self._tree.scan_lower_bound(mass) * 0 + 25
+
+
+def test_a_row_that_cannot_be_drawn_gives_way_to_the_one_before():
+    """As in TorchRL, where rounding leads to one that has no priority."""
+    buffer = filled(40)
+    buffer.sampler._sum_tree = Misled(buffer.sampler._sum_tree)
+    rows, weight = draw_by_priority(buffer.sampler, 40, 16)
+    expected, info = buffer.sampler.sample(buffer.storage, 16)
+    assert torch.equal(rows, expected) and (rows == 19).all()
+    assert torch.equal(weight, info["priority_weight"])
+
+
+def test_priorities_that_are_not_positive_are_refused():
+    """A weight would be a division by nothing."""
+    buffer = filled(40)
+    buffer.sampler._min_tree[3] = 0.0
+    with pytest.raises(RuntimeError, match="positive"):
+        draw_by_priority(buffer.sampler, 40, 16)
