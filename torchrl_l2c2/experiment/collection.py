@@ -65,6 +65,8 @@ class EpisodeCollector(Collector):
         >>> collector.shutdown()
     """
 
+    frames_per_batch: int
+
     def __init__(
         self,
         env: EnvBase,
@@ -140,7 +142,7 @@ class EpisodeCollector(Collector):
         if self.env.batch_size or not self.stop_at_done:
             return super().rollout()
         steps: list[TensorDictBase] = []
-        frames: int = self.frames_per_batch
+        frames = self.frames_per_batch
         self.frames_per_batch = 1
         try:
             while len(steps) < frames and not (steps and steps[-1]["next", "done"].any()):
