@@ -154,7 +154,7 @@ class Experiment:
         check_length(budget, len(self.metrics))
         algorithm, saved = self.config.algorithm, time.monotonic()
         schedule = SCHEDULES[algorithm.schedule](self.player, self.learner, algorithm)
-        compiles = self._compile and self.agent.compilable and not self.learner.updates
+        compiles = self._compile and not self.learner.updates
         bar = Progress(
             budget.total,
             self._spent(budget),
