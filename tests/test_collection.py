@@ -8,9 +8,9 @@ import pytest
 import torch
 from torchrl.collectors import Collector
 from torchrl.envs import (
+    CatFrames,
     ExplorationType,
     GymEnv,
-    RewardSum,
     SerialEnv,
     TransformedEnv,
     set_exploration_type,
@@ -82,13 +82,37 @@ def test_the_policys_mean_acts_on_request():
     torch.testing.assert_close(episode["action"], expected)
 
 
-def test_other_environments_are_referred_to_torchrls_collector():
-    """Batched environments and other transforms are refused by name."""
-    env, actor = make(TaskConfig("pendulum", "Pendulum-v1", noise_scale=0.0))
-    with pytest.raises(TypeError, match=r"one GymEnv, got SerialEnv.*torchrl.collectors"):
-        EpisodeCollector(SerialEnv(2, lambda: GymEnv("Pendulum-v1")), actor, frames_per_batch=5)
-    with pytest.raises(TypeError, match=r"RewardSum.*torchrl.collectors"):
-        EpisodeCollector(TransformedEnv(env, RewardSum()), actor, frames_per_batch=5)
+def stacked(env):
+    """The last two observations."""
+    return TransformedEnv(env, CatFrames(2, dim=-1, in_keys=["observation"]))
+
+
+OTHERS = {
+    "another transform": lambda: stacked(GymEnv("Pendulum-v1", max_episode_steps=7)),
+    "several": lambda: SerialEnv(2, lambda: stacked(GymEnv("Pendulum-v1", max_episode_steps=7))),
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_other_environments_are_played_by_torchrls_own_loop(name):
+    """The same numbers; one environment's batch ends with its episode, where that is asked for."""
+    batches = []
+    for kind, extra in ((EpisodeCollector, {"stop_at_done": False}), (Collector, {})):
+        torch.manual_seed(0)
+        env = OTHERS[name]()
+        env.set_seed(2)
+        actor = make_actor(6, env.action_spec_unbatched)
+        collector = kind(env, actor, frames_per_batch=20, **extra)
+        torch.manual_seed(1)
+        batches.append(collector.rollout())
+    ours, theirs = batches
+    for key in ours.keys(True, True):
+        torch.testing.assert_close(ours[key], theirs[key], rtol=0, atol=0, msg=str(key))
+    by_episode = EpisodeCollector(env, actor, frames_per_batch=20)
+    shapes = [by_episode.rollout().shape for _ in range(2)]
+    assert shapes == ([(7,)] * 2 if name == "another transform" else [(2, 10)] * 2)
+    with pytest.raises(RuntimeError, match="ObservationNoise"):
+        by_episode.generator_state()
 
 
 class TestSeveralWorkers:

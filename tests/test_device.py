@@ -53,7 +53,7 @@ def trained(chosen, folder=None):
     ]
     result, updates = run.test(sampled=True), run.learner.updates
     run.close()
-    return numbers, result, updates
+    return numbers, (result.returns, result.action_variations), updates
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)

@@ -23,7 +23,7 @@ from torchrl_l2c2.experiment import (
     UniformReplayConfig,
 )
 from torchrl_l2c2.experiment.compilation import compiler_available
-from torchrl_l2c2.experiment.replay import replay_state
+from torchrl_l2c2.experiment.replay import load_replay_state, replay_state
 from torchrl_l2c2.experiment.update import make_update
 
 logging.getLogger("torchrl").setLevel(logging.ERROR)
@@ -43,7 +43,7 @@ CASES = {
     "rollout": replace(
         PAPER,
         algorithm=PPOConfig(hidden=(8,), frames=1000),
-        replay=RolloutReplayConfig(batch_size=25),
+        replay=RolloutReplayConfig(batch_size=21),
     ),
     "sac": replace(
         PAPER,
@@ -139,6 +139,45 @@ def test_compiled_it_learns_the_same_and_follows_what_may_change(name):
     same(ours, plain, rtol=1e-3, atol=1e-4)
     actor = experiment.agent.loss.out_keys.index("loss_l2c2_actor")
     assert compiled[1, actor] > 30.0 * compiled[0, actor]
+
+
+def test_advantages_are_those_of_the_whole_episode():
+    """By hand, from the last frame to the first; the shuffled rows of a minibatch keep them."""
+    experiment = Experiment(CASES["rollout"])
+    experiment.train()
+    algorithm, episode = experiment.config.algorithm, experiment.learner.replay[:]
+    critic = experiment.agent.advantage.value_network
+    with torch.no_grad():
+        value = critic(episode.select("observation"))["state_value"]
+        following = critic(episode["next"].select("observation"))["state_value"]
+    expected, later = torch.empty(60, 1), torch.zeros(1)
+    for frame in reversed(range(60)):
+        target = episode["next", "reward"][frame] + algorithm.gamma * following[frame]
+        later = target - value[frame] + algorithm.gamma * algorithm.gae_lambda * later
+        expected[frame] = later
+    torch.testing.assert_close(episode["advantage"], expected)
+    torch.testing.assert_close(episode["value_target"], expected + value)
+    draw = experiment.learner.update.draw()
+    batch = experiment.learner.update.read(*draw)
+    assert torch.equal(batch["advantage"], episode["advantage"][draw.rows])
+
+
+@pytest.mark.skipif(not compiler_available(), reason="no C++ compiler")
+def test_a_rollout_s_smaller_last_batch_is_learned_from_with_the_same_graph():
+    """Compiled, two passes with batches of 21, 21 and 18 do as they do uncompiled."""
+    played = Experiment(CASES["rollout"])
+    played.train()
+    seen, graphs = [], torch._dynamo.utils.counters["stats"]
+    for compile in (True, False):
+        experiment = Experiment(replace(CASES["rollout"], compile=compile))
+        experiment.agent.loss.load_state_dict(played.agent.loss.state_dict())
+        load_replay_state(experiment.learner.replay, replay_state(played.learner.replay))
+        before = graphs["unique_graphs"]
+        experiment.learner.learn_rollout(2)
+        assert experiment.learner.updates == 6
+        assert graphs["unique_graphs"] - before == int(compile)
+        seen.append(learned(experiment))
+    same(*seen, rtol=1e-3, atol=1e-4)
 
 
 def begin(experiment, state):

@@ -30,30 +30,29 @@ NOISE_SEED = 7_919
 
 
 class EpisodeCollector(Collector):
-    """A TorchRL :class:`~torchrl.collectors.Collector` for one Gymnasium simulator on the CPU.
+    """A TorchRL :class:`~torchrl.collectors.Collector`, fast with one Gymnasium simulator.
 
     It gives the batches that the collector gives, to the bit, but for the ``collector`` entry.
     What it leaves out is the work around every step: specs, nested TensorDicts and their copies.
-    An episode's entries are kept in lists and stacked once.
+    An episode's entries are kept in lists and stacked once. That is for a ``GymEnv`` or
+    ``GymWrapper``, also one transformed by :class:`ObservationNoise`; environments with other
+    transforms, and several at once, are played by TorchRL's own loop, at its pace, with the policy
+    as it is, and a state of theirs cannot be saved.
 
     Args:
-        env (EnvBase): a ``GymEnv`` or ``GymWrapper``, or one transformed by
-            :class:`ObservationNoise` alone, with one tensor of observations under
-            ``"observation"``.
+        env (EnvBase): on the CPU, with one tensor of observations under ``"observation"``.
         policy (TensorDictModule): reads ``"observation"``.
 
     Keyword Args:
         frames_per_batch (int): frames of a batch.
         stop_at_done (bool): whether a batch ends with the episode, even if it is shorter.
-            Learning at the end of every episode needs this. Default ``True``.
+            Learning at the end of every episode needs this. Several environments, whose episodes
+            end at different times, fill a batch in any case. Default ``True``.
         compile_policy (bool): whether to compile the policy. Random numbers are drawn as without.
             Default ``False``.
         random_frames (int): first frames whose actions are drawn from the action's bounds
             instead. Default 0.
         exploration_type (ExplorationType): default ``RANDOM``.
-
-    Raises:
-        TypeError: an environment of another kind.
 
     Examples:
         >>> from torchrl.envs import GymEnv
@@ -66,6 +65,8 @@ class EpisodeCollector(Collector):
         >>> collector.shutdown()
     """
 
+    frames_per_batch: int
+
     def __init__(
         self,
         env: EnvBase,
@@ -77,9 +78,8 @@ class EpisodeCollector(Collector):
         random_frames: int = 0,
         exploration_type: ExplorationType = ExplorationType.RANDOM,
     ) -> None:
-        self._simulator, self._noise = _parts(env)
-        self._gymnasium = self._simulator._env
-        self._dtype = self._simulator.observation_spec["observation"].dtype
+        simulator, self._noise = _parts(env)
+        self._played_by_torchrl = simulator is None
         super().__init__(
             env,
             policy,
@@ -88,6 +88,9 @@ class EpisodeCollector(Collector):
             track_traj_ids=False,
             auto_register_policy_transforms=False,
             exploration_type=exploration_type,
+            # TorchRL's loop counts them itself, and keeps no batch that one here would change.
+            init_random_frames=random_frames if self._played_by_torchrl else 0,
+            use_buffers=False if self._played_by_torchrl else None,
         )
         self.stop_at_done = stop_at_done
         self._random_frames_left = random_frames
@@ -95,8 +98,11 @@ class EpisodeCollector(Collector):
         self._observation: Tensor | None = self._carrier.get("observation")
         self._policy_keys = [key for key in policy.out_keys if not key.startswith("_")]
         self._act = _on_tensors(policy, self._policy_keys, compile_policy)
-        continuous = self._simulator.action_spec.dtype.is_floating_point
-        self._to_action = Tensor.numpy if continuous else self._simulator.read_action
+        if simulator is not None:
+            self._simulator, self._gymnasium = simulator, simulator._env
+            self._dtype = simulator.observation_spec["observation"].dtype
+            continuous = simulator.action_spec.dtype.is_floating_point
+            self._to_action = Tensor.numpy if continuous else simulator.read_action
 
     def act(self, observation: Tensor) -> Tensor:
         """The policy's action at one observation, in the exploration type that is set."""
@@ -105,6 +111,8 @@ class EpisodeCollector(Collector):
     @torch.no_grad()
     def rollout(self) -> TensorDictBase:
         """Plays up to ``frames_per_batch`` frames; what iterating over the collector calls."""
+        if self._played_by_torchrl:
+            return self._rollout_by_torchrl()
         action_index = self._policy_keys.index("action")
         observation = self._observation
         steps = []
@@ -130,6 +138,19 @@ class EpisodeCollector(Collector):
         self._observation = observation
         return self._stack(steps)
 
+    def _rollout_by_torchrl(self) -> TensorDictBase:
+        if self.env.batch_size or not self.stop_at_done:
+            return super().rollout()
+        steps: list[TensorDictBase] = []
+        frames = self.frames_per_batch
+        self.frames_per_batch = 1
+        try:
+            while len(steps) < frames and not (steps and steps[-1]["next", "done"].any()):
+                steps.append(super().rollout())
+        finally:
+            self.frames_per_batch = frames
+        return torch.cat(steps)
+
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
         """Seeds the simulator and, with another seed, its noise; the next episode starts anew.
 
@@ -150,8 +171,14 @@ class EpisodeCollector(Collector):
         """The states of the simulator's and the noise's random generators, between episodes.
 
         Raises:
-            RuntimeError: in the middle of an episode, whose simulator's state cannot be saved.
+            RuntimeError: in the middle of an episode, whose simulator's state cannot be saved, or
+                where TorchRL's loop plays.
         """
+        if self._played_by_torchrl:
+            raise RuntimeError(
+                f"the random state of {self.env} is not known; only that of one GymEnv, with no "
+                "transform but ObservationNoise, can be saved."
+            )
         if self._observation is not None:
             raise RuntimeError("an episode is being played; a run can be saved between episodes.")
         simulator = self._gymnasium.unwrapped.np_random.bit_generator.state
@@ -225,23 +252,17 @@ def check_finite(batch: TensorDictBase, first_frame: int) -> None:
         )
 
 
-def _parts(env: EnvBase) -> tuple[GymWrapper, ObservationNoise | None]:
-    """The simulator and its noise."""
+def _parts(env: EnvBase) -> tuple[GymWrapper | None, ObservationNoise | None]:
+    """The simulator and its noise; no simulator where there is more to the environment."""
     transforms: list[Transform] = []
     simulator = env
     if isinstance(env, TransformedEnv):
         transforms, simulator = list(_flat(env.transform)), env.base_env
-    if not isinstance(simulator, GymWrapper) or simulator.batch_size:
-        raise TypeError(
-            f"EpisodeCollector takes one GymEnv, got {type(simulator).__name__} of batch size "
-            f"{tuple(simulator.batch_size)}; use torchrl.collectors.Collector for any other."
-        )
-    if len(transforms) > 1 or not all(isinstance(t, ObservationNoise) for t in transforms):
-        names = [type(t).__name__ for t in transforms]
-        raise TypeError(
-            f"EpisodeCollector takes no transform but one ObservationNoise, got {names}; use "
-            "torchrl.collectors.Collector for any other."
-        )
+    plain = isinstance(simulator, GymWrapper) and not simulator.batch_size
+    if not plain or len(transforms) > 1:
+        return None, None
+    if not all(isinstance(transform, ObservationNoise) for transform in transforms):
+        return None, None
     return simulator, transforms[0] if transforms else None
 
 

@@ -16,6 +16,7 @@ import csv
 import hashlib
 import io
 import json
+import math
 import os
 import pickle
 import struct
@@ -144,8 +145,17 @@ def _named(path: Path) -> Iterator[None]:
 
 
 def write_json(path: str | Path, value: Any) -> None:
-    """Writes a value as indented JSON, whole or not at all."""
-    write_atomically(path, (json.dumps(value, indent=2) + "\n").encode())
+    """Writes a value as indented JSON, whole or not at all; what is no number is ``null`` there."""
+    write_atomically(path, (json.dumps(_strict(value), indent=2) + "\n").encode())
+
+
+def _strict(value: Any) -> Any:
+    """JSON knows neither NaN nor infinity; Python writes them all the same."""
+    if isinstance(value, Mapping):
+        return {key: _strict(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_strict(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def save_checkpoint(folder: str | Path, episode: int, state: Mapping[str, Any], keep: int) -> Path:

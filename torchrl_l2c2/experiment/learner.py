@@ -97,7 +97,12 @@ class Learner:
         transitions = transitions.copy().set(("next", "reward"), scaled).to(self.agent.device)
         if self.agent.advantage is not None:
             transitions = self.agent.advantage(transitions)
-        self.replay.extend(transitions.select(*self.agent.loss.in_keys, strict=False))
+        read = list(self.agent.loss.in_keys)
+        if self.agent.advantage is not None:
+            # Where they are missing, TorchRL's loss estimates them anew, along a minibatch, whose
+            # rows do not follow each other in time.
+            read += [self.agent.advantage.advantage_key, self.agent.advantage.value_target_key]
+        self.replay.extend(transitions.select(*read, strict=False))
 
     def learn(self, updates: int) -> None:
         """Makes so many updates with batches from the replay buffer, once it holds one."""

@@ -30,7 +30,7 @@ class Agent:
         policy_terms: the algorithm's own terms that train the policy; a regularizer's loss knows
             its own.
         policy_delay: updates of the values per update of the policy.
-        compilable: whether the loss compiles into one graph.
+        compilable: whether the regularized loss compiles into one graph.
     """
 
     loss: LossModule

@@ -97,6 +97,4 @@ class PPOConfig(AlgorithmConfig):
             advantage=advantage,
             max_grad_norm=self.max_grad_norm,
             policy_terms=frozenset({"loss_objective", "loss_entropy"}),
-            # TorchRL's PPO losses dispatch on distributions in ways that Dynamo does not trace.
-            compilable=False,
         )
