@@ -182,7 +182,10 @@ class TestInARun:
         assert ratio.item() == pytest.approx(5.0)
         assert loss.caps_lambda_temporal.item() != pytest.approx(0.01)
 
-    @pytest.mark.parametrize("kind", KINDS)
+    @pytest.mark.parametrize(
+        "kind",
+        ["target", *(pytest.param(k, marks=pytest.mark.slow) for k in KINDS if k != "target")],
+    )
     def test_a_continued_run_is_the_uninterrupted_one(self, tmp_path, kind):
         """Parameters, gains and metrics, to the last bit."""
         config = small(L2C2Config(**KINDS[kind]), late_share=0.0)

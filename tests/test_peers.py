@@ -14,6 +14,7 @@ SETTINGS = {
 }
 
 
+@pytest.mark.slow
 def test_rows_are_seconds_here_by_seconds_there():
     """Two of the same kind, of which none is a hundred times as fast as the other."""
     rows = list(against("here / there", "sac", "sac", SETTINGS, rounds=1, at_most=0.9))

@@ -110,7 +110,8 @@ def test_the_batch_has_the_entries_and_neighbors_that_the_buffer_gives():
 
 
 @pytest.mark.skipif(not compiler_available(), reason="no C++ compiler")
-@pytest.mark.parametrize("name", ["prioritized", "sac"])
+# The rollout's, below, is the quick one with Adam.
+@pytest.mark.parametrize("name", ["prioritized", pytest.param("sac", marks=pytest.mark.slow)])
 def test_compiled_it_learns_the_same_and_follows_what_may_change(name):
     """Gain, learning rate, a policy left out, and an older state, loaded over its tensors."""
     seen = []

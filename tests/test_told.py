@@ -78,6 +78,7 @@ def test_a_parameter_that_is_not_finite_stops_every_algorithm(tmp_path, name):
 
     last = make(name).train(2)[-1]["updates"]
     run.agent.optimizer.step = broken
+    run.learner.renew()
     with pytest.raises(FloatingPointError, match=f"not finite after update {last}: ") as stopped:
         run.train(2)
     assert parameter_name in str(stopped.value)

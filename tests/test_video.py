@@ -84,6 +84,7 @@ def test_a_task_that_draws_nothing_is_refused(tmp_path):
     assert not list(folder.glob("*video*"))
 
 
+@pytest.mark.slow
 def test_recording_is_a_setting(tmp_path):
     """After training; the command says where it is."""
     command = [

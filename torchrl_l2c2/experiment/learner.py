@@ -73,6 +73,7 @@ class Learner:
         self.skipped_updates = 0
         self.first_update_seconds: float | None = None
         self.tells_faint_regularizer = True
+        self._device = agent.device
         self._reward_factor = reward_factor
         self._compile = compile
         self._skip_nonfinite = skip_nonfinite
@@ -94,7 +95,9 @@ class Learner:
     def remember(self, transitions: TensorDictBase) -> None:
         """Keeps the entries that the loss reads, and no others: sampling copies every one."""
         scaled = transitions["next", "reward"] * self._reward_factor
-        transitions = transitions.copy().set(("next", "reward"), scaled).to(self.agent.device)
+        transitions = transitions.copy().set(("next", "reward"), scaled)
+        if self._device.type != "cpu":  # Finding out that all is there takes long, too.
+            transitions = transitions.to(self._device)
         if self.agent.advantage is not None:
             transitions = self.agent.advantage(transitions)
         read = list(self.agent.loss.in_keys)
