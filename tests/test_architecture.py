@@ -44,7 +44,7 @@ experiment.algorithms.__init__
 experiment.config
 experiment.naming
 experiment.reports.statistics experiment.reports.paper experiment.reports.differences
-experiment.reports.records
+experiment.reports.records experiment.reports.document
 experiment.reports.runs experiment.reports.groups
 experiment.reports.score
 experiment.reports.tables
