@@ -19,7 +19,7 @@ ROUGH = 0.2
 SMOOTH = 0.02
 NOISY = 0.5
 WIDE = 0.4
-STEEP = 20.0
+STEEP = 10.0
 FAINT = 0.01
 CONCENTRATED = 0.3
 
@@ -100,9 +100,8 @@ def findings(diagnosis: Diagnosis) -> list[Finding]:
     if all(_still(diagnosis)):
         told = [_stillness(diagnosis)]
     else:
-        told = [*_actions(diagnosis), *_reasons(diagnosis)]
-        if not any(finding.fault for finding in told):
-            told.insert(0, _plain(diagnosis))
+        told = list(_actions(diagnosis)) or [_plain(diagnosis)]
+        told += _reasons(diagnosis)
     return [*told, *_training(diagnosis)]
 
 
@@ -176,7 +175,7 @@ def _flips(name: str, action: Tensor, gain: float, rate: float | None) -> Findin
 
 def _reasons(diagnosis: Diagnosis) -> Iterator[Finding]:
     """Why the actions move as they do."""
-    shaking = (diagnosis.relative.diff(dim=0).square().mean().sqrt()).item() > SMOOTH
+    shaking = _change(diagnosis.relative) > SMOOTH
     if diagnosis.noise_share >= NOISY and shaking:
         yield Finding(
             "noise",
@@ -186,39 +185,45 @@ def _reasons(diagnosis: Diagnosis) -> Iterator[Finding]:
         )
     constants = diagnosis.policy_lipschitz
     median, steps = constants.nanmedian().item(), diagnosis.worst(1)
-    if steps and median > 0.0 and (ratio := constants[steps[0]].item() / median) >= STEEP:
-        yield Finding(
-            "steep",
-            f"The policy has steep spots: at step {steps[0]} its local Lipschitz constant is "
-            f"{constants[steps[0]]:.3g}, {ratio:.0f} times its median of {median:.3g}; large ones "
-            f"are {_where(constants.nan_to_num().unsqueeze(-1))}.",
-        )
+    if shaking and steps and median > 0.0:
+        ratio = constants[steps[0]].item() / median
+        if ratio >= STEEP:
+            yield Finding(
+                "steep",
+                f"The policy has steep spots: at step {steps[0]} its local Lipschitz constant is "
+                f"{constants[steps[0]]:.3g}, {ratio:.0f} times its median of {median:.3g}.",
+            )
     if diagnosis.spread >= WIDE:
         yield Finding(
             "wide",
             f"Its samples are wide: their standard deviation is {diagnosis.spread:.2f} of half the "
-            f"range, where draws from all of it have .58. The mean may be smooth; what acts in "
-            "training is not, and distances of policies that are relative to the width are small.",
+            f"range, where draws from all of it have .58 and more if they crowd at its ends. However "
+            "smooth the mean, what acts in training is not, and distances of policies that are "
+            "relative to the width are small.",
         )
 
 
 def _training(diagnosis: Diagnosis) -> Iterator[Finding]:
-    """Of the regularizer's terms together."""
-    added = {name: share for name, share in diagnosis.shares.items() if share.added}
+    """Of the regularizer's terms, by their gradients where these are known."""
     for measured, what in (
         ("gradient", "of the gradient of the loss's own terms"),
         ("size", "of the loss, late in training"),
     ):
-        known = {name: getattr(share, measured) for name, share in added.items()}
-        known = {name: value for name, value in known.items() if not math.isnan(value)}
+        added = {
+            n: getattr(share, measured) for n, share in diagnosis.shares.items() if share.added
+        }
+        known = {name: value for name, value in added.items() if not math.isnan(value)}
+        faint = {name: value for name, value in known.items() if value < FAINT}
+        if faint:
+            each = ", ".join(f"{name} {value:.2%}" for name, value in faint.items())
+            every = len(faint) == len(known)
+            yield Finding(
+                "faint",
+                f"{'All' if every else 'Some'} of the regularizer's terms are small: {each} {what}. "
+                "They change little; raise their gains.",
+                fault=every,
+            )
         if known:
-            if max(known.values()) < FAINT:
-                each = ", ".join(f"{name} {value:.2%}" for name, value in known.items())
-                yield Finding(
-                    "faint",
-                    f"The regularizer's terms are small: {each} {what}. It changes little; raise "
-                    "its gains.",
-                )
             return
 
 
@@ -234,7 +239,8 @@ def _plain(diagnosis: Diagnosis) -> Finding:
     moving = diagnosis.relative.diff(dim=0).abs().mean(1, keepdim=True)
     return Finding(
         "moves",
-        f"No rule finds a fault, but it is not smooth: {numbers}; the change is {_where(moving)}.",
+        f"It moves much, but neither flips, nor jumps between its bounds, nor looks like noise: "
+        f"{numbers}; the change is {_where(moving)}.",
         fault=False,
     )
 

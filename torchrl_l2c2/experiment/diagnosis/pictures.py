@@ -1,0 +1,227 @@
+"""Pictures of diagnoses: one of each for every policy, on the same axes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrl_l2c2.experiment.diagnosis.measured import Diagnosis
+from torchrl_l2c2.experiment.reports.figures import drawn, subplots
+from torchrl_l2c2.metrics import amplitude_spectrum
+
+WIDTH = 4.6  # inches, of every picture
+ZOOM = 60  # steps that are shown close by
+MOST_ACTIONS = 4  # that are drawn: those that change most
+COLORS = ("#1f5fa8", "#c0562b", "#2a7f62", "#8a6d1d")
+WORST = "#c2182b"
+BINS = 40
+
+
+def draw_actions(diagnoses: Sequence[Diagnosis]) -> list[bytes]:
+    """Mean actions over an episode, and close by where they change most; SVG, one for each."""
+    return [_draw(2, 3.6, lambda axes, one=one: _actions(axes, one)) for one in diagnoses]
+
+
+def draw_spectra(diagnoses: Sequence[Diagnosis]) -> list[bytes]:
+    """Amplitudes of the frequencies that the actions are made of, as shares of their range."""
+    spectra = [
+        amplitude_spectrum(one.relative[:, busiest(one)], one.rate or 1.0) for one in diagnoses
+    ]
+    top = max(float(amplitudes[1:].max()) for _, amplitudes in spectra) or 1.0
+
+    def draw(axes: Sequence[Any], one: Diagnosis, spectrum: tuple[Tensor, Tensor]) -> None:
+        (axis,), (frequencies, amplitudes) = axes, spectrum
+        for place, number in enumerate(busiest(one)):
+            axis.plot(
+                *(frequencies[1:].numpy(), amplitudes[1:, place].clamp_min(1e-9).numpy()),
+                **_line(place, number),
+            )
+        axis.set_yscale("log")
+        axis.set_ylim(top * 1e-4, top * 1.5)
+        axis.set_xlabel("cycles per step" if one.rate is None else "hertz")
+        axis.set_ylabel("amplitude, of the range")
+        _legend(axis, one)
+
+    return [
+        _draw(1, 2.4, lambda axes, one=one, s=spectrum: draw(axes, one, s))
+        for one, spectrum in zip(diagnoses, spectra, strict=True)
+    ]
+
+
+def draw_steepness(diagnoses: Sequence[Diagnosis]) -> list[bytes]:
+    """Local Lipschitz constants along the episode, and where among its states; worst marked."""
+    policy = _limits(one.policy_lipschitz for one in diagnoses)
+    value = _limits(one.value_lipschitz for one in diagnoses if one.value_lipschitz is not None)
+
+    def draw(axes: Sequence[Any], one: Diagnosis) -> None:
+        over_time, of_value, plane = axes
+        _along(over_time, one.policy_lipschitz, one, policy, "policy")
+        if one.value_lipschitz is None:
+            of_value.text(0.5, 0.5, "no value function", ha="center", transform=of_value.transAxes)
+        else:
+            _along(of_value, one.value_lipschitz, one, value, "value")
+        of_value.set_xlabel("step")
+        _plane(plane, one, policy)
+
+    return [_draw(3, 6.4, lambda axes, one=one: draw(axes, one)) for one in diagnoses]
+
+
+def draw_neighborhoods(diagnoses: Sequence[Diagnosis]) -> list[bytes]:
+    """Histograms of the neighbors' distances and of the gain that is applied there."""
+    return [_draw(2, 3.8, lambda axes, one=one: _neighborhood(axes, one)) for one in diagnoses]
+
+
+def draw_shares(diagnoses: Sequence[Diagnosis]) -> list[bytes]:
+    """Bars of how much of the loss, and of its gradient, every term is."""
+    return [_draw(1, 2.6, lambda axes, one=one: _shares(axes[0], one)) for one in diagnoses]
+
+
+def busiest(one: Diagnosis) -> list[int]:
+    """The actions that change most, in their order."""
+    change = one.relative.diff(dim=0).abs().mean(0)
+    return sorted(change.topk(min(MOST_ACTIONS, len(change))).indices.tolist())
+
+
+def _actions(axes: Sequence[Any], one: Diagnosis) -> None:
+    change = one.relative.diff(dim=0).abs().sum(1)
+    sums = change.unfold(0, min(ZOOM, len(change)), 1).sum(1)
+    start = int(sums.argmax())
+    end = min(start + ZOOM, len(one.actions) - 1)
+    for axis, marker in zip(axes, (None, "."), strict=True):
+        for place, number in enumerate(busiest(one)):
+            steps = range(len(one.actions))
+            axis.plot(steps, one.actions[:, number].numpy(), marker=marker, **_line(place, number))
+        if one.bounded:
+            for bound in {*one.low.tolist(), *one.high.tolist()}:
+                axis.axhline(bound, color="black", linewidth=0.6, linestyle=":")
+        axis.set_ylabel("action")
+    axes[0].axvspan(start, end, color=WORST, alpha=0.12, linewidth=0)
+    axes[1].set_xlim(start, end)
+    axes[1].set_ylim(axes[0].get_ylim())
+    axes[1].set_xlabel("step (below: where it changes most)")
+    _legend(axes[0], one)
+
+
+def _along(
+    axis: Any, constants: Tensor, one: Diagnosis, limits: tuple[float, float], name: str
+) -> None:
+    axis.plot(range(len(constants)), constants.numpy(), color=COLORS[0], linewidth=0.7)
+    for place, step in enumerate(one.worst(), 1):
+        axis.plot([step], [constants[step]], "o", color=WORST, markersize=4)
+        axis.annotate(
+            str(place),
+            (step, float(constants[step])),
+            xytext=(3, 3),
+            textcoords="offset points",
+            color=WORST,
+            fontsize=8,
+        )
+    axis.set_yscale("log")
+    axis.set_ylim(limits[0] / 2, limits[1] * 3)
+    axis.set_ylabel(f"{name}, constant")
+
+
+def _plane(axis: Any, one: Diagnosis, limits: tuple[float, float]) -> None:
+    """The episode's states in the plane that holds most of them."""
+    from matplotlib.colors import LogNorm
+
+    states = one.observations
+    spread = states.std(0)
+    states = (states - states.mean(0)) / torch.where(spread > 0.0, spread, 1.0)
+    directions = torch.linalg.svd(states, full_matrices=False).Vh[:2]
+    x, y = (states @ directions.T).T if len(directions) > 1 else (states[:, 0], states[:, 0])
+    order = one.policy_lipschitz.nan_to_num().argsort()
+    dots = axis.scatter(
+        *(x[order].numpy(), y[order].numpy()),
+        c=one.policy_lipschitz.nan_to_num(limits[0])[order].clamp_min(limits[0]).numpy(),
+        norm=LogNorm(*limits),
+        cmap="viridis",
+        s=7,
+        linewidths=0,
+        rasterized=True,
+    )
+    for place, step in enumerate(one.worst(), 1):
+        axis.plot(*([x[step]], [y[step]]), "o", mfc="none", color=WORST, markersize=7)
+        axis.annotate(
+            str(place),
+            (float(x[step]), float(y[step])),
+            xytext=(5, 4),
+            textcoords="offset points",
+            color=WORST,
+            fontsize=8,
+        )
+    axis.set_xlabel("states, first principal direction")
+    axis.set_ylabel("second")
+    axis.figure.colorbar(dots, ax=axis, label="policy, constant", aspect=12)
+
+
+def _neighborhood(axes: Sequence[Any], one: Diagnosis) -> None:
+    near = one.neighborhood
+    distance, gain = one.distance[one.distance.isfinite()], one.gain
+    axes[0].hist(distance.numpy(), bins=BINS, range=(0.0, near.radius), color=COLORS[0])
+    axes[0].set_xlabel("distance max |u|")
+    low, high = near.lambda_min, near.lambda_max
+    edges = torch.logspace(math.log10(low), math.log10(high), BINS + 1).numpy()
+    axes[1].hist(gain.clamp(low, high).numpy(), bins=edges, color=COLORS[2])
+    axes[1].set_xscale("log")
+    for bound, name in ((low, "lambda_min"), (high, "lambda_max")):
+        axes[1].axvline(bound, color="black", linewidth=0.8, linestyle=":")
+        inward = {"ha": "left"} if bound == low else {"ha": "right"}
+        axes[1].annotate(
+            f" {name} ", (bound, 0.97), xycoords=("data", "axes fraction"), va="top", **inward
+        )
+    axes[1].axvline(gain.mean(), color=WORST, linewidth=1.2)
+    axes[1].set_xlabel(f"applied gain, mean {gain.mean():.3g} (red)")
+    for axis in axes:
+        axis.set_yticks([])
+
+
+def _shares(axis: Any, one: Diagnosis) -> None:
+    names = list(one.shares)[::-1]
+    kinds = (("size", "of the loss's size", COLORS[0]), ("gradient", "gradient", COLORS[1]))
+    for kind, label, color in kinds:
+        values = [getattr(one.shares[name], kind) for name in names]
+        height = 0.4 if kind == "size" else -0.4
+        axis.barh(names, values, height, align="edge", label=label, color=color)
+        for place, value in enumerate(values):
+            if not math.isnan(value):
+                axis.annotate(f" {value:.2%}", (value, place + height / 2), va="center", fontsize=8)
+    axis.margins(x=0.2)
+    axis.set_xlabel("share of the loss; gradient over that of its own terms")
+    axis.legend(frameon=False, fontsize=8, loc="best")
+
+
+def _draw(down: int, height: float, fill: Callable[[Sequence[Any]], None]) -> bytes:
+    figure, axes = subplots(1, down, (WIDTH, height))
+    for axis in axes:
+        axis.grid(alpha=0.25)
+    fill(axes)
+    return drawn(figure)
+
+
+def _limits(constants: Iterable[Tensor]) -> tuple[float, float]:
+    """Of all policies together; the lower hundredth is left out."""
+    known = [each[each.isfinite() & (each > 0.0)] for each in constants]
+    together = torch.cat([*known, torch.empty(0)])
+    if not len(together):
+        return 1.0, 10.0
+    low, high = together.quantile(0.01).item(), together.max().item()
+    return low, max(high, low * 1.01)
+
+
+def _line(place: int, number: int) -> dict[str, Any]:
+    return {
+        "color": COLORS[place],
+        "linewidth": 0.9,
+        "markersize": 3,
+        "label": f"action[{number}]",
+    }
+
+
+def _legend(axis: Any, one: Diagnosis) -> None:
+    if one.actions.shape[1] > 1:
+        axis.legend(frameon=False, fontsize=8, ncols=2, loc="best")
