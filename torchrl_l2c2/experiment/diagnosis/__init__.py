@@ -1,7 +1,7 @@
 """Why a policy shakes: measured, in words, and as one page.
 
-``python -m torchrl_l2c2.experiment.diagnose RUN [RUN...]`` writes the page of runs; :func:`diagnose`
-takes any TorchRL actor with an environment.
+``python -m torchrl_l2c2.experiment.diagnose RUN [RUN...]`` writes the page of runs;
+:func:`diagnose` takes any TorchRL actor with an environment.
 """
 
 from torchrl_l2c2.experiment.diagnosis.measured import Diagnosis, TermShare, diagnose

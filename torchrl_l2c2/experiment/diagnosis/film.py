@@ -88,4 +88,4 @@ def _strip(one: Diagnosis) -> tuple[Picture, Any]:
     pixels = np.asarray(imread(io.BytesIO(drawn(figure, "png"))))[..., :3]
     steps = np.stack([np.arange(len(one.actions)), np.zeros(len(one.actions))], 1)
     places = axis.transData.transform(steps)[:, 0] * pixels.shape[1] / figure.bbox.width
-    return np.uint8(255 * pixels), places.round().astype(int).clip(0, pixels.shape[1] - 1)
+    return (255 * pixels).astype(np.uint8), places.round().astype(int).clip(0, pixels.shape[1] - 1)

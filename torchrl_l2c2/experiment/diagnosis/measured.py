@@ -116,7 +116,8 @@ class Diagnosis:
 
         They are at least a fiftieth of the episode apart, so that one place is not listed twice.
         """
-        left, found = self.policy_lipschitz.nan_to_num(-math.inf).clone(), []
+        left = self.policy_lipschitz.nan_to_num(-math.inf).clone()
+        found: list[int] = []
         apart = max(1, len(left) // 50)
         while len(found) < number and left.max() > -math.inf:
             step = int(left.argmax())
@@ -278,7 +279,7 @@ def _steepness(
 def _constants(places: tuple[Tensor, Tensor], here: Tensor, there: Tensor) -> Tensor:
     """Local Lipschitz constants from a function's values at states and at their neighbors."""
     rows = _flat(there).unflatten(0, places[1].shape[:2])
-    return local_lipschitz(*(place.cpu() for place in places), _flat(here), rows)
+    return local_lipschitz(places[0].cpu(), places[1].cpu(), _flat(here), rows)
 
 
 def _means(played: Sequence[TensorDictBase], env: EnvBase) -> dict[str, float]:

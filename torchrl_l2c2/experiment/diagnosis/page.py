@@ -32,7 +32,7 @@ STYLE = """
 .card { border: 1px solid #ddd; border-radius: 6px; padding: .8rem 1rem; }
 .card p { color: #222; margin: .5rem 0 0; padding-left: .7rem; border-left: 3px solid #2a7f62; }
 .card p.fault { border-color: #c2182b; } video { max-width: 100%; } p { max-width: 60rem; }
-td:first-child { white-space: normal; }
+th { max-width: 11rem; overflow-wrap: anywhere; }
 """
 LISTED = 8  # coordinates of an observation, in the tables
 FIRST = {"return": "return", "length": "steps", "action_variation": "action variation (the paper)"}
@@ -120,19 +120,21 @@ def _measures(diagnoses: Sequence[Diagnosis]) -> Table:
         [names[name], *(_number(one.measures.get(name, math.nan)) for one in diagnoses)]
         for name in known
     ]
-    noise = "change by noise on observations (its standard deviation)"
-    of_change = "... its part of the squared change per step"
+    noise = "change by noise (of so much)"
+    of_change = "... part of the squared change"
     rows += [
         [noise, *(f"{_number(one.noise_action)} ({one.noise_scale:g})" for one in diagnoses)],
         [of_change, *(f"{one.noise_share:.1%}" for one in diagnoses)],
         [
-            "standard deviation of samples, of half the range",
+            "deviation of samples",
             *(_number(d.spread) for d in diagnoses),
         ],
     ]
     note = (
         "Means over the test episodes with mean actions; the last three rows are of the first of "
-        "them. Smaller is smoother, but for the return, and for the gain on the action before, "
+        "them: the root mean square change by noise on observations and its standard deviation, the "
+        "part of the mean squared change from step to step that such noise makes alone, and the "
+        "standard deviation of sampled actions, of half the range. Smaller is smoother, but for the return, and for the gain on the action before, "
         "where 1 is smooth. Definitions and units: torchrl_l2c2.metrics."
     )
     return Table("Return and smoothness", ["", *(one.name for one in diagnoses)], rows, [note])

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from torchrl_l2c2.experiment.diagnosis.measured import Diagnosis
 from torchrl_l2c2.experiment.reports.figures import drawn, subplots
-from torchrl_l2c2.metrics import amplitude_spectrum
 
 WIDTH = 4.6  # inches, of every picture
 ZOOM = 60  # steps that are shown close by
@@ -23,32 +22,17 @@ BINS = 40
 
 def draw_actions(diagnoses: Sequence[Diagnosis]) -> list[bytes]:
     """Mean actions over an episode, and close by where they change most; SVG, one for each."""
-    return [_draw(2, 3.6, lambda axes, one=one: _actions(axes, one)) for one in diagnoses]
+    return [_draw(2, 3.6, _actions, one) for one in diagnoses]
 
 
 def draw_spectra(diagnoses: Sequence[Diagnosis]) -> list[bytes]:
     """Amplitudes of the frequencies that the actions are made of, as shares of their range."""
-    spectra = [
-        amplitude_spectrum(one.relative[:, busiest(one)], one.rate or 1.0) for one in diagnoses
-    ]
+    spectra = [spectrum(one.relative[:, busiest(one)], one.rate or 1.0) for one in diagnoses]
     top = max(float(amplitudes[1:].max()) for _, amplitudes in spectra) or 1.0
 
-    def draw(axes: Sequence[Any], one: Diagnosis, spectrum: tuple[Tensor, Tensor]) -> None:
-        (axis,), (frequencies, amplitudes) = axes, spectrum
-        for place, number in enumerate(busiest(one)):
-            axis.plot(
-                *(frequencies[1:].numpy(), amplitudes[1:, place].clamp_min(1e-9).numpy()),
-                **_line(place, number),
-            )
-        axis.set_yscale("log")
-        axis.set_ylim(top * 1e-4, top * 1.5)
-        axis.set_xlabel("cycles per step" if one.rate is None else "hertz")
-        axis.set_ylabel("amplitude, of the range")
-        _legend(axis, one)
-
     return [
-        _draw(1, 2.4, lambda axes, one=one, s=spectrum: draw(axes, one, s))
-        for one, spectrum in zip(diagnoses, spectra, strict=True)
+        _draw(1, 2.4, _spectrum, one, *each, top)
+        for one, each in zip(diagnoses, spectra, strict=True)
     ]
 
 
@@ -57,27 +41,36 @@ def draw_steepness(diagnoses: Sequence[Diagnosis]) -> list[bytes]:
     policy = _limits(one.policy_lipschitz for one in diagnoses)
     value = _limits(one.value_lipschitz for one in diagnoses if one.value_lipschitz is not None)
 
-    def draw(axes: Sequence[Any], one: Diagnosis) -> None:
-        over_time, of_value, plane = axes
-        _along(over_time, one.policy_lipschitz, one, policy, "policy")
-        if one.value_lipschitz is None:
-            of_value.text(0.5, 0.5, "no value function", ha="center", transform=of_value.transAxes)
-        else:
-            _along(of_value, one.value_lipschitz, one, value, "value")
-        of_value.set_xlabel("step")
-        _plane(plane, one, policy)
-
-    return [_draw(3, 6.4, lambda axes, one=one: draw(axes, one)) for one in diagnoses]
+    return [_draw(3, 6.8, _steepness, one, policy, value) for one in diagnoses]
 
 
 def draw_neighborhoods(diagnoses: Sequence[Diagnosis]) -> list[bytes]:
     """Histograms of the neighbors' distances and of the gain that is applied there."""
-    return [_draw(2, 3.8, lambda axes, one=one: _neighborhood(axes, one)) for one in diagnoses]
+    return [_draw(2, 3.8, _neighborhood, one) for one in diagnoses]
 
 
 def draw_shares(diagnoses: Sequence[Diagnosis]) -> list[bytes]:
     """Bars of how much of the loss, and of its gradient, every term is."""
-    return [_draw(1, 2.6, lambda axes, one=one: _shares(axes[0], one)) for one in diagnoses]
+    return [_draw(1, 0.9 + 0.32 * len(one.shares), _shares, one) for one in diagnoses]
+
+
+def spectrum(actions: Tensor, sampling_rate: float = 1.0) -> tuple[Tensor, Tensor]:
+    """Frequencies ``[F]`` and amplitudes ``[F, A]`` of actions ``[T, A]``, up to half the rate.
+
+    :func:`~torchrl_l2c2.metrics.amplitude_spectrum` and what is made of it leave the highest
+    frequency out, as published; an action that flips at every step has all of its amplitude there.
+
+    Examples:
+        >>> flipping = torch.tensor([[1.0], [-1.0], [1.0], [-1.0]])
+        >>> frequencies, amplitudes = spectrum(flipping, sampling_rate=20.0)
+        >>> frequencies.tolist(), amplitudes.squeeze(-1).tolist()
+        ([0.0, 5.0, 10.0], [0.0, 0.0, 1.0])
+    """
+    steps = len(actions)
+    amplitudes = 2.0 / steps * torch.fft.rfft(actions, dim=0).abs()
+    if steps % 2 == 0:
+        amplitudes[-1] /= 2.0  # It stands for one frequency, all others for two of opposite sign.
+    return torch.fft.rfftfreq(steps, 1.0 / sampling_rate), amplitudes
 
 
 def busiest(one: Diagnosis) -> list[int]:
@@ -102,8 +95,35 @@ def _actions(axes: Sequence[Any], one: Diagnosis) -> None:
     axes[0].axvspan(start, end, color=WORST, alpha=0.12, linewidth=0)
     axes[1].set_xlim(start, end)
     axes[1].set_ylim(axes[0].get_ylim())
-    axes[1].set_xlabel("step (below: where it changes most)")
+    axes[1].set_xlabel("step, where it changes most")
     _legend(axes[0], one)
+
+
+def _spectrum(
+    axes: Sequence[Any], one: Diagnosis, frequencies: Tensor, amplitudes: Tensor, top: float
+) -> None:
+    (axis,) = axes
+    for place, number in enumerate(busiest(one)):
+        heights = amplitudes[1:, place].clamp_min(1e-9).numpy()
+        axis.plot(frequencies[1:].numpy(), heights, **_line(place, number))
+    axis.set_yscale("log")
+    axis.set_ylim(top * 1e-4, top * 1.5)
+    axis.set_xlabel("cycles per step" if one.rate is None else "hertz")
+    axis.set_ylabel("amplitude, of the range")
+    _legend(axis, one)
+
+
+def _steepness(
+    axes: Sequence[Any], one: Diagnosis, policy: tuple[float, float], value: tuple[float, float]
+) -> None:
+    over_time, of_value, plane = axes
+    _along(over_time, one.policy_lipschitz, one, policy, "policy")
+    if one.value_lipschitz is None:
+        of_value.text(0.5, 0.5, "no value function", ha="center", transform=of_value.transAxes)
+    else:
+        _along(of_value, one.value_lipschitz, one, value, "value")
+    of_value.set_xlabel("step")
+    _plane(plane, one, policy)
 
 
 def _along(
@@ -156,7 +176,7 @@ def _plane(axis: Any, one: Diagnosis, limits: tuple[float, float]) -> None:
         )
     axis.set_xlabel("states, first principal direction")
     axis.set_ylabel("second")
-    axis.figure.colorbar(dots, ax=axis, label="policy, constant", aspect=12)
+    axis.figure.colorbar(dots, ax=axis, label="policy, constant", location="bottom", aspect=40)
 
 
 def _neighborhood(axes: Sequence[Any], one: Diagnosis) -> None:
@@ -168,20 +188,16 @@ def _neighborhood(axes: Sequence[Any], one: Diagnosis) -> None:
     edges = torch.logspace(math.log10(low), math.log10(high), BINS + 1).numpy()
     axes[1].hist(gain.clamp(low, high).numpy(), bins=edges, color=COLORS[2])
     axes[1].set_xscale("log")
-    for bound, name in ((low, "lambda_min"), (high, "lambda_max")):
+    for bound in (low, high):
         axes[1].axvline(bound, color="black", linewidth=0.8, linestyle=":")
-        inward = {"ha": "left"} if bound == low else {"ha": "right"}
-        axes[1].annotate(
-            f" {name} ", (bound, 0.97), xycoords=("data", "axes fraction"), va="top", **inward
-        )
     axes[1].axvline(gain.mean(), color=WORST, linewidth=1.2)
-    axes[1].set_xlabel(f"applied gain, mean {gain.mean():.3g} (red)")
+    axes[1].set_xlabel(f"applied gain between its bounds (dotted); mean {gain.mean():.3g} (red)")
     for axis in axes:
         axis.set_yticks([])
 
 
-def _shares(axis: Any, one: Diagnosis) -> None:
-    names = list(one.shares)[::-1]
+def _shares(axes: Sequence[Any], one: Diagnosis) -> None:
+    (axis,), names = axes, list(one.shares)[::-1]
     kinds = (("size", "of the loss's size", COLORS[0]), ("gradient", "gradient", COLORS[1]))
     for kind, label, color in kinds:
         values = [getattr(one.shares[name], kind) for name in names]
@@ -195,11 +211,11 @@ def _shares(axis: Any, one: Diagnosis) -> None:
     axis.legend(frameon=False, fontsize=8, loc="best")
 
 
-def _draw(down: int, height: float, fill: Callable[[Sequence[Any]], None]) -> bytes:
+def _draw(down: int, height: float, fill: Callable[..., None], *of: Any) -> bytes:
     figure, axes = subplots(1, down, (WIDTH, height))
     for axis in axes:
         axis.grid(alpha=0.25)
-    fill(axes)
+    fill(axes, *of)
     return drawn(figure)
 
 

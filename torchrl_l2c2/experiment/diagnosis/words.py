@@ -197,9 +197,9 @@ def _reasons(diagnosis: Diagnosis) -> Iterator[Finding]:
         yield Finding(
             "wide",
             f"Its samples are wide: their standard deviation is {diagnosis.spread:.2f} of half the "
-            f"range, where draws from all of it have .58 and more if they crowd at its ends. However "
-            "smooth the mean, what acts in training is not, and distances of policies that are "
-            "relative to the width are small.",
+            "range, where draws from all of it have .58, and more if they crowd at its ends. "
+            "However smooth the mean, what acts in training is not, and distances of policies "
+            "that are relative to the width are small.",
         )
 
 
@@ -219,8 +219,8 @@ def _training(diagnosis: Diagnosis) -> Iterator[Finding]:
             every = len(faint) == len(known)
             yield Finding(
                 "faint",
-                f"{'All' if every else 'Some'} of the regularizer's terms are small: {each} {what}. "
-                "They change little; raise their gains.",
+                f"{'All' if every else 'Some'} of the regularizer's terms are small: {each} "
+                f"{what}. They change little; raise their gains.",
                 fault=every,
             )
         if known:
