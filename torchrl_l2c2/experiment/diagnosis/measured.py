@@ -26,6 +26,7 @@ Value = Callable[[Tensor, Tensor], Tensor]
 
 SAMPLES = 16  # actions drawn at a state to see how far they spread
 SAMPLED_STATES = 256
+SAME_PLACE = 0.25  # of the standard deviation of every coordinate within the episode
 STEPS_AT_ONCE = 128  # whose neighbors are in memory together: they may be images
 
 
@@ -114,7 +115,8 @@ class Diagnosis:
     def worst(self, number: int = 5) -> list[int]:
         """Steps with the largest local Lipschitz constants of the policy, from the worst on.
 
-        They are at least a fiftieth of the episode apart, so that one place is not listed twice.
+        No two are within a fiftieth of the episode or within ``SAME_PLACE``, so that one place is
+        not listed twice.
         """
         left = self.policy_lipschitz.nan_to_num(-math.inf).clone()
         found: list[int] = []
@@ -123,6 +125,8 @@ class Diagnosis:
             step = int(left.argmax())
             found.append(step)
             left[max(0, step - apart + 1) : step + apart] = -math.inf
+            away = (self.observations - self.observations[step]).abs()
+            left[(away <= SAME_PLACE * self.observations.std(0)).all(1)] = -math.inf
         return found
 
 

@@ -30,8 +30,9 @@ STYLE = """
 .side h3, figcaption { font-size: .95rem; font-weight: 600; margin: 0 0 .3rem;
   overflow-wrap: anywhere; }
 .card { border: 1px solid #ddd; border-radius: 6px; padding: .8rem 1rem; }
-.card p { color: #222; margin: .5rem 0 0; padding-left: .7rem; border-left: 3px solid #2a7f62; }
-.card p.fault { border-color: #c2182b; } video { max-width: 100%; } p { max-width: 60rem; }
+.card p { color: #222; margin: .5rem 0 0; padding-left: .7rem; border-left: 3px solid #bbb; }
+.card p.fault { border-color: #c2182b; } .card p.smooth { border-color: #2a7f62; }
+video { max-width: 100%; } p { max-width: 60rem; }
 th { max-width: 11rem; overflow-wrap: anywhere; }
 """
 LISTED = 8  # coordinates of an observation, in the tables
@@ -68,6 +69,7 @@ def page(diagnoses: Sequence[Diagnosis]) -> str:
     ]
     parts = [
         "<h1>Why a policy shakes</h1>",
+        f"<p>{_EPISODE}</p>",
         _side([_card(one) for one in diagnoses]),
         _measures(diagnoses).html(),
         *_videos(diagnoses),
@@ -81,6 +83,10 @@ def page(diagnoses: Sequence[Diagnosis]) -> str:
     return whole_page("Why a policy shakes", parts, STYLE)
 
 
+_EPISODE = (
+    "Words and pictures are of the first test episode of each policy with its mean actions. Red: "
+    "to mend; green: smooth."
+)
 _ACTIONS = (
     "Mean actions of one test episode, and the shaded part of it close by: where they change most. "
     "Dotted: the bounds."
@@ -107,7 +113,7 @@ _TERMS = (
 
 def _card(one: Diagnosis) -> str:
     told = "".join(
-        f"<p{' class=fault' if each.fault else ''}>{html.escape(each.text)}</p>"
+        f"<p class='{'fault' if each.fault else each.kind}'>{html.escape(each.text)}</p>"
         for each in findings(one)
     )
     return f"<div class=card><h3>{html.escape(one.name)}</h3>{told}</div>"
@@ -131,11 +137,12 @@ def _measures(diagnoses: Sequence[Diagnosis]) -> Table:
         ],
     ]
     note = (
-        "Means over the test episodes with mean actions; the last three rows are of the first of "
-        "them: the root mean square change by noise on observations and its standard deviation, the "
-        "part of the mean squared change from step to step that such noise makes alone, and the "
-        "standard deviation of sampled actions, of half the range. Smaller is smoother, but for the return, and for the gain on the action before, "
-        "where 1 is smooth. Definitions and units: torchrl_l2c2.metrics."
+        "Means over the test episodes with mean actions. The last three rows are of the first of "
+        "them: the root mean square change of the action by noise on observations, with the "
+        "noise's standard deviation; the part of the mean squared change from step to step that "
+        "such noise makes alone; the standard deviation of sampled actions, of half the range. "
+        "Smaller is smoother, but for the return, and for the gain on the action before, where 1 "
+        "is smooth. Definitions and units: torchrl_l2c2.metrics."
     )
     return Table("Return and smoothness", ["", *(one.name for one in diagnoses)], rows, [note])
 
