@@ -60,15 +60,25 @@ def _told(one: Diagnosis) -> str:
 
 
 def _names(folders: Sequence[str]) -> list[str]:
-    """The folders' names, without what all of them share."""
-    parts = [Path(folder).resolve().parts for folder in folders]
-    if len(set(parts)) < len(parts):
+    """The ends of the folders' paths that tell them apart, without what these have in common.
+
+    Examples:
+        >>> _names(["a/sac/none/seed_0", "a/sac/caps/seed_0"])
+        ['none', 'caps']
+        >>> _names(["a/sac/none/seed_0", "a/td3/none/seed_0", "b/sac/caps/seed_0"])
+        ['sac/none', 'td3/none', 'sac/caps']
+        >>> _names(["/a/sac/none/seed_0"])
+        ['sac/none/seed_0']
+    """
+    paths = [Path(folder).resolve().parts for folder in folders]
+    if len(paths) == 1:
+        return ["/".join(paths[0][-3:])]
+    if len(set(paths)) < len(paths):
         raise ValueError("a run is named twice; its page would show the same thing twice.")
-    shared = 0
-    while len(parts) > 1 and len({part[shared : shared + 1] for part in parts}) == 1:
-        shared += 1
-    ends = [list(part[shared:]) if shared else list(part[-3:]) for part in parts]
-    while len(parts) > 1 and len({tuple(end[-1:]) for end in ends}) == 1 and len(ends[0]) > 1:
+    longest = max(map(len, paths))
+    length = next(n for n in range(1, longest + 1) if len({p[-n:] for p in paths}) == len(paths))
+    ends = [path[-length:] for path in paths]
+    while len({end[-1] for end in ends}) == 1:
         ends = [end[:-1] for end in ends]
     return ["/".join(end) for end in ends]
 

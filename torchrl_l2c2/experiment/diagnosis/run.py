@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 from torchrl.objectives import LossModule
@@ -120,7 +120,10 @@ def _trained(folder: Path, config: ExperimentConfig, env: EnvBase) -> Agent | No
     if newest is None:
         return None
     agent = replace(config, device="cpu").make_agent(env)
-    agent.loss.load_state_dict(newest[1]["loss"])
+    state = newest[1]["loss"]
+    if any(key.startswith("_value_estimator.") for key in state):
+        _ = agent.loss.value_estimator  # Some losses make theirs when they are first called.
+    agent.loss.load_state_dict(state)
     return agent
 
 
@@ -165,16 +168,15 @@ def _sizes(path: Path) -> dict[str, float]:
     }
 
 
-def _batch(agent: Agent, config: ExperimentConfig, env: EnvBase, max_steps: int) -> TensorDict:
-    """A training episode, as the replay buffer would hold it."""
+def _batch(agent: Agent, config: ExperimentConfig, env: EnvBase, max_steps: int) -> TensorDictBase:
+    """A training episode, with what the loss reads of it."""
     with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-        episode = env.rollout(max_steps, agent.policy)
+        episode: TensorDictBase = env.rollout(max_steps, agent.policy)
         reward = episode["next", "reward"] * config.algorithm.reward_factor
         episode.set(("next", "reward"), reward)
         if agent.advantage is not None:
             episode = agent.advantage(episode)
-    batch: TensorDict = episode.select(*agent.loss.in_keys, strict=False)
-    return batch
+    return episode
 
 
 def _pictures(folder: Path, seed: int, noise_scale: float | None, best: bool) -> list[Any]:
