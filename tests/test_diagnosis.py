@@ -172,7 +172,7 @@ class TestWords:
         )
         assert "faint" not in kinds(made_up(shares={**own, "l2c2_actor": strong}))
         by_size = said(made_up(shares={**own, "caps": TermShare(True, 1e-3)}), "faint")
-        assert "caps 0.10% of the loss" in by_size.text and by_size.fault
+        assert "caps 0.1% of the loss" in by_size.text and by_size.fault
         both = said(made_up(shares={"a": faint, "b": strong}), "faint")
         assert both.text.startswith("Some") and not both.fault
 

@@ -68,7 +68,7 @@ def _shrunk(picture: Picture) -> Picture:
     from PIL import Image
 
     height, width, _ = picture.shape
-    size = (WIDTH, round(height * WIDTH / width))
+    size = (WIDTH, 2 * round(height * WIDTH / width / 2))  # even, for the encoder
     return np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.BOX))
 
 

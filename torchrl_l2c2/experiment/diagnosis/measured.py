@@ -119,6 +119,7 @@ class Diagnosis:
         not listed twice.
         """
         left = self.policy_lipschitz.nan_to_num(-math.inf).clone()
+        left[left <= 0.0] = -math.inf
         found: list[int] = []
         apart = max(1, len(left) // 50)
         while len(found) < number and left.max() > -math.inf:

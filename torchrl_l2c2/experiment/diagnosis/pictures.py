@@ -92,7 +92,8 @@ def _actions(axes: Sequence[Any], one: Diagnosis) -> None:
             for bound in {*one.low.tolist(), *one.high.tolist()}:
                 axis.axhline(bound, color="black", linewidth=0.6, linestyle=":")
         axis.set_ylabel("action")
-    axes[0].axvspan(start, end, color=WORST, alpha=0.12, linewidth=0)
+    if end - start < len(one.actions) - 1:
+        axes[0].axvspan(start, end, color=WORST, alpha=0.12, linewidth=0)
     axes[1].set_xlim(start, end)
     axes[1].set_ylim(axes[0].get_ylim())
     axes[1].set_xlabel("step, where it changes most")
@@ -176,7 +177,16 @@ def _plane(axis: Any, one: Diagnosis, limits: tuple[float, float]) -> None:
         )
     axis.set_xlabel("states, first principal direction")
     axis.set_ylabel("second")
-    axis.figure.colorbar(dots, ax=axis, label="policy, constant", location="bottom", aspect=40)
+    bar = axis.figure.colorbar(
+        dots,
+        ax=axis,
+        label="policy, constant",
+        location="bottom",
+        aspect=40,
+        ticks=[limits[0], math.sqrt(limits[0] * limits[1]), limits[1]],
+        format="%.2g",
+    )
+    bar.minorticks_off()
 
 
 def _neighborhood(axes: Sequence[Any], one: Diagnosis) -> None:
@@ -205,7 +215,9 @@ def _shares(axes: Sequence[Any], one: Diagnosis) -> None:
         axis.barh(names, values, height, align="edge", label=label, color=color)
         for place, value in enumerate(values):
             if not math.isnan(value):
-                axis.annotate(f" {value:.2%}", (value, place + height / 2), va="center", fontsize=8)
+                axis.annotate(
+                    f" {100 * value:.2g}%", (value, place + height / 2), va="center", fontsize=8
+                )
     axis.margins(x=0.2)
     axis.set_xlabel("share of the loss; gradient over that of its own terms")
     axis.legend(frameon=False, fontsize=8, loc="best")

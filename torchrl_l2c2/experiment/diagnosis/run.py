@@ -156,13 +156,13 @@ def _sizes(path: Path) -> dict[str, float]:
     with open(path, newline="") as file:
         rows = list(csv.DictReader(file))
     late = rows[-max(1, round(LATE * len(rows))) :]
-    columns = [name for name in (late[-1] if late else {}) if name.startswith("share_")]
+    columns = [name for name in (late[-1] if late else {}) if name.split("_")[0] == "share"]
     known = {
         name: [v for row in late if not math.isnan(v := float(row[name] or "nan"))]
         for name in columns
     }
     return {
-        name.removeprefix("share_"): statistics.fmean(values)
+        name.replace("share", "loss", 1).removeprefix("loss_"): statistics.fmean(values)
         for name, values in known.items()
         if values
     }

@@ -215,7 +215,7 @@ def _training(diagnosis: Diagnosis) -> Iterator[Finding]:
         known = {name: value for name, value in added.items() if not math.isnan(value)}
         faint = {name: value for name, value in known.items() if value < FAINT}
         if faint:
-            each = ", ".join(f"{name} {value:.2%}" for name, value in faint.items())
+            each = ", ".join(f"{name} {100 * value:.2g}%" for name, value in faint.items())
             every = len(faint) == len(known)
             yield Finding(
                 "faint",
