@@ -368,6 +368,15 @@ class TestRun:
         assert all(found.shares[name].gradient > 0.0 for name in added)
         assert sum(share.size for share in found.shares.values()) == pytest.approx(1.0)
 
+    def test_pictures_are_left_out_where_they_cannot_be_drawn(self, run, monkeypatch):
+        """As without pygame; all else is there."""
+
+        def missing(*args, **kwargs):
+            raise gymnasium.error.DependencyNotInstalled("pygame is not installed")
+
+        monkeypatch.setattr("torchrl_l2c2.experiment.diagnosis.run.play_pictures", missing)
+        assert diagnose_run(run, episodes=1).pictures == []
+
 
 class TestPage:
     """Needs nothing else."""

@@ -219,7 +219,7 @@ def _shares(axes: Sequence[Any], one: Diagnosis) -> None:
                     f" {100 * value:.2g}%", (value, place + height / 2), va="center", fontsize=8
                 )
     axis.margins(x=0.2)
-    axis.set_xlabel("share of the loss; gradient over that of its own terms")
+    axis.set_xlabel("share")
     axis.legend(frameon=False, fontsize=8, loc="best")
 
 

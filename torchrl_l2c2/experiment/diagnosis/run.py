@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from gymnasium.error import DependencyNotInstalled
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
@@ -184,6 +185,7 @@ def _pictures(folder: Path, seed: int, noise_scale: float | None, best: bool) ->
         ((_, pictures, _),) = play_pictures(
             folder, 1, seed=seed, noise_scale=noise_scale, best=best
         )
-    except ValueError:  # The task draws none.
+    # The task draws none, or not without a package that is not there.
+    except (ValueError, DependencyNotInstalled):
         return []
     return pictures
