@@ -44,7 +44,7 @@ experiment.algorithms.__init__
 experiment.config
 experiment.naming
 experiment.reports.statistics experiment.reports.paper experiment.reports.differences
-experiment.reports.records
+experiment.reports.records experiment.reports.document
 experiment.reports.runs experiment.reports.groups
 experiment.reports.score
 experiment.reports.tables
@@ -56,6 +56,12 @@ experiment.reports.__main__
 experiment.workers
 experiment.evaluate experiment.update experiment.player experiment.manual
 experiment.influence experiment.best_policy experiment.export experiment.video
+experiment.diagnosis.measured
+experiment.diagnosis.words experiment.diagnosis.pictures experiment.diagnosis.run
+experiment.diagnosis.film
+experiment.diagnosis.page
+experiment.diagnosis.__init__
+experiment.diagnose
 experiment.learner
 experiment.gain
 experiment.continuation experiment.schedules

@@ -52,6 +52,7 @@ policy_best.pt        the best one of evaluations.json, likewise (evaluate_every
 evaluations.json      tests during training (evaluate_every)
 evaluation.json       test episodes at the end
 learning_curves.png   a picture of metrics.csv
+diagnosis.html        why the policy shakes (experiment.diagnose)
 video.mp4             a test episode (record)
 export/               the policy as ONNX and torch.export program (experiment.export)
 

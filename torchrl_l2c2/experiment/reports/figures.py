@@ -43,7 +43,7 @@ def draw_learning_curves(runs: Sequence[FinishedRun], path: str | Path) -> None:
     styles = _styles(groups)
     known = [name for name in PANELS if any(np.isfinite(run.column(name)).any() for run in runs)]
     window = max(10, max(len(run.metrics) for run in runs) // 40)
-    figure, axes = _subplots(len(known), 1, (3.4 * len(known) + 0.6, 3.6))
+    figure, axes = subplots(len(known), 1, (3.4 * len(known) + 0.6, 3.6))
     for axis, name in zip(axes, known, strict=True):
         for group in groups:
             members = [runs_of[record.identity] for record in group.records]
@@ -72,7 +72,7 @@ def draw_plane(groups: Sequence[Group], figure: str, path: str | Path) -> None:
     panels = list(dict.fromkeys((group.first.task, group.first.algorithm) for group in groups))
     across = min(4, len(panels))
     down = -(-len(panels) // across)
-    drawn, axes = _subplots(across, down, (max(3.4 * across, 5.4), 3.2 * down + 0.6))
+    picture, axes = subplots(across, down, (max(3.4 * across, 5.4), 3.2 * down + 0.6))
     for axis, (task, algorithm) in zip(axes, panels, strict=False):
         together = [g for g in groups if (g.first.task, g.first.algorithm) == (task, algorithm)]
         styles = _styles(together)
@@ -83,7 +83,7 @@ def draw_plane(groups: Sequence[Group], figure: str, path: str | Path) -> None:
         axis.set_ylabel("return")
     for axis in axes[len(panels) :]:
         axis.set_visible(False)
-    _finish(drawn, axes, f"{FIGURES[figure]}; hollow: the paper", path)
+    _finish(picture, axes, f"{FIGURES[figure]}; hollow: the paper", path)
 
 
 def _draw_curve(
@@ -169,7 +169,14 @@ def _styles(groups: Sequence[Group]) -> dict[str, dict[str, str]]:
     return styles
 
 
-def _subplots(across: int, down: int, size: tuple[float, float]) -> tuple[Any, list[Any]]:
+def subplots(across: int, down: int, size: tuple[float, float]) -> tuple[Any, list[Any]]:
+    """A figure without a window, and its axes row by row.
+
+    Args:
+        across (int): axes beside one another.
+        down (int): rows of axes.
+        size (tuple): width and height in inches.
+    """
     # Imported here: drawing takes a second to import and no other function needs it.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -197,11 +204,16 @@ def _finish(figure: Any, axes: Sequence[Any], title: str, path: str | Path) -> N
 
 def save(figure: Any, path: str | Path) -> None:
     """Writes a picture whole or not at all; the same picture gives the same bytes."""
+    write_atomically(path, drawn(figure, Path(path).suffix[1:]))
+
+
+def drawn(figure: Any, kind: str = "svg") -> bytes:
+    """A picture as the content of a file; the same picture gives the same bytes."""
     from matplotlib import rc_context
 
-    content, kind = io.BytesIO(), Path(path).suffix[1:]
+    content = io.BytesIO()
     # Without these an SVG file has the date and random names in it.
     metadata = {"Date": None, "Creator": None} if kind == "svg" else {"Software": None}
     with rc_context({"svg.hashsalt": "torchrl_l2c2", "svg.fonttype": "none"}):
         figure.savefig(content, dpi=110, format=kind, metadata=metadata)
-    write_atomically(path, content.getvalue())
+    return content.getvalue()

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import base64
 import html
 from collections.abc import Sequence
 from pathlib import Path
 
 from torchrl_l2c2.experiment.folder import make_folder, write_atomically, write_json
 from torchrl_l2c2.experiment.reports.comparison import statistics_tables, summary
+from torchrl_l2c2.experiment.reports.document import picture, whole_page
 from torchrl_l2c2.experiment.reports.figures import draw_learning_curves, draw_plane
 from torchrl_l2c2.experiment.reports.groups import group_records
 from torchrl_l2c2.experiment.reports.measures import measures_table
@@ -16,17 +16,6 @@ from torchrl_l2c2.experiment.reports.records import FIGURES, Record
 from torchrl_l2c2.experiment.reports.runs import FinishedRun
 from torchrl_l2c2.experiment.reports.score import readings
 from torchrl_l2c2.experiment.reports.tables import Table, results_tables, runs_table, score_table
-
-_STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 75rem; margin: 2rem auto; padding: 0 1rem;
-  color: #222; background: #fff; }
-h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin: 2rem 0 .5rem; }
-.wide { overflow-x: auto; }
-table { border-collapse: collapse; font-size: 13px; font-variant-numeric: tabular-nums; }
-th, td { text-align: left; padding: .25rem .6rem; border-bottom: 1px solid #ddd; }
-th { vertical-align: bottom; border-bottom: 2px solid #888; }
-td { white-space: nowrap; } img { max-width: 100%; } p { font-size: 13px; color: #555; }
-"""
 
 
 def all_tables(records: Sequence[Record]) -> list[Table]:
@@ -95,9 +84,7 @@ def _draw(folder: Path, records: Sequence[Record], runs: Sequence[FinishedRun]) 
 
 def _page(tables: Sequence[Table], pictures: Sequence[Path], notes: Sequence[str]) -> str:
     drawn = "\n".join(
-        f'<p><img alt="{html.escape(path.stem.replace("_", " "))}" '
-        f'src="data:image/svg+xml;base64,{base64.b64encode(path.read_bytes()).decode()}"></p>'
-        for path in pictures
+        f"<p>{picture(path.stem.replace('_', ' '), path.read_bytes())}</p>" for path in pictures
     )
     results, others = tables[:2], tables[2:]
     parts = [
@@ -107,7 +94,4 @@ def _page(tables: Sequence[Table], pictures: Sequence[Path], notes: Sequence[str
         f"<h2>Pictures</h2>\n{drawn}",
         *(table.html() for table in others),
     ]
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>Runs</title>\n'
-        f"<style>{_STYLE}</style></head>\n<body>\n" + "\n".join(parts) + "\n</body></html>\n"
-    )
+    return whole_page("Runs", parts)

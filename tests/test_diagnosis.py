@@ -1,0 +1,452 @@
+"""Why a policy shakes: what is measured, what is said of it, and the page."""
+
+import re
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import NormalParamExtractor, TensorDictModule
+from torch import nn
+from torchrl.envs import GymEnv, GymWrapper, SerialEnv
+from torchrl.modules import ProbabilisticActor
+
+from torchrl_l2c2 import Neighborhood
+from torchrl_l2c2.experiment import (
+    Experiment,
+    ExperimentConfig,
+    L2C2Config,
+    PPORPEConfig,
+    TaskConfig,
+    TD3Config,
+    evaluate_policy,
+    load_policy,
+)
+from torchrl_l2c2.experiment.diagnose import main
+from torchrl_l2c2.experiment.diagnosis import (
+    THRESHOLDS,
+    Diagnosis,
+    TermShare,
+    diagnose,
+    diagnose_run,
+    findings,
+    value_function,
+    write_page,
+)
+from torchrl_l2c2.experiment.diagnosis.film import film
+from torchrl_l2c2.experiment.diagnosis.page import page
+from torchrl_l2c2.metrics import previous_action_gain
+
+STEPS = torch.arange(100.0)
+SINE = torch.sin(2 * torch.pi * STEPS / 100).unsqueeze(-1)
+FLIPPING = (-1.0) ** STEPS.unsqueeze(-1)
+
+
+def made_up(actions=0.5 * SINE, **known):
+    """A diagnosis of these actions in [-1, 1], with nothing to say of anything else."""
+    size = actions.shape[1]
+    return Diagnosis(
+        **{
+            "name": "made up",
+            "measures": {
+                "return": 1.0,
+                "previous_action_gain": previous_action_gain(actions).item(),
+            },
+            "actions": actions,
+            "low": -torch.ones(size),
+            "high": torch.ones(size),
+            "bounded": True,
+            "observations": torch.stack([STEPS[: len(actions)], STEPS[: len(actions)] ** 2], 1),
+            "policy_lipschitz": torch.ones(len(actions)),
+            "value_lipschitz": None,
+            "distance": torch.full((len(actions),), 0.5),
+            "neighborhood": Neighborhood(),
+            "unmoved": torch.tensor([0.0, 1.0]),
+            "noise_scale": 0.01,
+            "noise_action": 0.01,
+            "noise_share": 0.1,
+            "spread": 0.1,
+            "entries": ("speed", "angle"),
+            **known,
+        }
+    )
+
+
+def kinds(diagnosis):
+    return [found.kind for found in findings(diagnosis)]
+
+
+def said(diagnosis, kind):
+    (found,) = [found for found in findings(diagnosis) if found.kind == kind]
+    return found
+
+
+class TestWords:
+    """Of made-up episodes."""
+
+    def test_a_slow_sine_is_smooth(self):
+        """Which is no fault. Its mean change is 4 amplitudes in a period of 100 steps."""
+        found = said(made_up(), "smooth")
+        assert kinds(made_up()) == ["smooth"] and not found.fault
+        assert "1.0% of its range" in found.text
+
+    def test_an_action_that_alternates_flips(self):
+        """By half of the range at every step, at half of 20 Hz."""
+        found = said(made_up(0.5 * FLIPPING, rate=20.0), "flips")
+        assert kinds(made_up(0.5 * FLIPPING)) == ["flips"] and found.fault
+        for words in ("10 Hz", "100% of the steps", "50.0% of its range", "throughout"):
+            assert words in found.text
+
+    def test_flipping_in_one_place_is_said_to_be_there(self):
+        """A tenth of the episode; the rest is at rest."""
+        actions = torch.zeros(100, 1)
+        actions[50:60] = 0.5 * FLIPPING[50:60]
+        assert "in steps 50 to 59" in said(made_up(actions), "flips").text
+
+    def test_the_action_that_flips_is_named(self):
+        """Beside a smooth one."""
+        actions = torch.cat([0.5 * SINE, 0.5 * FLIPPING], 1)
+        assert said(made_up(actions), "flips").text.startswith("action[1]")
+
+    def test_a_square_wave_is_bang_bang(self):
+        """From bound to bound every ten steps: nine jumps in a hundred steps."""
+        square = torch.where((STEPS // 10) % 2 == 0, 1.0, -1.0).unsqueeze(-1)
+        assert kinds(made_up(square)) == ["bang-bang"]
+        text = said(made_up(square), "bang-bang").text
+        assert "in 100% of the steps" in text and "9 times, one in 11 steps" in text
+
+    def test_without_bounds_nothing_is_bang_bang(self):
+        """The largest action that was seen is no bound."""
+        square = torch.where((STEPS // 10) % 2 == 0, 1.0, -1.0).unsqueeze(-1)
+        assert "bang-bang" not in kinds(made_up(square, bounded=False))
+
+    def test_one_bound_is_pinned(self):
+        """What moves in four tenths of the steps is no jumping between bounds."""
+        actions = torch.where(STEPS < 60, 1.0, 0.5 * SINE[:, 0]).unsqueeze(-1)
+        assert "pinned at its upper bound in 60%" in said(made_up(actions), "pinned").text
+
+    def test_a_constant_action_stands_still(self):
+        """Nothing else is said of it, but of its training."""
+        still = made_up(torch.full((100, 1), 0.3) + 1e-4 * SINE, noise_share=1.0, spread=0.9)
+        assert kinds(still) == ["still"] and "(0.3)" in findings(still)[0].text
+
+    def test_white_noise_is_rough(self):
+        """Its roughness is a quarter of the rate."""
+        noise = torch.rand(100, 1, generator=torch.Generator().manual_seed(0)) - 0.5
+        found = said(made_up(noise), "rough")
+        assert abs(float(re.search(r"roughness is ([\d.]+)", found.text)[1]) - 0.25) < 0.03
+
+    def test_fast_and_even_moves_are_neither_smooth_nor_a_fault(self):
+        """Ten sines of half the range."""
+        found = findings(made_up(0.5 * torch.sin(2 * torch.pi * STEPS / 10).unsqueeze(-1)))
+        assert [(each.kind, each.fault) for each in found] == [("moves", False)]
+
+    @pytest.mark.parametrize(
+        ("kind", "name", "known"),
+        [
+            ("noise", "NOISY", lambda value: {"noise_share": value}),
+            ("wide", "WIDE", lambda value: {"spread": value}),
+            (
+                "steep",
+                "STEEP",
+                lambda value: {"policy_lipschitz": torch.tensor([1.0] * 99 + [value])},
+            ),
+        ],
+    )
+    def test_reasons_are_told_from_their_thresholds_on(self, kind, name, known):
+        """Of a policy that moves much."""
+        fast = 0.5 * torch.sin(2 * torch.pi * STEPS / 10).unsqueeze(-1)
+        threshold = THRESHOLDS[name][0]
+        assert kind in kinds(made_up(fast, **known(threshold)))
+        assert kind not in kinds(made_up(fast, **known(0.99 * threshold)))
+
+    def test_a_faint_regularizer_is_told_by_its_gradients(self):
+        """Sizes count where there are no gradients; terms of the loss itself never do."""
+        own = {"actor": TermShare(added=False, size=1e-5)}
+        faint, strong = TermShare(True, 0.5, 1e-4), TermShare(True, 1e-5, 0.5)
+        assert (
+            "l2c2_actor 0.01% of the gradient"
+            in said(made_up(shares={**own, "l2c2_actor": faint}), "faint").text
+        )
+        assert "faint" not in kinds(made_up(shares={**own, "l2c2_actor": strong}))
+        by_size = said(made_up(shares={**own, "caps": TermShare(True, 1e-3)}), "faint")
+        assert "caps 0.1% of the loss" in by_size.text and by_size.fault
+        both = said(made_up(shares={"a": faint, "b": strong}), "faint")
+        assert both.text.startswith("Some") and not both.fault
+
+    def test_every_threshold_of_the_rules_is_documented(self):
+        """With the number that the rules use."""
+        from torchrl_l2c2.experiment.diagnosis import words
+
+        constants = {name: value for name, value in vars(words).items() if name.isupper()}
+        del constants["THRESHOLDS"]
+        assert {name: number for name, (number, _) in THRESHOLDS.items()} == constants
+
+
+class Walk(gymnasium.Env):
+    """One coordinate goes up by .1 at every step, the other stays."""
+
+    observation_space = gymnasium.spaces.Box(-9, 9, (2,), np.float32)
+    action_space = gymnasium.spaces.Box(-4, 4, (1,), np.float32)
+
+    length = 10
+
+    def _seen(self):
+        return np.array([0.1 * self.steps, 0.7], np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return self._seen(), {}
+
+    def step(self, action):
+        self.steps += 1
+        return self._seen(), 2.0, False, self.steps == self.length, {}
+
+
+def linear(slope):
+    """A deterministic policy: this slope times the first coordinate."""
+    return TensorDictModule(
+        lambda observation: slope * observation[..., :1], ["observation"], ["action"]
+    )
+
+
+class TestMeasured:
+    """Against numbers known by hand."""
+
+    def test_a_linear_policy_has_its_slope_everywhere(self):
+        """So has a linear value function; the second coordinate has no neighbors."""
+        found = diagnose(
+            linear(3.0), GymWrapper(Walk()), value=lambda o, a: 5 * o[:, 0], episodes=2
+        )
+        for constants, slope in ((found.policy_lipschitz, 3.0), (found.value_lipschitz, 5.0)):
+            torch.testing.assert_close(constants, torch.full((10,), slope), rtol=1e-3, atol=0.0)
+        assert found.unmoved.tolist() == [0.0, 1.0]
+        assert found.measures["return"] == 20.0 and found.measures["length"] == 10.0
+        assert found.measures["action_variation"] == pytest.approx(0.3, rel=1e-5)
+        assert found.spread == 0.0 and found.low.tolist() == [-4.0] and found.bounded
+
+    def test_an_action_value_sees_the_action_of_the_state(self):
+        """At all of its neighbors: of the action times the state, the slope is the action."""
+        found = diagnose(linear(3.0), GymWrapper(Walk()), value=lambda o, a: a * o[:, :1])
+        expected = 0.3 * torch.arange(10.0)
+        torch.testing.assert_close(found.value_lipschitz, expected, rtol=1e-3, atol=1e-6)
+
+    def test_noise_moves_the_action_by_the_slope(self):
+        """3 * .01; two draws of it, of the variance 2 * .03^2, beside steps of .3."""
+        walk = Walk()
+        walk.length = 1000
+        found = diagnose(linear(3.0), GymWrapper(walk), episodes=1, noise_scale=0.01)
+        assert found.noise_action == pytest.approx(0.03, rel=0.1)
+        assert found.noise_share == pytest.approx(2 * found.noise_action**2 / 0.3**2, rel=1e-3)
+
+    def test_distances_and_gains_are_those_of_the_neighborhood(self):
+        """Which is drawn from all of, and whose gain at a distance of zero is the largest."""
+        near = Neighborhood(sigma=0.5, lambda_min=0.1, lambda_max=2.0)
+        found = diagnose(linear(3.0), GymWrapper(Walk()), neighborhood=near, num_neighbors=200)
+        assert found.distance.min() >= 0.0 and found.distance.max() <= near.radius
+        assert found.distance.max() > 0.99 * near.radius
+        assert near.lambda_min <= found.gain.min() + 1e-6 and found.gain.max() <= near.lambda_max
+        at_center = replace(found, distance=torch.zeros(1))
+        assert at_center.gain.item() == pytest.approx(near.lambda_max)
+
+    def test_the_spread_is_that_of_the_samples(self):
+        """Of a standard deviation of .4 in a range of four to either side."""
+        module = nn.Sequential(nn.Linear(2, 2), NormalParamExtractor("relu"))
+        nn.init.zeros_(module[0].weight)
+        module[0].bias.data = torch.tensor([0.0, 0.4])
+        policy = ProbabilisticActor(
+            TensorDictModule(module, ["observation"], ["loc", "scale"]),
+            in_keys=["loc", "scale"],
+            distribution_class=torch.distributions.Normal,
+        )
+        before = torch.get_rng_state()
+        found = diagnose(policy, GymWrapper(Walk()))
+        assert found.spread == pytest.approx(0.1, rel=0.1)
+        assert torch.equal(before, torch.get_rng_state())
+
+    def test_the_worst_states_are_places_apart(self):
+        """In time and among the states; the second largest is beside the largest."""
+        constants = torch.ones(100)
+        constants[[30, 31, 70, 90]] = torch.tensor([9.0, 8.0, 7.0, 6.0])
+        observations = torch.stack([STEPS, STEPS], 1)
+        observations[90] = observations[30]
+        found = made_up(policy_lipschitz=constants, observations=observations)
+        assert found.worst(2) == [30, 70] and 90 not in found.worst(5)
+
+    def test_what_cannot_be_diagnosed_is_refused(self):
+        """A batch of environments, two observations, an episode that is hardly one."""
+        with pytest.raises(ValueError, match="got a batch of \\(2,\\)"):
+            diagnose(linear(1.0), SerialEnv(2, lambda: GymWrapper(Walk())))
+        two = TensorDictModule(lambda a, b: a, ["observation", "other"], ["action"])
+        with pytest.raises(ValueError, match=r"reads \['observation', 'other'\]"):
+            diagnose(two, GymWrapper(Walk()))
+        with pytest.raises(ValueError, match="3 steps is too short"):
+            diagnose(linear(1.0), GymWrapper(Walk()), max_steps=3)
+
+    def test_discrete_actions_are_measured_too(self):
+        """A pole that is pushed by turns."""
+        env = GymEnv("CartPole-v1")
+
+        def by_turns(observation):
+            left = (observation[..., 3:] < 0).long()
+            return torch.cat([left, 1 - left], -1)
+
+        found = diagnose(TensorDictModule(by_turns, ["observation"], ["action"]), env)
+        assert found.actions.shape[1] == 2 and not found.bounded and found.rate == 50.0
+        assert not {"bang-bang", "pinned"} & set(kinds(found))
+        assert found.actions.sum(1).eq(1).all()
+
+
+@pytest.mark.parametrize(("algorithm", "heads"), [(PPORPEConfig(), 5), (TD3Config(), 2)])
+def test_the_value_function_is_the_losss(algorithm, heads):
+    """Of all heads, or of both networks of a pair, at any actions."""
+    config = ExperimentConfig(
+        task=TaskConfig("task", "Pendulum-v1", episodes=1), algorithm=algorithm, compile=False
+    )
+    loss = config.make_agent(config.task.make_env(0)).loss
+    observation, action = torch.randn(7, 3), torch.randn(7, 1)
+    batch = TensorDict({"observation": observation, "action": action}, [7])
+    value = value_function(loss)(observation, action)
+    assert value.shape == (7, heads)
+    network = "critic_network" if heads == 5 else "qvalue_network"
+    params, net = getattr(loss, f"{network}_params"), getattr(loss, network)
+    with torch.no_grad():
+        if heads == 5:
+            with params.to_module(net):
+                expected = net(batch)["state_value_heads"]
+        else:
+            each = []
+            for number in range(heads):
+                with params[number].to_module(net):
+                    each.append(net(batch.copy())["state_action_value"])
+            expected = torch.cat(each, 1)
+    torch.testing.assert_close(value, expected)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Of a pendulum, with L2C2."""
+    return trained(tmp_path_factory.mktemp("runs") / "l2c2")
+
+
+def trained(folder, env_id="Pendulum-v1"):
+    config = ExperimentConfig(
+        task=TaskConfig("task", env_id, episodes=4, max_steps=40, noise_scale=0.05),
+        algorithm=PPORPEConfig(hidden=(8,)),
+        regularizer=L2C2Config(sigma=0.5),
+        compile=False,
+        late_share=0.0,
+    )
+    experiment = Experiment(config, folder)
+    experiment.train()
+    experiment.save()
+    experiment.close()
+    return folder
+
+
+class TestRun:
+    """A run's folder has all of it."""
+
+    def test_it_plays_the_test_episodes(self, run):
+        """The same as ``evaluate`` on the same seed and noise."""
+        found = diagnose_run(run, seed=5, episodes=2, with_pictures=False)
+        policy, env, steps = load_policy(run, seed=5)
+        expected = evaluate_policy(policy, env, 2, max_steps=steps).summary()
+        assert found.measures["return"] == pytest.approx(expected["return_mean"], rel=1e-5)
+        assert found.measures["roughness"] == pytest.approx(expected["roughness_mean"], rel=1e-4)
+
+    def test_neighborhood_noise_and_shares_are_the_runs_own(self, run):
+        """Gradients are known of what the regularizer has added, sizes of every term."""
+        found = diagnose_run(run, with_pictures=False)
+        assert found.neighborhood.sigma == 0.5 and found.noise_scale == 0.05
+        assert found.value_lipschitz.shape == (40,)
+        added = {name for name, share in found.shares.items() if share.added}
+        assert added == {"l2c2_actor", "l2c2_critic"} and {"actor", "critic"} < set(found.shares)
+        assert all(found.shares[name].gradient > 0.0 for name in added)
+        assert sum(share.size for share in found.shares.values()) == pytest.approx(1.0)
+
+    def test_pictures_are_left_out_where_they_cannot_be_drawn(self, run, monkeypatch):
+        """As without pygame; all else is there."""
+
+        def missing(*args, **kwargs):
+            raise gymnasium.error.DependencyNotInstalled("pygame is not installed")
+
+        monkeypatch.setattr("torchrl_l2c2.experiment.diagnosis.run.play_pictures", missing)
+        assert diagnose_run(run, episodes=1).pictures == []
+
+
+class TestPage:
+    """Needs nothing else."""
+
+    def test_it_has_no_reference_to_anything_outside(self, tmp_path):
+        """No address, no script, no source but what is inside it."""
+        text = write_page(tmp_path / "page.html", [made_up(name="a <b>")]).read_text()
+        assert "://" not in text and "<script" not in text and "url(" not in text
+        assert "<link" not in text and "@import" not in text and "href" not in text
+        sources = re.findall(r"src=.(.{11})", text)
+        assert len(sources) == 4 and set(sources) == {"data:image/"}
+        assert "width=device-width" in text and "a &lt;b&gt;" in text and "<b>" not in text
+
+    def test_several_stand_side_by_side(self):
+        """Each has its words, a column of the table and every picture."""
+        flipping = made_up(0.5 * FLIPPING, name="other", shares={"caps": TermShare(True, 0.1)})
+        text = page([made_up(name="first"), flipping])
+        assert text.count("<div class=card>") == 2
+        assert "<th></th><th>first</th><th>other</th>" in text
+        for name, pictures in (("first", 4), ("other", 5)):
+            assert text.count(f"<figcaption>{name}</figcaption>") == pictures
+        assert "flips from step to step" in text and "It is smooth" in text
+        assert "angle" in text  # which never moves
+
+    def test_none_is_refused(self, tmp_path):
+        """There is nothing to show."""
+        with pytest.raises(ValueError, match="at least one"):
+            write_page(tmp_path / "page.html", [])
+
+    def test_the_video_has_them_beside_one_another(self, tmp_path):
+        """As long as the longest, at no more than 30 pictures a second, at the true speed."""
+        ffmpeg = pytest.importorskip("imageio_ffmpeg")
+        shots = [np.full((60, 64, 3), shade, np.uint8) for shade in range(101)]
+        both = [made_up(pictures=shots, rate=60.0), made_up(pictures=shots[:41], rate=60.0)]
+        (tmp_path / "film.mp4").write_bytes(film(both))
+        frames, seconds = ffmpeg.count_frames_and_secs(str(tmp_path / "film.mp4"))
+        assert frames == 51 and seconds == pytest.approx(51 / 30, abs=0.05)
+        assert next(ffmpeg.read_frames(tmp_path / "film.mp4"))["size"] == (512, 320)
+
+
+class Blank(Walk):
+    """Draws nothing."""
+
+
+gymnasium.register("Blank-v0", Blank)
+
+
+class TestCommand:
+    """Says it, and writes the page."""
+
+    def test_two_runs(self, run, tmp_path, capsys):
+        """A video where the task draws pictures, a word where it does not."""
+        pytest.importorskip("pygame")
+        pytest.importorskip("imageio_ffmpeg")
+        blank = trained(tmp_path / "blank", "Blank-v0")
+        path = tmp_path / "new" / "page.html"
+        main([str(run), str(blank), "--episodes", "1", "--output", str(path)])
+        told, text = capsys.readouterr().out, path.read_text()
+        assert text.count('src="data:video/mp4;base64,') == 1
+        assert "Without pictures: " in text and "blank" in text
+        assert f"page: {path}" in told and "  - " in told
+
+    def test_the_page_lies_in_the_first_folder(self, run, capsys):
+        """Without pictures if these are not wanted."""
+        main([str(run), "--no-video", "--episodes", "1"])
+        assert "<video" not in (run / "diagnosis.html").read_text()
+
+    def test_what_is_wrong_is_one_line(self, run, tmp_path):
+        """A folder that is no run; the same run twice."""
+        with pytest.raises(SystemExit, match=r"^error: '.*' is not the folder of a run"):
+            main([str(tmp_path)])
+        with pytest.raises(SystemExit, match=r"^error: a run is named twice"):
+            main([str(run), str(run)])

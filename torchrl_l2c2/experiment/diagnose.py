@@ -1,0 +1,87 @@
+"""The command that writes a page of why policies shake: ``diagnosis/`` has what is on it."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from torchrl_l2c2.experiment.diagnosis import Diagnosis, diagnose_run, findings, write_page
+from torchrl_l2c2.experiment.environments import TEST_SEED
+from torchrl_l2c2.experiment.folder import make_folder
+
+
+def main(arguments: Iterable[str] | None = None) -> None:
+    """Does what the command line says; an error is one line."""
+    parser = _parser()
+    chosen = parser.parse_args(None if arguments is None else list(arguments))
+    if chosen.episodes < 1:
+        parser.error(f"--episodes must be at least 1, got {chosen.episodes}")
+    try:
+        diagnoses = [
+            diagnose_run(
+                folder,
+                name=name,
+                episodes=chosen.episodes,
+                seed=chosen.seed,
+                noise_scale=chosen.noise,
+                best=chosen.best,
+                with_pictures=not chosen.no_video,
+            )
+            for folder, name in zip(chosen.folders, _names(chosen.folders), strict=True)
+        ]
+        path = Path(chosen.output or Path(chosen.folders[0]) / "diagnosis.html")
+        make_folder(path.parent)
+        write_page(path, diagnoses)
+    except (ValueError, OSError, RuntimeError, ImportError) as error:
+        sys.exit(f"error: {error}")
+    print("\n\n".join([*map(_told, diagnoses), f"page: {path}"]))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m torchrl_l2c2.experiment.diagnose",
+        description="Writes one page that shows why the policies of runs shake, and says it.",
+    )
+    add = parser.add_argument
+    add("folders", nargs="+", metavar="RUN", help="a run's folder, finished or not")
+    add("--output", help="the page (default: diagnosis.html in the first folder)")
+    add("--episodes", type=int, default=3, help="of the measures' means (default: 3)")
+    add("--seed", type=int, default=TEST_SEED, help=f"of every policy (default: {TEST_SEED})")
+    add("--noise", type=float, help="on observations (default: the task's)")
+    add("--best", action="store_true", help="policy_best.pt instead of policy.pt")
+    add("--no-video", action="store_true", help="draw no pictures of the task, which is quicker")
+    return parser
+
+
+def _told(one: Diagnosis) -> str:
+    return "\n".join([one.name, *(f"  - {found.text}" for found in findings(one))])
+
+
+def _names(folders: Sequence[str]) -> list[str]:
+    """The ends of the folders' paths that tell them apart, without what these have in common.
+
+    Examples:
+        >>> _names(["a/sac/none/seed_0", "a/sac/caps/seed_0"])
+        ['none', 'caps']
+        >>> _names(["a/sac/none/seed_0", "a/td3/none/seed_0", "b/sac/caps/seed_0"])
+        ['sac/none', 'td3/none', 'sac/caps']
+        >>> _names(["/a/sac/none/seed_0"])
+        ['sac/none/seed_0']
+    """
+    paths = [Path(folder).resolve().parts for folder in folders]
+    if len(paths) == 1:
+        return ["/".join(paths[0][-3:])]
+    if len(set(paths)) < len(paths):
+        raise ValueError("a run is named twice; its page would show the same thing twice.")
+    longest = max(map(len, paths))
+    length = next(n for n in range(1, longest + 1) if len({p[-n:] for p in paths}) == len(paths))
+    ends = [path[-length:] for path in paths]
+    while len({end[-1] for end in ends}) == 1:
+        ends = [end[:-1] for end in ends]
+    return ["/".join(end) for end in ends]
+
+
+if __name__ == "__main__":
+    main()

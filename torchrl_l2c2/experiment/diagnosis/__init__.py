@@ -1,0 +1,22 @@
+"""Why a policy shakes: measured, in words, and as one page.
+
+``python -m torchrl_l2c2.experiment.diagnose RUN [RUN...]`` writes the page of runs;
+:func:`diagnose` takes any TorchRL actor with an environment.
+"""
+
+from torchrl_l2c2.experiment.diagnosis.measured import Diagnosis, TermShare, diagnose
+from torchrl_l2c2.experiment.diagnosis.page import write_page
+from torchrl_l2c2.experiment.diagnosis.run import diagnose_run, value_function
+from torchrl_l2c2.experiment.diagnosis.words import THRESHOLDS, Finding, findings
+
+__all__ = [
+    "THRESHOLDS",
+    "Diagnosis",
+    "Finding",
+    "TermShare",
+    "diagnose",
+    "diagnose_run",
+    "findings",
+    "value_function",
+    "write_page",
+]

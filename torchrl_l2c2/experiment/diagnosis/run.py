@@ -1,0 +1,191 @@
+"""What a run's folder gives to a diagnosis: its policy and value function, and its training."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import statistics
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from gymnasium.error import DependencyNotInstalled
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
+from torchrl.objectives import LossModule
+
+from torchrl_l2c2.experiment.algorithms.agent import Agent
+from torchrl_l2c2.experiment.config import ExperimentConfig
+from torchrl_l2c2.experiment.diagnosis.measured import Diagnosis, TermShare, Value, diagnose
+from torchrl_l2c2.experiment.environments import TEST_SEED
+from torchrl_l2c2.experiment.evaluate import load_policy
+from torchrl_l2c2.experiment.export import entry_names
+from torchrl_l2c2.experiment.folder import load_newest
+from torchrl_l2c2.experiment.influence import gradient_shares
+from torchrl_l2c2.experiment.process import ProcessState
+from torchrl_l2c2.experiment.video import play_pictures
+from torchrl_l2c2.objectives.evaluation import VALUE_NETWORKS, Evaluation, is_ensemble
+
+LATE = 0.1  # of the training, whose mean shares are told
+
+
+def diagnose_run(
+    folder: str | Path,
+    *,
+    name: str | None = None,
+    episodes: int = 3,
+    seed: int = TEST_SEED,
+    noise_scale: float | None = None,
+    best: bool = False,
+    with_pictures: bool = True,
+) -> Diagnosis:
+    """Diagnoses a run's policy, with its own neighborhood, value function and training.
+
+    Args:
+        folder (str or Path): of a run, finished or not.
+
+    Keyword Args:
+        name (str, optional): what it is called. Default: the folder.
+        episodes (int): as for :func:`~.measured.diagnose`. Default 3.
+        seed (int): of the environment and its noise, the same for all that are compared.
+        noise_scale (float, optional): of the environment's noise. Default: the task's. Where there
+            is none, sensitivity is measured with .01.
+        best (bool): whether to take ``policy_best.pt``. Default ``False``.
+        with_pictures (bool): whether the first episode is drawn as well. Default ``True``.
+
+    Returns:
+        Diagnosis: with the shares of the loss's terms, and with pictures where they were wanted
+        and the task draws any.
+
+    Raises:
+        FileNotFoundError: the folder holds no run, or no policy yet.
+    """
+    folder = Path(folder)
+    policy, env, max_steps = load_policy(folder, seed=seed, noise_scale=noise_scale, best=best)
+    config = ExperimentConfig.from_dict(json.loads((folder / "config.json").read_text()))
+    noise = config.task.noise_scale if noise_scale is None else noise_scale
+    agent = _trained(folder, config, env)
+    with ProcessState(seed):
+        found = diagnose(
+            policy,
+            env,
+            name=name or str(folder),
+            episodes=episodes,
+            max_steps=max_steps,
+            neighborhood=getattr(config.regularizer, "neighborhood", None),
+            value=None if agent is None else value_function(agent.loss),
+            noise_scale=noise or 0.01,
+        )
+        shares = _shares(folder, config, agent, env, max_steps)
+    seen = getattr(env, "base_env", env).unwrapped.observation_space
+    entries = entry_names(seen, found.observations.shape[1])
+    env.close()
+    pictures = _pictures(folder, seed, noise_scale, best) if with_pictures else []
+    return replace(found, shares=shares, entries=entries, pictures=pictures)
+
+
+def value_function(loss: LossModule) -> Value | None:
+    """The value function of a loss, all of its heads; ``None`` where it has none.
+
+    Args:
+        loss (LossModule): any that says what its networks read and write.
+
+    Returns:
+        callable: observations ``[N, *F]`` and actions ``[N, *A]`` to values ``[N, M]``. State
+        values do not look at the action.
+    """
+    present = [name for name in VALUE_NETWORKS if getattr(loss, name, None) is not None]
+    if not present:
+        return None
+    network, evaluation = present[0], Evaluation()
+    evaluation.wire(loss, [network])
+    dim = int(is_ensemble(loss, network))
+
+    def value(observation: Tensor, action: Tensor) -> Tensor:
+        batch = TensorDict({"observation": observation, "action": action}, observation.shape[:1])
+        states = batch.select("observation").unsqueeze(0)
+        _, there = evaluation.values_at(loss, network, batch, states)
+        # From [M, 1, N, H] of an ensemble, [1, N, H] of one network.
+        return there.movedim(dim + 1, 0).flatten(1)
+
+    return value
+
+
+def _trained(folder: Path, config: ExperimentConfig, env: EnvBase) -> Agent | None:
+    """What learned in the run, as its newest checkpoint has it; ``None`` without one."""
+    newest = load_newest(folder)
+    if newest is None:
+        return None
+    agent = replace(config, device="cpu").make_agent(env)
+    state = newest[1]["loss"]
+    if any(key.startswith("_value_estimator.") for key in state):
+        _ = agent.loss.value_estimator  # Some losses make theirs when they are first called.
+    agent.loss.load_state_dict(state)
+    return agent
+
+
+def _shares(
+    folder: Path, config: ExperimentConfig, agent: Agent | None, env: EnvBase, max_steps: int
+) -> dict[str, TermShare]:
+    """Of the metrics, and of the gradients at a training episode that is played for them."""
+    sizes = _sizes(folder / "metrics.csv")
+    gradients: Mapping[str, float] = {}
+    added: Iterable[str] = ()
+    if agent is not None:
+        added = getattr(agent.loss, "added_terms", ())
+        if added:
+            with torch.enable_grad():
+                gradients = gradient_shares(agent.loss, _batch(agent, config, env, max_steps))
+    names = dict.fromkeys([*sizes, *(key.removeprefix("loss_") for key in gradients)])
+    return {
+        name: TermShare(
+            added=f"loss_{name}" in added,
+            size=sizes.get(name, math.nan),
+            gradient=gradients.get(f"loss_{name}", math.nan),
+        )
+        for name in names
+    }
+
+
+def _sizes(path: Path) -> dict[str, float]:
+    if not path.exists():
+        return {}
+    with open(path, newline="") as file:
+        rows = list(csv.DictReader(file))
+    late = rows[-max(1, round(LATE * len(rows))) :]
+    columns = [name for name in (late[-1] if late else {}) if name.split("_")[0] == "share"]
+    known = {
+        name: [v for row in late if not math.isnan(v := float(row[name] or "nan"))]
+        for name in columns
+    }
+    return {
+        name.replace("share", "loss", 1).removeprefix("loss_"): statistics.fmean(values)
+        for name, values in known.items()
+        if values
+    }
+
+
+def _batch(agent: Agent, config: ExperimentConfig, env: EnvBase, max_steps: int) -> TensorDictBase:
+    """A training episode, with what the loss reads of it."""
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        episode: TensorDictBase = env.rollout(max_steps, agent.policy)
+        reward = episode["next", "reward"] * config.algorithm.reward_factor
+        episode.set(("next", "reward"), reward)
+        if agent.advantage is not None:
+            episode = agent.advantage(episode)
+    return episode
+
+
+def _pictures(folder: Path, seed: int, noise_scale: float | None, best: bool) -> list[Any]:
+    try:
+        ((_, pictures, _),) = play_pictures(
+            folder, 1, seed=seed, noise_scale=noise_scale, best=best
+        )
+    # The task draws none, or not without a package that is not there.
+    except (ValueError, DependencyNotInstalled):
+        return []
+    return pictures
