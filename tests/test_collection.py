@@ -193,6 +193,7 @@ class TestSeveralWorkers:
             collector.rollout()
 
 
+@pytest.mark.slow
 def test_a_script_that_leaves_its_workers_running_ends(tmp_path):
     """They are ended with it, also where nobody closed the experiment."""
     script = tmp_path / "script.py"

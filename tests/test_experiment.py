@@ -443,7 +443,7 @@ gymnasium.register("Broken-v0", entry_point=Broken)
 """
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_an_error_of_the_users_own_task_is_shown_with_its_lines(tmp_path, monkeypatch, workers):
     """Also where it happened in another process."""
     (tmp_path / "broken_task.py").write_text(BROKEN_TASK)

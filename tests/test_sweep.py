@@ -72,11 +72,19 @@ def begun(folder, least=1):
     return len(files) >= least and all(episodes(file.parent) >= 2 for file in files)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize(
-    "launcher",
-    # Two processes beside those of the tests take minutes.
-    ["basic", pytest.param("joblib", marks=pytest.mark.slow)],
+    ("launcher", "number"),
+    [
+        ("basic", signal.SIGINT),  # SIGTERM is test_resume's
+        *(
+            pytest.param(*each, marks=pytest.mark.slow)
+            for each in (
+                ("basic", signal.SIGTERM),
+                ("joblib", signal.SIGINT),
+                ("joblib", signal.SIGTERM),
+            )
+        ),
+    ],
 )
 def test_an_interrupted_sweep_saves_ends_and_is_continued(tmp_path, launcher, number):
     """Its running jobs save, no other one begins, no process stays; the same command goes on."""
@@ -111,6 +119,7 @@ def test_an_interrupted_sweep_saves_ends_and_is_continued(tmp_path, launcher, nu
     assert said(tmp_path).count("continuing after episode") == running
 
 
+@pytest.mark.slow
 def test_ctrl_c_while_compiling_saves(tmp_path):
     """The compiler does not hear it; the episode ends with its updates, and is saved."""
     kappa = f"algorithm.kappa={random.random()}"  # nothing of it is in the compiler's cache
@@ -126,6 +135,7 @@ def test_ctrl_c_while_compiling_saves(tmp_path):
     wait_until(lambda: not alive(process.pid), 10)
 
 
+@pytest.mark.slow  # with the other launcher it is test_experiment's
 def test_the_failed_jobs_of_a_sweep_are_named_at_its_end(tmp_path):
     """Each in a line with its reason, after everything else; the others are finished."""
     wrong = "regularizer.sigma=-1,1"
