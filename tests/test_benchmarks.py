@@ -25,6 +25,7 @@ WHERE = {
 }
 
 
+@pytest.mark.slow
 def test_the_command_writes_rows_as_json_and_as_a_table(tmp_path):
     """A quick run of two groups: valid JSON, one table line per row, ratios of the parts."""
     result, table = tmp_path / "speed.json", tmp_path / "speed.md"

@@ -42,6 +42,7 @@ def test_the_best_policy_of_the_tests_during_training_is_kept(tmp_path):
     assert not (tmp_path / "without" / "evaluations.json").exists()
 
 
+@pytest.mark.slow
 def test_tests_during_training_are_continued_with_the_run(tmp_path):
     """None is lost and none comes twice."""
     whole = run(tmp_path / "whole", evaluate_every=2)

@@ -596,6 +596,7 @@ class TestFraction:
                 if ours is not None:
                     torch.testing.assert_close(ours, theirs)
 
+    @pytest.mark.slow
     def test_it_compiles_into_one_graph(self):
         """With the eager numbers, at the same seed."""
         torch._dynamo.reset()

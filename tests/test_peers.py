@@ -27,6 +27,7 @@ def test_rows_are_seconds_here_by_seconds_there():
         assert 0.01 < row.value < 100.0
 
 
+@pytest.mark.slow
 def test_a_library_that_is_not_installed_is_named(tmp_path):
     """In its place: a module that cannot be imported."""
     python = tmp_path / "python"

@@ -263,7 +263,7 @@ def wait_for(condition, process, pause=0.01):
 )
 def test_killed_processes_end_with_the_numbers_of_the_one_that_was_not(tmp_path, kills):
     """SIGKILL between and within episodes, and while a checkpoint is being written."""
-    episodes = 20 * (kills + 1)
+    episodes = 10 * (kills + 2)
     undisturbed = start(tmp_path / "undisturbed", episodes)
     assert undisturbed.wait(600) == 0, messages(tmp_path / "undisturbed").read_text()
     folder = tmp_path / "killed"

@@ -12,6 +12,7 @@ import pytest
 
 import torchrl_l2c2
 
+pytestmark = pytest.mark.slow  # as CONTRIBUTING says, when pages or docstrings were touched
 ROOT = Path(__file__).parents[1]
 
 
