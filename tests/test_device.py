@@ -2,41 +2,26 @@
 
 import pytest
 import torch
+from small import ALGORITHMS, env_id_of, replay_of
 
 from torchrl_l2c2.experiment import (
     AdamConfig,
-    DQNConfig,
     Experiment,
     ExperimentConfig,
-    PPOConfig,
-    PPORPEConfig,
-    SACConfig,
     TaskConfig,
-    TD3Config,
-    UniformReplayConfig,
 )
 from torchrl_l2c2.experiment.settings import SettingError
 
-ALGORITHMS = {
-    "ppo_rpe": PPORPEConfig(hidden=(8,)),
-    "sac": SACConfig(random_frames=10, hidden=(8,)),
-    "td3": TD3Config(random_frames=10, hidden=(8,)),
-    "ppo": PPOConfig(frames=30, epochs=2, hidden=(8,)),
-    "dqn": DQNConfig(random_frames=10, hidden=(8,)),
-}
 CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 
 
-SMALL = {"replay": UniformReplayConfig(batch_size=16)}
-
-
 def config(name, **settings):
-    env_id = "CartPole-v1" if name == "dqn" else "Pendulum-v1"
     return ExperimentConfig(
         **{
-            "task": TaskConfig("task", env_id, episodes=4, max_steps=30),
+            "task": TaskConfig("task", env_id_of(name), episodes=4, max_steps=30),
             "algorithm": ALGORITHMS[name],
-            **(SMALL if name in ("sac", "td3", "dqn") else {}),
+            # By priority where that is usual: the draws go to the device as well.
+            **({} if name == "ppo_rpe" else {"replay": replay_of(name)}),
             "optimizer": AdamConfig(lr=0.001),
             "compile": False,
             "test_episodes": 2,

@@ -11,20 +11,15 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from small import ALGORITHMS, env_id_of, replay_of
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs import ExplorationType, GymWrapper, set_exploration_type
 
 from torchrl_l2c2.experiment import (
-    DQNConfig,
     Experiment,
     ExperimentConfig,
-    PPOConfig,
-    PPORPEConfig,
-    SACConfig,
     TaskConfig,
-    TD3Config,
-    UniformReplayConfig,
     evaluate_policy,
 )
 from torchrl_l2c2.experiment.environments import control_rate
@@ -33,25 +28,18 @@ from torchrl_l2c2.experiment.export import export_policy, main
 
 onnxruntime = pytest.importorskip("onnxruntime")
 ROOT = Path(__file__).parents[1]
-ALGORITHMS = {
-    "ppo_rpe": PPORPEConfig(hidden=(16,)),
-    "sac": SACConfig(random_frames=10, hidden=(16,)),
-    "td3": TD3Config(random_frames=10, hidden=(16,)),
-    "ppo": PPOConfig(frames=30, epochs=2),
-    "dqn": DQNConfig(random_frames=10, hidden=(16,)),
-}
 
 
 def finished_run(folder, name="ppo_rpe", **task):
-    env_id = "CartPole-v1" if name == "dqn" else "Pendulum-v1"
-    replay = {"replay": UniformReplayConfig(batch_size=16)} if name in ("sac", "td3", "dqn") else {}
     config = ExperimentConfig(
-        task=TaskConfig("task", **{"env_id": env_id, "episodes": 3, "max_steps": 40, **task}),
+        task=TaskConfig(
+            "task", **{"env_id": env_id_of(name), "episodes": 3, "max_steps": 40, **task}
+        ),
         algorithm=ALGORITHMS[name],
+        replay=replay_of(name),
         compile=False,
         test_episodes=1,
         late_share=0.0,
-        **replay,
     )
     run = Experiment(config, folder)
     run.train()

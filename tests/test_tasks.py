@@ -10,21 +10,16 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from small import ALGORITHMS, replay_of
 
 from torchrl_l2c2.experiment import (
     TASKS,
     AdamConfig,
-    DQNConfig,
     EpisodeCollector,
     Experiment,
     ExperimentConfig,
-    PPOConfig,
     PPORPEConfig,
-    RolloutReplayConfig,
-    SACConfig,
     TaskConfig,
-    TD3Config,
-    UniformReplayConfig,
     make_env,
 )
 
@@ -148,24 +143,16 @@ def test_images_are_refused_where_a_vector_is_to_be(monkeypatch):
         make_env(task(), 0)
 
 
-ALGORITHMS = {
-    "ppo_rpe": (PPORPEConfig(hidden=(8,)), UniformReplayConfig(batch_size=16)),
-    "sac": (SACConfig(random_frames=10, hidden=(8,)), UniformReplayConfig(batch_size=16)),
-    "td3": (TD3Config(random_frames=10, hidden=(8,)), UniformReplayConfig(batch_size=16)),
-    "ppo": (PPOConfig(frames=30, epochs=2, hidden=(8,)), RolloutReplayConfig(batch_size=16)),
-    "dqn": (DQNConfig(random_frames=10, hidden=(8,)), UniformReplayConfig(batch_size=16)),
-}
 CONTINUOUS = [name for name in ALGORITHMS if name != "dqn"]
 
 
 def experiment(name, chosen, folder=None, **settings):
-    algorithm, replay = ALGORITHMS[name]
     return Experiment(
         ExperimentConfig(
             **{
                 "task": chosen,
-                "algorithm": algorithm,
-                "replay": replay,
+                "algorithm": ALGORITHMS[name],
+                "replay": replay_of(name),
                 "optimizer": AdamConfig(lr=0.001),
                 "compile": False,
                 "test_episodes": 1,

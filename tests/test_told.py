@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from small import ALGORITHMS, env_id_of, replay_of
 from tensordict import TensorDict
 from torchrl.modules import MLP, Actor, ValueOperator
 from torchrl.objectives import DDPGLoss
@@ -14,37 +15,22 @@ from torchrl_l2c2 import L2C2Loss, Neighborhood, NeighborTransform
 from torchrl_l2c2.experiment import (
     AdamConfig,
     CAPSConfig,
-    DQNConfig,
     Experiment,
     ExperimentConfig,
     L2C2Config,
-    PPOConfig,
-    PPORPEConfig,
-    RolloutReplayConfig,
     SACConfig,
     TaskConfig,
-    TD3Config,
-    UniformReplayConfig,
 )
 from torchrl_l2c2.experiment.influence import gradient_shares
 
 PENDULUM = TaskConfig("pendulum", "Pendulum-v1", episodes=2, max_steps=40)
-ALGORITHMS = {
-    "ppo_rpe": PPORPEConfig(hidden=(8,)),
-    "sac": SACConfig(hidden=(8,), random_frames=10),
-    "td3": TD3Config(hidden=(8,), random_frames=10),
-    "ppo": PPOConfig(hidden=(8,), frames=30, epochs=2),
-    "dqn": DQNConfig(hidden=(8,), random_frames=10),
-}
 
 
 def make(name, folder=None, **settings):
-    replay = RolloutReplayConfig if name == "ppo" else UniformReplayConfig
-    task = replace(PENDULUM, env_id="CartPole-v1" if name == "dqn" else "Pendulum-v1")
     values = {
-        "task": task,
+        "task": replace(PENDULUM, env_id=env_id_of(name)),
         "algorithm": ALGORITHMS[name],
-        "replay": replay(batch_size=8),
+        "replay": replay_of(name),
         "optimizer": AdamConfig(),
         "compile": False,
         "test_episodes": 1,

@@ -83,7 +83,22 @@ class RampGain(ConstantGain):
         return self.value
 
 
-class GradientGain(ConstantGain):
+class _BoundedGain(ConstantGain):
+    """A gain that moves by factors, within bounds around its first value."""
+
+    def __init__(self, rate: float, limit: float, value: float) -> None:
+        check_real("rate", rate, above=0, at_most=1)
+        check_real("value", value, above=0)
+        check_real("limit", limit, above=1)
+        super().__init__(value)
+        self.rate = float(rate)
+        self._low, self._high = value / limit, value * limit
+
+    def _multiply(self, factor: float) -> None:
+        self.value = min(max(self.value * factor, self._low), self._high)
+
+
+class GradientGain(_BoundedGain):
     r"""A gain that keeps a term's gradient at a share of that of the loss's own terms.
 
     .. math::
@@ -116,20 +131,17 @@ class GradientGain(ConstantGain):
         self, share: float, rate: float = 0.1, limit: float = 1000.0, value: float = 1.0
     ) -> None:
         check_real("share", share, above=0)
-        check_real("rate", rate, above=0, at_most=1)
-        self.share, self.rate = float(share), float(rate)
-        self._low, self._high = _bounds(value, limit)
-        super().__init__(value)
+        super().__init__(rate, limit, value)
+        self.share = float(share)
 
     def step(self, measured: float = math.nan) -> float:
         """The next value after a share :math:`\\rho`; 0 and what is not finite change nothing."""
         if 0.0 < measured < math.inf:
-            value = self.value * (self.share / measured) ** self.rate
-            self.value = min(max(value, self._low), self._high)
+            self._multiply((self.share / measured) ** self.rate)
         return self.value
 
 
-class TargetGain(ConstantGain):
+class TargetGain(_BoundedGain):
     r"""A gain that rises while a measure is above its target, and falls while it is below.
 
     .. math::
@@ -162,21 +174,12 @@ class TargetGain(ConstantGain):
         self, target: float, rate: float = 0.1, limit: float = 1000.0, value: float = 1.0
     ) -> None:
         check_real("target", target, above=0)
-        check_real("rate", rate, above=0, at_most=1)
-        self.target, self.rate = float(target), float(rate)
-        self._low, self._high = _bounds(value, limit)
-        super().__init__(value)
+        super().__init__(rate, limit, value)
+        self.target = float(target)
 
     def step(self, measured: float = math.nan) -> float:
         """The next value after a measure :math:`m`; one that is not finite changes nothing."""
         if math.isfinite(measured):
             excess = min(max(measured / self.target - 1.0, -1.0), 1.0)
-            value = self.value * math.exp(self.rate * excess)
-            self.value = min(max(value, self._low), self._high)
+            self._multiply(math.exp(self.rate * excess))
         return self.value
-
-
-def _bounds(value: float, limit: float) -> tuple[float, float]:
-    check_real("value", value, above=0)
-    check_real("limit", limit, above=1)
-    return value / limit, value * limit

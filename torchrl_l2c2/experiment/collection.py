@@ -226,6 +226,33 @@ class EpisodeCollector(Collector):
         )
 
 
+def play_episodes(
+    policy: TensorDictModule,
+    env: EnvBase,
+    episodes: int,
+    *,
+    max_steps: int,
+    sampled: bool = False,
+    compile_policy: bool = False,
+) -> Iterator[TensorDictBase]:
+    """Episodes ``[T]`` of a policy, by its mean or by samples; the environment stays open.
+
+    The arguments are those of :func:`~torchrl_l2c2.experiment.evaluate_policy`.
+    """
+    collector = EpisodeCollector(
+        env,
+        policy,
+        frames_per_batch=max_steps,
+        compile_policy=compile_policy,
+        exploration_type=ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC,
+    )
+    try:
+        for _ in range(episodes):
+            yield collector.rollout()
+    finally:
+        collector.shutdown(close_env=False)
+
+
 def check_finite(batch: TensorDictBase, first_frame: int) -> None:
     """Stops at the first NaN or infinity that the environment or the policy gave.
 

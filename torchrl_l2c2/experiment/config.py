@@ -178,7 +178,6 @@ class ExperimentConfig:
             )
         with device:
             agent = self.algorithm.make_agent(env, self.regularizer, self.optimizer)
-        agent.compilable &= self.regularizer.compilable
         if device.type != "cpu":
             agent.act_on_cpu()
         return agent

@@ -22,7 +22,7 @@ from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 from tqdm import tqdm
 
-from torchrl_l2c2.experiment.collection import EpisodeCollector, check_finite
+from torchrl_l2c2.experiment.collection import EpisodeCollector, check_finite, play_episodes
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
 from torchrl_l2c2.experiment.folder import load_newest, write_json
@@ -124,19 +124,22 @@ def evaluate_policy(
     variations: list[float] = []
     lengths: list[int] = []
     measures: dict[str, list[float]] = {}
-    collector = EpisodeCollector(
-        env,
-        policy,
-        frames_per_batch=max_steps,
-        compile_policy=compile_policy,
-        exploration_type=ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC,
-    )
-    name = "test, sampled" if sampled else "test"
     bar = tqdm(
-        range(episodes), name, unit="episode", disable=None if progress else True, leave=False
+        play_episodes(
+            policy,
+            env,
+            episodes,
+            max_steps=max_steps,
+            sampled=sampled,
+            compile_policy=compile_policy,
+        ),
+        "test, sampled" if sampled else "test",
+        episodes,
+        unit="episode",
+        disable=None if progress else True,
+        leave=False,
     )
-    for _ in bar:
-        episode = collector.rollout()
+    for episode in bar:
         check_finite(episode, sum(lengths))
         actions = mean_actions(policy, episode) if sampled else episode["action"]
         returns.append(episode["next", "reward"].sum().item())
@@ -147,7 +150,6 @@ def evaluate_policy(
                 measures.setdefault(prefix + name, []).append(value)
         lengths.append(len(episode))
         bar.set_postfix_str(f"return {statistics.fmean(returns):.1f}")
-    collector.shutdown(close_env=False)
     return Evaluation(returns, variations, lengths, measures)
 
 

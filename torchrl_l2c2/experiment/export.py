@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from torchrl.data import OneHot
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
-from torchrl_l2c2.experiment.collection import EpisodeCollector
+from torchrl_l2c2.experiment.collection import play_episodes
 from torchrl_l2c2.experiment.environments import control_rate
 from torchrl_l2c2.experiment.evaluate import load_policy
 from torchrl_l2c2.experiment.folder import make_folder, versions, write_atomically, write_json
@@ -108,7 +108,8 @@ def export_policy(
         )
     policy, env, max_steps = load_policy(run, best=best)
     with ProcessState(0):
-        observations = _record(policy, env, max_steps, episodes)
+        played = play_episodes(policy, env, episodes, max_steps=max_steps)
+        observations = torch.cat([episode["observation"] for episode in played])
     mean = MeanPolicy(policy, isinstance(env.action_spec, OneHot)).eval()
     program, content = _translate(mean, observations[:2])
     act = _onnx_function(content)
@@ -133,18 +134,6 @@ def export_policy(
     write_atomically(folder / "policy.pt2", saved.getvalue())
     write_json(folder / "contract.json", contract)
     return Exported(folder, contract)
-
-
-def _record(policy: TensorDictModule, env: EnvBase, max_steps: int, episodes: int) -> Tensor:
-    collector = EpisodeCollector(
-        env,
-        policy,
-        frames_per_batch=max_steps,
-        exploration_type=ExplorationType.DETERMINISTIC,
-    )
-    seen = torch.cat([collector.rollout()["observation"] for _ in range(episodes)])
-    collector.shutdown(close_env=False)
-    return seen
 
 
 def _translate(mean: MeanPolicy, observations: Tensor) -> tuple[Any, bytes]:

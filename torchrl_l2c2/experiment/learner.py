@@ -52,6 +52,7 @@ class Learner:
         skip_nonfinite (bool): as for :func:`~.update.make_update`.
 
     Attributes:
+        compiles: whether the update is compiled.
         updates: gradient steps so far.
         skipped_updates: batches that were not finite and changed nothing.
         first_update_seconds: how long the first took, compilation included; ``None`` before it.
@@ -75,7 +76,7 @@ class Learner:
         self.tells_faint_regularizer = True
         self._device = agent.device
         self._reward_factor = reward_factor
-        self._compile = compile
+        self.compiles = compile
         self._skip_nonfinite = skip_nonfinite
         self._terms: list[torch.Tensor] = []
         # Here, as a compiled update would not tell.
@@ -88,7 +89,7 @@ class Learner:
         """Makes the update anew: a compiled one is made for the tensors that were there."""
         self.agent.refresh_policy()
         self.update = ReplayUpdate(
-            self.agent, self.replay, compile=self._compile, skip_nonfinite=self._skip_nonfinite
+            self.agent, self.replay, compile=self.compiles, skip_nonfinite=self._skip_nonfinite
         )
 
     @torch.no_grad()

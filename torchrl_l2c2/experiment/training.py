@@ -106,7 +106,7 @@ class Experiment:
                 self.agent,
                 config.make_replay(),
                 reward_factor=config.algorithm.reward_factor,
-                compile=self._compile,
+                compile=self._compile and config.regularizer.compilable,
                 skip_nonfinite=config.on_nonfinite == "skip",
             )
             collector = make_collector(config, env, self.agent, compile=self._compile)
@@ -156,7 +156,7 @@ class Experiment:
         check_length(budget, len(self.metrics))
         algorithm, saved = self.config.algorithm, time.monotonic()
         schedule = SCHEDULES[algorithm.schedule](self.player, self.learner, algorithm)
-        compiles = self._compile and self.agent.compilable and not self.learner.updates
+        compiles = self.learner.compiles and not self.learner.updates
         bar = Progress(
             budget.total,
             self._spent(budget),

@@ -59,7 +59,6 @@ def make_update(
     """
     parameters = [p for group in agent.optimizer.param_groups for p in group["params"]]
     keys = agent.loss.out_keys
-    compile = compile and agent.compilable
     step: Callable[[], object] | None = None
     if compile and traceable_targets(agent.target_updater):
         step = traceable_step(agent.optimizer)

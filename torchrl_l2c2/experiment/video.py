@@ -16,9 +16,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
-from torchrl.envs import ExplorationType
 
-from torchrl_l2c2.experiment.collection import EpisodeCollector
+from torchrl_l2c2.experiment.collection import play_episodes
 from torchrl_l2c2.experiment.environments import control_rate
 from torchrl_l2c2.experiment.evaluate import load_policy
 from torchrl_l2c2.experiment.process import ProcessState
@@ -71,7 +70,7 @@ def record_video(
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}.")
     path = Path(path or Path(run) / "video.mp4")
-    played = list(play_pictures(run, episodes, seed=seed, noise_scale=noise_scale, best=best))
+    played = play_pictures(run, episodes, seed=seed, noise_scale=noise_scale, best=best)
     rate = played[0][2]
     write_video(path, [picture for _, seen, _ in played for picture in seen], rate or 30.0)
     return path
@@ -84,31 +83,27 @@ def play_pictures(
     seed: int | None = None,
     noise_scale: float | None = None,
     best: bool = False,
-) -> Iterator[tuple[TensorDictBase, list[Picture], float | None]]:
+) -> list[tuple[TensorDictBase, list[Picture], float | None]]:
     """Test episodes with the pictures of every state, and the pictures per second.
 
     The arguments are those of :func:`record_video`.
 
-    Yields:
-        tuple: an episode ``[T]``; its ``T + 1`` pictures, from the reset on; their rate, or
-        ``None`` where the simulator does not say.
+    Returns:
+        list: of each, the episode ``[T]``; its ``T + 1`` pictures, from the reset on; their rate,
+        or ``None`` where the simulator does not say.
     """
     with _without_a_screen():
         policy, env, max_steps = load_policy(
             run, seed=seed, noise_scale=noise_scale, best=best, render=True
         )
-        collector = EpisodeCollector(
-            env,
-            policy,
-            frames_per_batch=max_steps,
-            exploration_type=ExplorationType.DETERMINISTIC,
-        )
         simulator = getattr(env, "base_env", env)._env
-        for _ in range(episodes):
-            with ProcessState(seed or 0):
-                episode = collector.rollout()
-            yield episode, list(simulator.render()), control_rate(env)
-        collector.shutdown()
+        with ProcessState(seed or 0):
+            played = [
+                (episode, list(simulator.render()), control_rate(env))
+                for episode in play_episodes(policy, env, episodes, max_steps=max_steps)
+            ]
+        env.close()
+    return played
 
 
 def write_video(path: Path, pictures: Sequence[Picture], rate: float) -> None:

@@ -30,7 +30,6 @@ class Agent:
         policy_terms: the algorithm's own terms that train the policy; a regularizer's loss knows
             its own.
         policy_delay: updates of the values per update of the policy.
-        compilable: whether the regularized loss compiles into one graph.
     """
 
     loss: LossModule
@@ -42,7 +41,6 @@ class Agent:
     max_grad_norm: float | None = None
     policy_terms: frozenset[str] = field(default_factory=frozenset)
     policy_delay: int = 1
-    compilable: bool = True
     _trained: nn.Module | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:

@@ -121,10 +121,7 @@ def _trained(folder: Path, config: ExperimentConfig, env: EnvBase) -> Agent | No
     if newest is None:
         return None
     agent = replace(config, device="cpu").make_agent(env)
-    state = newest[1]["loss"]
-    if any(key.startswith("_value_estimator.") for key in state):
-        _ = agent.loss.value_estimator  # Some losses make theirs when they are first called.
-    agent.loss.load_state_dict(state)
+    agent.loss.load_state_dict(newest[1]["loss"])
     return agent
 
 
