@@ -35,7 +35,7 @@ from tqdm import tqdm
 from benchmarks.peers import against
 from benchmarks.timing import Row, alternate, machine, to_markdown, to_text
 from torchrl_l2c2.experiment import (
-    TASKS,
+    PAPER_TASKS,
     EpisodeCollector,
     Experiment,
     ExperimentConfig,
@@ -153,7 +153,7 @@ def _smoothing_row(group: str, size: int, us: dict[str, float], at_most: float) 
 
 def collection_rows(effort: Effort) -> Iterable[Row]:
     """Frames with noise, stored as batches, against the simulator's with the same policy."""
-    for name, task in TASKS.items():
+    for name, task in PAPER_TASKS.items():
         task = dataclasses.replace(task, max_steps=min(task.max_steps, effort.steps))
         env = make_env(task, seed=0)
         actor = make_actor(env.observation_spec["observation"].shape[-1], env.action_spec)
@@ -185,7 +185,7 @@ def collection_rows(effort: Effort) -> Iterable[Row]:
 def worker_rows(effort: Effort) -> Iterable[Row]:
     """Episodes of two processes at once, against one after another in this process."""
     for name in ("swingup", "ant"):
-        task = dataclasses.replace(TASKS[name], max_steps=min(1000, effort.steps))
+        task = dataclasses.replace(PAPER_TASKS[name], max_steps=min(1000, effort.steps))
         env = make_env(task, seed=0)
         actor = make_actor(env.observation_spec["observation"].shape[-1], env.action_spec)
         one = EpisodeCollector(
@@ -318,7 +318,7 @@ def peer_rows(effort: Effort) -> Iterable[Row]:
     """Whole training by other libraries, on the same task, networks and batches."""
     steps = min(512, effort.steps)
     settings = {
-        "env_id": TASKS["swingup"].env_id,
+        "env_id": PAPER_TASKS["swingup"].env_id,
         "frames": steps,
         "turn": 4 * steps,
         "compile": effort.compile,

@@ -33,10 +33,12 @@ experiment.folder
 experiment.environments experiment.lock experiment.signals
 experiment.process experiment.progress experiment.sweep experiment.optimizers
 experiment.tasks experiment.replay experiment.collection
+experiment.rollouts
 experiment.regularizers.base
 experiment.regularizers.none experiment.regularizers.caps experiment.regularizers.l2c2
 experiment.regularizers.cats experiment.regularizers.lcp experiment.regularizers.sr2l
 experiment.regularizers.__init__
+experiment.algorithms.normalization
 experiment.algorithms.agent experiment.algorithms.networks experiment.algorithms.base
 experiment.algorithms.ppo_rpe experiment.algorithms.sac experiment.algorithms.td3
 experiment.algorithms.dqn experiment.algorithms.ppo

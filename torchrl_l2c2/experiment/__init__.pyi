@@ -13,11 +13,13 @@ from .regularizers import (
     SR2LConfig,
 )
 from .replay import PrioritizedReplayConfig, RolloutReplayConfig, UniformReplayConfig
-from .tasks import TASKS, TaskConfig
+from .tasks import FIELD_TASKS, PAPER_TASKS, TASKS, TaskConfig
 from .training import Experiment
 from .workers import MultiEpisodeCollector
 
 __all__ = [
+    "FIELD_TASKS",
+    "PAPER_TASKS",
     "TASKS",
     "AdaTermConfig",
     "AdamConfig",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -78,7 +78,7 @@ class EpisodeCollector(Collector):
         random_frames: int = 0,
         exploration_type: ExplorationType = ExplorationType.RANDOM,
     ) -> None:
-        simulator, self._noise = _parts(env)
+        simulator, self._noise = simulator_and_noise(env)
         self._played_by_torchrl = simulator is None
         super().__init__(
             env,
@@ -97,7 +97,7 @@ class EpisodeCollector(Collector):
         # The collector has reset the environment when it was made.
         self._observation: Tensor | None = self._carrier.get("observation")
         self._policy_keys = [key for key in policy.out_keys if not key.startswith("_")]
-        self._act = _on_tensors(policy, self._policy_keys, compile_policy)
+        self._act = on_tensors(policy, self._policy_keys, compile_policy)
         if simulator is not None:
             self._simulator, self._gymnasium = simulator, simulator._env
             self._dtype = simulator.observation_spec["observation"].dtype
@@ -136,7 +136,7 @@ class EpisodeCollector(Collector):
                     if self.stop_at_done:
                         break
         self._observation = observation
-        return self._stack(steps)
+        return stack_steps(steps, self._policy_keys)
 
     def _rollout_by_torchrl(self) -> TensorDictBase:
         if self.env.batch_size or not self.stop_at_done:
@@ -202,29 +202,6 @@ class EpisodeCollector(Collector):
         observation = torch.as_tensor(seen, dtype=self._dtype)
         return observation if self._noise is None else self._noise._apply_transform(observation)
 
-    def _stack(self, steps: list[tuple[Any, ...]]) -> TensorDictBase:
-        observations, following, rewards, terminated, truncated, outputs = zip(*steps, strict=True)
-        ends = [torch.tensor(flags).unsqueeze(-1) for flags in (terminated, truncated)]
-        written = [torch.stack(values) for values in zip(*outputs, strict=True)]
-        false = torch.zeros_like(ends[0])
-        return TensorDict(
-            {
-                "observation": torch.stack(observations),
-                "done": false,
-                "terminated": false.clone(),
-                "truncated": false.clone(),
-                **dict(zip(self._policy_keys, written, strict=True)),
-                "next": {
-                    "observation": torch.stack(following),
-                    "reward": torch.tensor(rewards, dtype=torch.float32).unsqueeze(-1),
-                    "done": ends[0] | ends[1],
-                    "terminated": ends[0],
-                    "truncated": ends[1],
-                },
-            },
-            [len(steps)],
-        )
-
 
 def play_episodes(
     policy: TensorDictModule,
@@ -253,6 +230,37 @@ def play_episodes(
         collector.shutdown(close_env=False)
 
 
+def stack_steps(steps: Sequence[tuple[Any, ...]], policy_keys: Sequence[str]) -> TensorDictBase:
+    """Frames ``[T]`` of what each of them was.
+
+    Args:
+        steps (sequence of tuple): observation, the next one, reward, whether the episode terminated
+            and was truncated, and what the policy wrote.
+        policy_keys (sequence of str): names of the last.
+    """
+    observations, following, rewards, terminated, truncated, outputs = zip(*steps, strict=True)
+    ends = [torch.tensor(flags).unsqueeze(-1) for flags in (terminated, truncated)]
+    written = [torch.stack(values) for values in zip(*outputs, strict=True)]
+    false = torch.zeros_like(ends[0])
+    return TensorDict(
+        {
+            "observation": torch.stack(observations),
+            "done": false,
+            "terminated": false.clone(),
+            "truncated": false.clone(),
+            **dict(zip(policy_keys, written, strict=True)),
+            "next": {
+                "observation": torch.stack(following),
+                "reward": torch.tensor(rewards, dtype=torch.float32).unsqueeze(-1),
+                "done": ends[0] | ends[1],
+                "terminated": ends[0],
+                "truncated": ends[1],
+            },
+        },
+        [len(steps)],
+    )
+
+
 def check_finite(batch: TensorDictBase, first_frame: int) -> None:
     """Stops at the first NaN or infinity that the environment or the policy gave.
 
@@ -279,8 +287,8 @@ def check_finite(batch: TensorDictBase, first_frame: int) -> None:
         )
 
 
-def _parts(env: EnvBase) -> tuple[GymWrapper | None, ObservationNoise | None]:
-    """The simulator and its noise; no simulator where there is more to the environment."""
+def simulator_and_noise(env: EnvBase) -> tuple[GymWrapper | None, ObservationNoise | None]:
+    """The two parts of an environment; no simulator where there is more to the environment."""
     transforms: list[Transform] = []
     simulator = env
     if isinstance(env, TransformedEnv):
@@ -301,7 +309,7 @@ def _flat(transform: Transform) -> Iterator[Transform]:
         yield transform
 
 
-def _on_tensors(
+def on_tensors(
     policy: TensorDictModule, keys: list[str], compile_policy: bool
 ) -> Callable[[Tensor], tuple[Tensor, ...]]:
     """The policy as a function from an observation to the tensors it writes."""

@@ -183,6 +183,7 @@ def run(values: dict[str, Any], standing: str = "") -> FinishedRun | None:
         values (dict): the configuration.
         standing (str): of the sweep that it belongs to; shown before its name and its progress.
     """
+    _check_preset(values)
     config = ExperimentConfig.from_dict(values)
     # Here, as settings are checked before anything waits for torch.
     from torchrl_l2c2.experiment.folder import save_policy
@@ -219,6 +220,20 @@ def run(values: dict[str, Any], standing: str = "") -> FinishedRun | None:
     if video.exists():
         print(f"video: {video}", flush=True)
     return finished
+
+
+def _check_preset(values: dict[str, Any]) -> None:
+    """Refuses a task and an algorithm that the chosen preset has no settings of."""
+    if values.get("preset") != "???":
+        return
+    name = HydraConfig.get().runtime.choices["preset"]
+    known = ", ".join(sorted(path.stem for path in (CONF / "preset" / name).glob("*.yaml")))
+    task, algorithm = values["task"]["name"], values["algorithm"]["name"]
+    raise SettingError(
+        "preset",
+        f"must have settings of task={task} with algorithm={algorithm}, and {name} has those of "
+        f"{known}: choose one of these, or preset=none.",
+    )
 
 
 @contextmanager

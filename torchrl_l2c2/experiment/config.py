@@ -47,7 +47,7 @@ GROUPS: dict[str, Mapping[str, Any]] = {
     "logger": LOGGERS,
 }
 # What steers where and how often runs happen, and is no setting of a run.
-STEERING = {"outputs", "experiment", "resume", "allow_other_versions"}
+STEERING = {"outputs", "experiment", "preset", "resume", "allow_other_versions"}
 
 
 @settings
@@ -213,6 +213,12 @@ class ExperimentConfig:
     def _check_rounds(self) -> None:
         """Several workers play whole episodes, and all of them as many."""
         workers, episodes = self.num_workers, self.task.episodes
+        if workers > 1 and getattr(self.algorithm, "num_envs", None) is not None:
+            raise SettingError(
+                "num_workers",
+                f"must be 1 with algorithm.num_envs, whose simulators one process plays, got "
+                f"{workers}: leave one of the two.",
+            )
         if workers > 1 and self.algorithm.schedule == "step":
             raise SettingError(
                 "num_workers",
@@ -258,6 +264,8 @@ FREE_TASK_SETTINGS = {"name", "episodes", "frames", "solved_at"}
 # Others are newer, too: null and false always are such values.
 NEUTRAL_SETTINGS = {
     "device": "cpu",
+    "algorithm.activation": "tanh",
+    "algorithm.scale_mapping": "softplus",
     "regularizer.policy_distance": "hellinger",
     "regularizer.over_neighbors": "mean",
     "regularizer.fraction": 1.0,

@@ -295,6 +295,8 @@ def load_policy(
         raise FileNotFoundError(f"{str(saved)!r} does not exist; evaluate_every=N makes it.")
     elif newest := load_newest(folder):
         agent.loss.load_state_dict(newest[1]["loss"])
+        if agent.normalization is not None:
+            agent.normalization.load_state_dict(newest[1]["normalization"])
     else:
         raise FileNotFoundError(f"{str(folder)!r} holds neither policy.pt nor a checkpoint yet.")
     return agent.policy, env, config.task.time_limit

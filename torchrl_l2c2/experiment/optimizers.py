@@ -43,12 +43,35 @@ class AdamConfig:
         default=(0.9, 0.999), description="decay of the first and second moment, each in [0, 1)"
     )
     eps: float = Field(default=1e-8, ge=0, description="added to the denominator")
+    linear: bool = Field(
+        default=False, description="the learning rate falls to 0 in a line over the training"
+    )
 
     def make(self, parameters: Iterable[Parameter]) -> Optimizer:
         """The optimizer of these parameters."""
         import torch
 
         return torch.optim.Adam(parameters, lr=self.lr, betas=self.betas, eps=self.eps)
+
+
+def anneal(config: OptimizerConfig, optimizer: Optimizer, done: float) -> None:
+    """Sets the learning rate that follows a part of the training, where it changes.
+
+    Args:
+        config (AdaTermConfig or AdamConfig): made the optimizer.
+        optimizer (Optimizer): its learning rates are set, in place where they are tensors.
+        done (float): share of the training that is over; beyond 1 the rate stays at 0.
+    """
+    import torch
+
+    if not getattr(config, "linear", False):
+        return
+    rate = config.lr * max(0.0, 1.0 - done)
+    for group in optimizer.param_groups:
+        if isinstance(group["lr"], torch.Tensor):  # A compiled step reads it.
+            group["lr"].fill_(rate)
+        else:
+            group["lr"] = rate
 
 
 OptimizerConfig = AdaTermConfig | AdamConfig

@@ -11,6 +11,7 @@ from torchrl.modules import EGreedyModule
 
 from torchrl_l2c2.experiment.algorithms.agent import Agent
 from torchrl_l2c2.experiment.collection import EpisodeCollector, check_finite
+from torchrl_l2c2.experiment.rollouts import RolloutCollector
 from torchrl_l2c2.experiment.workers import MultiEpisodeCollector
 from torchrl_l2c2.metrics import action_variation
 
@@ -40,7 +41,7 @@ class Player:
     """Plays an agent's episodes, and measures and counts what is played.
 
     Args:
-        collector (EpisodeCollector or MultiEpisodeCollector): plays.
+        collector (EpisodeCollector, MultiEpisodeCollector or RolloutCollector): plays.
         agent (Agent): whose policy it plays.
         env_id (str): for errors.
 
@@ -49,7 +50,10 @@ class Player:
     """
 
     def __init__(
-        self, collector: EpisodeCollector | MultiEpisodeCollector, agent: Agent, env_id: str
+        self,
+        collector: EpisodeCollector | MultiEpisodeCollector | RolloutCollector,
+        agent: Agent,
+        env_id: str,
     ) -> None:
         self.collector = collector
         self.frames = 0

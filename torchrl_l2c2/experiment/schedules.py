@@ -43,6 +43,8 @@ def by_episode(player: Player, learner: Learner, algorithm: OffPolicyConfig) -> 
 
 def by_rollout(player: Player, learner: Learner, algorithm: PPOConfig) -> Iterator[Episode]:
     """Updates with everything that one policy has played, once it is enough."""
+    if algorithm.num_envs is not None:
+        yield from by_frames(player, learner, algorithm)
     while True:
         episodes = player.play()
         for episode in episodes:
@@ -50,6 +52,25 @@ def by_rollout(player: Player, learner: Learner, algorithm: PPOConfig) -> Iterat
         for episode in episodes:
             if len(learner.replay) >= algorithm.frames:
                 learner.learn_rollout(algorithm.epochs)
+            yield episode
+
+
+def by_frames(player: Player, learner: Learner, algorithm: PPOConfig) -> Iterator[Episode]:
+    """Updates after so many frames, wherever episodes are then; hands out those that have ended."""
+    normalization = learner.agent.normalization
+    while True:
+        first_frame = player.frames
+        rollout = player.step()
+        ended = player.collector.ended  # type: ignore[union-attr]  # of a RolloutCollector
+        episodes = [player.measured(e.transitions, first_frame + e.frame) for e in ended]
+        for frames in rollout if normalization is None else normalization(rollout):
+            learner.remember(frames)
+        learner.learn_rollout(algorithm.epochs)
+        if normalization is not None:
+            normalization.follow()
+            learner.agent.refresh_policy()
+        for number, episode in enumerate(episodes, start=1):
+            episode.ends_round = number == len(episodes)
             yield episode
 
 

@@ -112,9 +112,17 @@ def _bullet(name: str) -> str:
 
 
 # Noise, steps and the returns that count as solved are the paper's; episodes are inferred.
-TASKS: dict[str, TaskConfig] = {
+PAPER_TASKS: dict[str, TaskConfig] = {
     "swingup": TaskConfig(max_steps=1000, solved_at=800.0),
     "reacher": TaskConfig("reacher", _bullet("Reacher"), 0.01, 3000, 150, 18.0),
     "hopper": TaskConfig("hopper", _bullet("Hopper"), 0.001, 1500, 1000, 2500.0),
     "ant": TaskConfig("ant", _bullet("Ant"), 0.001, 1500, 1000, 2500.0),
 }
+# Those of the methods after it, without noise; conf/experiment/field/ says how long they train.
+FIELD_TASKS: dict[str, TaskConfig] = {
+    "pendulum": TaskConfig("pendulum", "Pendulum-v1"),
+    "lunarlander": TaskConfig("lunarlander", "LunarLanderContinuous-v3"),
+    "hopper_v5": TaskConfig("hopper_v5", "Hopper-v5"),
+    "walker2d_v5": TaskConfig("walker2d_v5", "Walker2d-v5"),
+}
+TASKS: dict[str, TaskConfig] = {**PAPER_TASKS, **FIELD_TASKS}

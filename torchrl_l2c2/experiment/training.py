@@ -34,6 +34,7 @@ from torchrl_l2c2.experiment.gain import GainControl
 from torchrl_l2c2.experiment.learner import Learner, untrained
 from torchrl_l2c2.experiment.lock import lock_folder
 from torchrl_l2c2.experiment.loggers import check_installed
+from torchrl_l2c2.experiment.optimizers import anneal
 from torchrl_l2c2.experiment.player import Episode, Player
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.progress import Progress, say
@@ -171,6 +172,8 @@ class Experiment:
             while not ended:
                 episode = next(schedule)
                 self._write(self._row(episode, budget), bar)
+                done = self._spent(budget) / budget.total
+                anneal(self.config.optimizer, self.agent.optimizer, done)
                 self._best_policy.after(len(self.metrics))
                 if not episode.ends_round:
                     continue
@@ -312,7 +315,7 @@ class Experiment:
 
     def _parts(self) -> dict[str, Any]:
         """What has a state of its own, by its name in checkpoints."""
-        named = ("loss", "optimizer", "target_updater", "exploration")
+        named = ("loss", "optimizer", "target_updater", "exploration", "normalization")
         parts = {name: getattr(self.agent, name) for name in named}
         parts |= {"best_policy": self._best_policy, "gain": self._gain, "metrics_log": self._log}
         return {name: part for name, part in parts.items() if part is not None}

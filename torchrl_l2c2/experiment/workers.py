@@ -21,16 +21,25 @@ from torchrl_l2c2.experiment.algorithms.agent import Agent
 from torchrl_l2c2.experiment.collection import EpisodeCollector
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.environments import make_env
+from torchrl_l2c2.experiment.rollouts import RolloutCollector
+
+
+# Between the seeds of a run's simulators: far enough for no run to have another's.
+SEEDS_APART = 15_485_863
 
 
 def make_collector(
     config: ExperimentConfig, env: EnvBase, agent: Agent, *, compile: bool
-) -> EpisodeCollector | MultiEpisodeCollector:
+) -> EpisodeCollector | MultiEpisodeCollector | RolloutCollector:
     """What plays a run's episodes: this process, or as many others as the settings say."""
-    options: dict[str, Any] = {
-        "compile_policy": compile and agent.policy_compiles,
-        "random_frames": getattr(config.algorithm, "random_frames", 0),
-    }
+    options: dict[str, Any] = {"compile_policy": compile and agent.policy_compiles}
+    num_envs = getattr(config.algorithm, "num_envs", None)
+    if num_envs is not None:
+        seeds = (config.seed + SEEDS_APART * i for i in range(1, num_envs))
+        envs = [env, *(make_env(config.task, seed) for seed in seeds)]
+        frames = config.algorithm.frames
+        return RolloutCollector(envs, agent.policy, frames_per_batch=frames, **options)
+    options["random_frames"] = getattr(config.algorithm, "random_frames", 0)
     if config.num_workers == 1:
         frames = 1 if config.algorithm.schedule == "step" else config.task.time_limit
         return EpisodeCollector(env, agent.policy, frames_per_batch=frames, **options)

@@ -13,6 +13,8 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
 from torchrl.objectives.value import GAE
 
+from torchrl_l2c2.experiment.algorithms.normalization import Normalization
+
 
 @dataclass
 class Agent:
@@ -30,6 +32,7 @@ class Agent:
         policy_terms: the algorithm's own terms that train the policy; a regularizer's loss knows
             its own.
         policy_delay: updates of the values per update of the policy.
+        normalization: of what is learned from; ``policy`` has it inside. ``None`` without any.
     """
 
     loss: LossModule
@@ -41,6 +44,7 @@ class Agent:
     max_grad_norm: float | None = None
     policy_terms: frozenset[str] = field(default_factory=frozenset)
     policy_delay: int = 1
+    normalization: Normalization | None = None
     _trained: nn.Module | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:

@@ -6,11 +6,23 @@ from copy import deepcopy
 from math import ceil
 
 import torch
-from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictParams
-from torch import nn
+from tensordict.nn import (
+    AddStateIndependentNormalScale,
+    NormalParamExtractor,
+    TensorDictModule,
+    TensorDictParams,
+)
+from torch import Tensor, nn
 from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase, ExplorationType
-from torchrl.modules import MLP, ConvNet, ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.modules import (
+    MLP,
+    ConvNet,
+    IndependentNormal,
+    ProbabilisticActor,
+    TanhNormal,
+    ValueOperator,
+)
 
 from torchrl_l2c2.modules import EncodedNetwork
 
@@ -42,6 +54,12 @@ def _bounded(spec: TensorSpec) -> bool:
     # An unbounded one has the largest floats as its low and high.
     sides = (spec.space.low, spec.space.high)
     return isinstance(spec, Bounded) and all(bool(side.isfinite().all()) for side in sides)
+
+
+def action_bounds(env: EnvBase) -> tuple[Tensor, Tensor] | tuple[()]:
+    """The least and the largest action, ``[A]`` each; nothing where there are none."""
+    spec = env.action_spec.to(torch.get_default_device())
+    return (spec.space.low, spec.space.high) if _bounded(spec) else ()
 
 
 # Of the convolutional layers; each halves the image.
@@ -102,25 +120,75 @@ def perceptron(
     return layers if encoder is None else EncodedNetwork(encoder, layers)
 
 
-def tanh_normal_actor(
-    env: EnvBase, hidden: tuple[int, ...], activation: type[nn.Module]
+def normal_actor(
+    env: EnvBase,
+    hidden: tuple[int, ...],
+    activation: type[nn.Module],
+    *,
+    squash: bool = True,
+    log_scale: float | None = None,
+    exponential: bool = False,
 ) -> TensorDictModule:
-    """A tanh-squashed diagonal normal."""
+    """A diagonal normal.
+
+    Keyword Args:
+        squash (bool): whether tanh squashes it into the action's bounds. Default ``True``.
+        log_scale (float, optional): what the logarithm of the scale begins with, as a parameter
+            of its own. Default: the scale is an output of the network.
+        exponential (bool): whether such an output is the scale's logarithm, cut to [-20, 2],
+            instead of going through a softplus. Default ``False``.
+    """
     spec = env.action_spec.to(torch.get_default_device())
-    network = nn.Sequential(
-        perceptron(env, 2 * spec.shape[-1], hidden, activation),
-        NormalParamExtractor(),
-    )
+    size = spec.shape[-1]
+    extractor: nn.Module
+    if log_scale is not None:
+        extractor = AddStateIndependentNormalScale(size, init_value=log_scale)
+    else:
+        extractor = LogScaleExtractor() if exponential else NormalParamExtractor()
+    outputs = 2 * size if log_scale is None else size
+    network = nn.Sequential(perceptron(env, outputs, hidden, activation), extractor)
+    squashed = {"low": spec.space.low, "high": spec.space.high} if squash else {}
     return ProbabilisticActor(
         TensorDictModule(network, ["observation"], ["loc", "scale"]),
         in_keys=["loc", "scale"],
-        spec=spec,
-        distribution_class=TanhNormal,
-        distribution_kwargs={"low": spec.space.low, "high": spec.space.high},
+        # An unsquashed one's samples lie beyond the bounds.
+        spec=spec if squash else None,
+        distribution_class=TanhNormal if squash else IndependentNormal,
+        distribution_kwargs=squashed,
         return_log_prob=True,
         log_prob_key="action_log_prob",
         default_interaction_type=ExplorationType.RANDOM,
     )
+
+
+class LogScaleExtractor(nn.Module):
+    """Halves an output into a location and a scale, the logarithm of which it is.
+
+    Examples:
+        >>> import torch
+        >>> loc, scale = LogScaleExtractor()(torch.tensor([3.0, 9.0]))
+        >>> loc.item(), scale.log().item()
+        (3.0, 2.0)
+    """
+
+    LIMITS = (-20.0, 2.0)
+
+    def forward(self, output: Tensor) -> tuple[Tensor, Tensor]:
+        """An output ``[*B, 2 A]`` to location and scale, each ``[*B, A]``."""
+        loc, log_scale = output.chunk(2, -1)
+        return loc, log_scale.clamp(*self.LIMITS).exp()
+
+
+def orthogonal(network: nn.Module, *, last: float) -> None:
+    """Orthogonal weights with a gain of the root of 2, and no biases.
+
+    Keyword Args:
+        last (float): gain of the last layer. Smaller ones have outputs nearer to 0 at first.
+    """
+    layers = [layer for layer in network.modules() if isinstance(layer, nn.Linear | nn.Conv2d)]
+    for layer in layers:
+        nn.init.orthogonal_(layer.weight, last if layer is layers[-1] else 2.0**0.5)
+        nn.init.zeros_(layer.bias)
 
 
 def action_value(env: EnvBase, hidden: tuple[int, ...]) -> ValueOperator:

@@ -28,6 +28,10 @@ class SACConfig(OffPolicyConfig):
     hidden: Layers = Field(
         default=(256, 256), description="neurons of the hidden layers of all networks"
     )
+    scale_mapping: Literal["softplus", "exp"] = Field(
+        default="softplus",
+        description="from the network's output to the policy's scale; exp: cut to e^-20 and e^2",
+    )
     random_frames: int = Field(
         default=1000, ge=0, description="frames with random actions, before learning starts"
     )
@@ -58,12 +62,12 @@ class SACConfig(OffPolicyConfig):
         from torchrl_l2c2.experiment.algorithms.networks import (
             action_value,
             check_actions,
+            normal_actor,
             sharing,
-            tanh_normal_actor,
         )
 
         check_actions(env, self.name, continuous=True, squashed=True)
-        actor = tanh_normal_actor(env, self.hidden, nn.ReLU)
+        actor = normal_actor(env, self.hidden, nn.ReLU, exponential=self.scale_mapping == "exp")
         loss = SACLoss(
             actor,
             action_value(env, self.hidden),

@@ -172,6 +172,8 @@ def _batch(agent: Agent, config: ExperimentConfig, env: EnvBase, max_steps: int)
         episode: TensorDictBase = env.rollout(max_steps, agent.policy)
         reward = episode["next", "reward"] * config.algorithm.reward_factor
         episode.set(("next", "reward"), reward)
+        if agent.normalization is not None:
+            episode = agent.normalization.normalized(episode)
         if agent.advantage is not None:
             episode = agent.advantage(episode)
     return episode

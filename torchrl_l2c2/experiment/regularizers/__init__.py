@@ -29,4 +29,7 @@ REGULARIZERS: dict[str, RegularizerConfig] = {
     "l2c2": L2C2Config(),
     # The paper's ablation: the policy alone is regularized.
     "l2c2_policy": L2C2Config(name="l2c2_policy", beta=0.0),
+    # For policies of any scale, and where little is to be lost early.
+    "l2c2_mean": L2C2Config(name="l2c2_mean", policy_distance="mean"),
+    "l2c2_ramp": L2C2Config(name="l2c2_ramp", policy_distance="mean", gain="ramp"),
 }

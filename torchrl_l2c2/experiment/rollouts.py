@@ -1,0 +1,222 @@
+"""Rollouts of a fixed length from several simulators, which episodes may outlast."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
+
+from torchrl_l2c2.experiment.collection import on_tensors, simulator_and_noise, stack_steps
+
+
+class Ended(NamedTuple):
+    """An episode that ended in a rollout.
+
+    Attributes:
+        frame: of the rollout, counted over all simulators, after which it had ended.
+        transitions: of the whole episode, ``[T]``.
+    """
+
+    frame: int
+    transitions: TensorDictBase
+
+
+class RolloutCollector:
+    """Plays several Gymnasium simulators in this process with one policy, a frame of each in turn.
+
+    The policy is called once for all of them. A rollout is cut where it is full: what goes on is an
+    episode that the next one continues, and the last ``("next", "observation")`` of a simulator is
+    what to bootstrap from. After an end it is the last observation of the episode, too, and not the
+    first one of the next.
+
+    An episode in the middle can be saved, though its simulator cannot: it is played again from the
+    state of the random generators that it began with, by the actions that were taken.
+
+    Args:
+        envs (sequence of EnvBase): one for each simulator, as
+            :class:`~torchrl_l2c2.experiment.EpisodeCollector` takes them, each seeded by itself.
+        policy (TensorDictModule): reads ``"observation"`` ``[N, F]``. Its actions are clipped into
+            their bounds for the simulators, and kept as they are.
+
+    Keyword Args:
+        frames_per_batch (int): of a rollout, a multiple of the number of environments.
+        compile_policy (bool): whether to compile the policy. Default ``False``.
+        exploration_type (ExplorationType): default ``RANDOM``.
+
+    Attributes:
+        ended: the episodes that ended in the last rollout, in the order of their ends.
+
+    Raises:
+        ValueError: an environment with transforms other than
+            :class:`~torchrl_l2c2.ObservationNoise`.
+
+    Examples:
+        >>> from torchrl.envs import GymEnv
+        >>> from torchrl_l2c2 import make_actor
+        >>> envs = [GymEnv("Pendulum-v1", max_episode_steps=7) for _ in range(2)]
+        >>> actor = make_actor(3, envs[0].action_spec)
+        >>> collector = RolloutCollector(envs, actor, frames_per_batch=20)
+        >>> [frames.shape for frames in collector.rollout()]
+        [torch.Size([10]), torch.Size([10])]
+        >>> [(episode.frame, len(episode.transitions)) for episode in collector.ended]
+        [(13, 7), (14, 7)]
+        >>> collector.shutdown()
+    """
+
+    def __init__(
+        self,
+        envs: Sequence[EnvBase],
+        policy: TensorDictModule,
+        *,
+        frames_per_batch: int,
+        compile_policy: bool = False,
+        exploration_type: ExplorationType = ExplorationType.RANDOM,
+    ) -> None:
+        if frames_per_batch % len(envs):
+            raise ValueError(
+                f"frames_per_batch must be a multiple of the {len(envs)} environments, got "
+                f"{frames_per_batch}."
+            )
+        self._policy_keys = [key for key in policy.out_keys if not key.startswith("_")]
+        self._streams = [_Stream(env, self._policy_keys) for env in envs]
+        self._steps = frames_per_batch // len(envs)
+        self._act = on_tensors(policy, self._policy_keys, compile_policy)
+        self._exploration_type = exploration_type
+        self.ended: list[Ended] = []
+
+    @torch.no_grad()
+    def rollout(self) -> list[TensorDictBase]:
+        """The next frames ``[T]`` of every simulator."""
+        self.ended = []
+        action_index, number = self._policy_keys.index("action"), len(self._streams)
+        played: list[list[tuple[Any, ...]]] = [[] for _ in self._streams]
+        with set_exploration_type(self._exploration_type):
+            for step in range(self._steps):
+                outputs = self._act(torch.stack([stream.observation() for stream in self._streams]))
+                actions = outputs[action_index].numpy()
+                rows = zip(*(output.unbind(0) for output in outputs), strict=True)
+                for place, (stream, action, written) in enumerate(
+                    zip(self._streams, actions, rows, strict=True)
+                ):
+                    played[place].append(stream.step(action, written))
+                    if stream.has_ended:
+                        frame = step * number + place + 1
+                        self.ended.append(Ended(frame, stream.finish()))
+        return [stack_steps(steps, self._policy_keys) for steps in played]
+
+    def generator_state(self) -> dict[str, Any]:
+        """The random generators' states and the episodes that are being played."""
+        return {"streams": {str(i): s.state_dict() for i, s in enumerate(self._streams)}}
+
+    def set_generator_state(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`generator_state` gave, by playing the begun episodes again.
+
+        Warns:
+            UserWarning: a simulator came to another observation than it did; a new episode begins.
+        """
+        for i, stream in enumerate(self._streams):
+            stream.load_state_dict(state["streams"][str(i)])
+
+    def shutdown(self) -> None:
+        """Closes the simulators."""
+        for stream in self._streams:
+            stream.close()
+
+
+class _Stream:
+    """A simulator and the episode that it is in."""
+
+    def __init__(self, env: EnvBase, policy_keys: Sequence[str]) -> None:
+        simulator, self._noise = simulator_and_noise(env)
+        if simulator is None:
+            raise ValueError(
+                "RolloutCollector plays Gymnasium environments with no transform but "
+                f"ObservationNoise, got {env}."
+            )
+        self._env, self._gymnasium, self._policy_keys = env, simulator._env, policy_keys
+        self._dtype = simulator.observation_spec["observation"].dtype
+        space: Any = self._gymnasium.action_space
+        self._low, self._high = space.low, space.high
+        self._observation: Tensor | None = None
+        self._steps: list[tuple[Any, ...]] = []
+        self._begun_with = self._generators()
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether the last step was an episode's."""
+        return bool(self._steps) and (self._steps[-1][3] or self._steps[-1][4])
+
+    def observation(self) -> Tensor:
+        """The present one; an episode begins where there is none."""
+        if self._observation is None:
+            self._begun_with = self._generators()
+            self._observation = self._observe(self._gymnasium.reset()[0])
+        return self._observation
+
+    def step(self, action: np.ndarray, written: tuple[Tensor, ...]) -> tuple[Any, ...]:
+        """Takes an action; gives the frame."""
+        before = self.observation()
+        taken = np.clip(action, self._low, self._high)
+        seen, reward, terminated, truncated, _ = self._gymnasium.step(taken)
+        self._observation = self._observe(seen)
+        step = (before, self._observation, reward, terminated, truncated, written)
+        self._steps.append(step)
+        return step
+
+    def finish(self) -> TensorDictBase:
+        """The episode that has ended."""
+        episode = stack_steps(self._steps, self._policy_keys)
+        self._observation, self._steps = None, []
+        return episode
+
+    def state_dict(self) -> dict[str, Any]:
+        """The generators' states at the episode's beginning, and its frames."""
+        begun = self._begun_with if self._steps else self._generators()
+        frames = stack_steps(self._steps, self._policy_keys).to_dict() if self._steps else None
+        return {"generators": begun, "frames": frames}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores it: the simulator plays the same actions again."""
+        self._set_generators(state["generators"])
+        self._observation, self._steps = None, []
+        if state["frames"] is None:
+            return
+        frames = TensorDict(state["frames"], [len(state["frames"]["action"])])
+        outputs = zip(*(frames[key].unbind(0) for key in self._policy_keys), strict=True)
+        for action, written in zip(frames["action"].numpy(), outputs, strict=True):
+            self.step(action, written)
+        assert self._observation is not None
+        if not self._observation.equal(frames["next", "observation"][-1]):
+            warnings.warn(
+                f"{self._env} plays an episode differently when it is played again: another one "
+                "begins instead, and the run is not the one that it would have been in one go.",
+                stacklevel=4,
+            )
+            self._observation, self._steps = None, []
+
+    def close(self) -> None:
+        """Closes the simulator."""
+        if not self._env.is_closed:
+            self._env.close()
+
+    def _observe(self, seen: np.ndarray) -> Tensor:
+        observation = torch.as_tensor(seen, dtype=self._dtype)
+        return observation if self._noise is None else self._noise._apply_transform(observation)
+
+    def _generators(self) -> dict[str, Any]:
+        simulator = self._gymnasium.unwrapped.np_random.bit_generator.state
+        noise = None if self._noise is None else self._noise.get_extra_state()
+        return {"simulator": json.dumps(simulator), "noise": noise}
+
+    def _set_generators(self, state: dict[str, Any]) -> None:
+        self._gymnasium.unwrapped.np_random.bit_generator.state = json.loads(state["simulator"])
+        if self._noise is not None:
+            self._noise.set_extra_state(state["noise"])
