@@ -22,12 +22,12 @@ from torchrl_l2c2.experiment import (
     SACConfig,
     TaskConfig,
 )
-from torchrl_l2c2.experiment.command import CONF, register
+from torchrl_l2c2.experiment.command import CONF, check_preset, register
 from torchrl_l2c2.experiment.config import GROUPS
 from torchrl_l2c2.experiment.manual import manual, page
 from torchrl_l2c2.experiment.regularizers import REGULARIZERS
 from torchrl_l2c2.experiment.settings import SettingError, describe
-from torchrl_l2c2.experiment.tasks import TASKS
+from torchrl_l2c2.experiment.tasks import FIELD_TASKS, PAPER_TASKS
 
 ROOT = Path(__file__).parent.parent
 
@@ -107,13 +107,16 @@ def test_settings_and_components_have_the_same_defaults(settings, component):
 @pytest.mark.parametrize("regularizer", ["none", "l2c2"])
 def test_every_comparison_is_made_of_valid_runs(name, regularizer):
     """With the task and sizes that its file says."""
+    # Its sweep chooses the tasks and the algorithms.
+    chosen = ["task=pendulum", "algorithm=ppo"] if name == "field_table" else []
     config = ExperimentConfig.from_dict(
-        composed(f"experiment={name}", f"regularizer={regularizer}")
+        composed(f"experiment={name}", f"regularizer={regularizer}", *chosen)
     )
     env_id, algorithm, size = {
         "table3": (TaskConfig().env_id, "ppo_rpe", 32),
         "table3_tau": (TaskConfig().env_id, "ppo_rpe", 32),
         "pendulum": ("Pendulum-v1", "ppo_rpe", 64),
+        "field_table": ("Pendulum-v1", "ppo", 64),
         "cartpole": ("CartPole-v1", "dqn", 64),
     }[name]
     assert config.algorithm.name == algorithm and config.replay.batch_size == size
@@ -121,7 +124,42 @@ def test_every_comparison_is_made_of_valid_runs(name, regularizer):
     assert config.task.env_id == env_id
 
 
-@pytest.mark.parametrize("task", TASKS)
+# Frames, batches, learning rate, discount: numbers of rl_zoo3 2.9.2 and, where it
+# is silent, of Stable-Baselines3.
+ZOO = {
+    ("pendulum", "ppo"): (500_000, 64, 1e-3, 0.9),
+    ("lunarlander", "ppo"): (500_000, 64, 3e-4, 0.999),
+    ("hopper_v5", "ppo"): (1_000_000, 32, 9.80828e-5, 0.999),
+    ("walker2d_v5", "ppo"): (1_000_000, 32, 5.05041e-5, 0.99),
+    ("pendulum", "sac"): (100_000, 256, 1e-3, 0.99),
+    ("lunarlander", "sac"): (500_000, 256, 7.3e-4, 0.99),
+    ("hopper_v5", "sac"): (1_000_000, 256, 3e-4, 0.99),
+    ("walker2d_v5", "sac"): (1_000_000, 256, 3e-4, 0.99),
+}
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "sac"])
+@pytest.mark.parametrize("task", FIELD_TASKS)
+def test_a_preset_is_of_a_task_and_an_algorithm(task, algorithm):
+    """Whichever way they are chosen; what is given beside it goes before."""
+    chosen = ["preset=rl_zoo", f"task={task}", f"algorithm={algorithm}"]
+    values = composed(*chosen)
+    config = ExperimentConfig.from_dict(values)
+    assert values["preset"] == "rl_zoo"
+    learned = (config.replay.batch_size, config.optimizer.lr, config.algorithm.gamma)
+    assert (config.task.frames, *learned) == ZOO[task, algorithm]
+    assert (config.task.env_id, config.test_episodes) == (FIELD_TASKS[task].env_id, 10)
+    other = ExperimentConfig.from_dict(composed(*chosen, "algorithm.gamma=0.5"))
+    assert other.algorithm.gamma == 0.5
+
+
+def test_a_preset_without_settings_of_a_task_is_refused():
+    """And not left at the defaults."""
+    with pytest.raises(SettingError, match="preset must have settings of task=swingup with algo"):
+        check_preset(composed("preset=rl_zoo", "algorithm=ppo"), "rl_zoo")
+
+
+@pytest.mark.parametrize("task", PAPER_TASKS)
 def test_the_papers_tasks_have_the_papers_noise(task):
     """Scale .01 for Swingup and Reacher, .001 for Hopper and Ant; none for what is not its own."""
     expected = {"swingup": 0.01, "reacher": 0.01}.get(task, 0.001)
@@ -176,6 +214,8 @@ def test_settings_survive_a_round_trip():
         ({"algorithm": {"name": "ppo_rpe", "schedule": "now"}}, "schedule must be 'episode' or"),
         ({"algorithm": {"name": "sac", "hidden": 100}}, "algorithm.hidden must be a list, got 100"),
         ({"algorithm": {"name": "sac", "hidden": [0]}}, "algorithm.hidden must be greater than"),
+        ({"algorithm": {"name": "ppo", "clip_actions": True}}, "clip_actions needs num_envs, got"),
+        ({"algorithm": {"name": "ppo", "num_envs": 3}}, "frames must be a multiple of num_envs=3"),
         ({"optimizer": {"name": "adam", "lr": "fast"}}, "optimizer.lr must be a valid number, got"),
         ({"replay": {"name": "uniform", "capacity": 8}}, "replay.capacity must be at least the b"),
         ({"seed": -1}, "seed must be greater than or equal to 0, got -1"),
@@ -199,6 +239,10 @@ def test_wrong_settings_are_refused_with_what_is_allowed(settings, message):
         (
             {"num_workers": 2, "algorithm": SACConfig()},
             "num_workers must be 1 with algorithm.schedule=step",
+        ),
+        (
+            {"num_workers": 2, "algorithm": PPOConfig(num_envs=2)},
+            "num_workers must be 1 with algorithm.num_envs",
         ),
         ({"replay": GROUPS["replay"]["rollout"]}, "'rollout' is nothing that algorithm 'ppo_rpe'"),
         (

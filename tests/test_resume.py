@@ -21,6 +21,7 @@ from torchrl_l2c2.experiment import (
     Experiment,
     ExperimentConfig,
     L2C2Config,
+    PPOConfig,
     PPORPEConfig,
     TaskConfig,
     UniformReplayConfig,
@@ -74,8 +75,22 @@ def lines(folder, late_tests=True):
         {"regularizer": CAPSConfig(), "task": HOPPER},
         {"replay": UniformReplayConfig(batch_size=32), "optimizer": AdamConfig()},
         {"algorithm": PPORPEConfig(schedule="step"), "task": replace(SWINGUP, max_steps=30)},
+        {
+            # Three episodes of 30 frames end in two rollouts, ten frames before their end.
+            "task": TaskConfig("pendulum", "Pendulum-v1", 0.01, 6, 30),
+            "algorithm": PPOConfig(
+                num_envs=1,
+                frames=50,
+                epochs=2,
+                hidden=(8,),
+                clip_actions=True,
+                log_scale=0.0,
+                normalize_observations=True,
+                normalize_rewards=True,
+            ),
+        },
     ],
-    ids=("l2c2", "caps-hopper", "uniform-adam", "step"),
+    ids=("l2c2", "caps-hopper", "uniform-adam", "step", "rollouts"),
 )
 def test_a_continued_run_is_the_uninterrupted_one(tmp_path, settings):
     """Parameters, targets, thresholds, metrics and test episodes, to the last bit."""

@@ -13,7 +13,7 @@ from gymnasium import spaces
 from small import ALGORITHMS, replay_of
 
 from torchrl_l2c2.experiment import (
-    TASKS,
+    PAPER_TASKS,
     AdamConfig,
     EpisodeCollector,
     Experiment,
@@ -222,7 +222,7 @@ def test_actions_that_are_no_vector_are_refused(monkeypatch, action):
 def test_an_episode_is_as_long_as_the_task_is_registered():
     """Pendulum's 200 steps; the paper's tasks have their own; a setting goes before."""
     assert TaskConfig("pendulum", "Pendulum-v1").time_limit == 200
-    limits = {name: chosen.time_limit for name, chosen in TASKS.items()}
+    limits = {name: chosen.time_limit for name, chosen in PAPER_TASKS.items()}
     assert limits == {"swingup": 1000, "reacher": 150, "hopper": 1000, "ant": 1000}
     assert TaskConfig("pendulum", "Pendulum-v1", max_steps=7).time_limit == 7
     run = experiment("td3", TaskConfig("pendulum", "Pendulum-v1", episodes=1))

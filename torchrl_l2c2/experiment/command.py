@@ -183,7 +183,7 @@ def run(values: dict[str, Any], standing: str = "") -> FinishedRun | None:
         values (dict): the configuration.
         standing (str): of the sweep that it belongs to; shown before its name and its progress.
     """
-    _check_preset(values)
+    check_preset(values, HydraConfig.get().runtime.choices.get("preset"))
     config = ExperimentConfig.from_dict(values)
     # Here, as settings are checked before anything waits for torch.
     from torchrl_l2c2.experiment.folder import save_policy
@@ -222,12 +222,15 @@ def run(values: dict[str, Any], standing: str = "") -> FinishedRun | None:
     return finished
 
 
-def _check_preset(values: dict[str, Any]) -> None:
-    """Refuses a task and an algorithm that the chosen preset has no settings of."""
-    if values.get("preset") != "???":
+def check_preset(values: dict[str, Any], name: str | None) -> None:
+    """Refuses a task and an algorithm that a preset has no settings of.
+
+    Raises:
+        SettingError: with those that it has.
+    """
+    if values.get("preset") != "???":  # What they replace.
         return
-    name = HydraConfig.get().runtime.choices["preset"]
-    known = ", ".join(sorted(path.stem for path in (CONF / "preset" / name).glob("*.yaml")))
+    known = ", ".join(sorted(path.stem for path in (CONF / "preset" / str(name)).glob("*.yaml")))
     task, algorithm = values["task"]["name"], values["algorithm"]["name"]
     raise SettingError(
         "preset",

@@ -61,7 +61,7 @@ def by_frames(player: Player, learner: Learner, algorithm: PPOConfig) -> Iterato
     while True:
         first_frame = player.frames
         rollout = player.step()
-        ended = player.collector.ended  # type: ignore[union-attr]  # of a RolloutCollector
+        ended = player.collector.ended
         episodes = [player.measured(e.transitions, first_frame + e.frame) for e in ended]
         for frames in rollout if normalization is None else normalization(rollout):
             learner.remember(frames)

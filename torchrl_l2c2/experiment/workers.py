@@ -17,12 +17,12 @@ from torch import Tensor
 from torchrl.collectors import MultiSyncCollector
 from torchrl.envs import EnvBase, ExplorationType
 
+from torchrl_l2c2.experiment.algorithms import PPOConfig
 from torchrl_l2c2.experiment.algorithms.agent import Agent
 from torchrl_l2c2.experiment.collection import EpisodeCollector
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.environments import make_env
 from torchrl_l2c2.experiment.rollouts import RolloutCollector
-
 
 # Between the seeds of a run's simulators: far enough for no run to have another's.
 SEEDS_APART = 15_485_863
@@ -33,12 +33,11 @@ def make_collector(
 ) -> EpisodeCollector | MultiEpisodeCollector | RolloutCollector:
     """What plays a run's episodes: this process, or as many others as the settings say."""
     options: dict[str, Any] = {"compile_policy": compile and agent.policy_compiles}
-    num_envs = getattr(config.algorithm, "num_envs", None)
-    if num_envs is not None:
-        seeds = (config.seed + SEEDS_APART * i for i in range(1, num_envs))
+    algorithm = config.algorithm
+    if isinstance(algorithm, PPOConfig) and algorithm.num_envs is not None:
+        seeds = (config.seed + SEEDS_APART * i for i in range(1, algorithm.num_envs))
         envs = [env, *(make_env(config.task, seed) for seed in seeds)]
-        frames = config.algorithm.frames
-        return RolloutCollector(envs, agent.policy, frames_per_batch=frames, **options)
+        return RolloutCollector(envs, agent.policy, frames_per_batch=algorithm.frames, **options)
     options["random_frames"] = getattr(config.algorithm, "random_frames", 0)
     if config.num_workers == 1:
         frames = 1 if config.algorithm.schedule == "step" else config.task.time_limit

@@ -188,7 +188,8 @@ def orthogonal(network: nn.Module, *, last: float) -> None:
     layers = [layer for layer in network.modules() if isinstance(layer, nn.Linear | nn.Conv2d)]
     for layer in layers:
         nn.init.orthogonal_(layer.weight, last if layer is layers[-1] else 2.0**0.5)
-        nn.init.zeros_(layer.bias)
+        if layer.bias is not None:
+            nn.init.zeros_(layer.bias)
 
 
 def action_value(env: EnvBase, hidden: tuple[int, ...]) -> ValueOperator:

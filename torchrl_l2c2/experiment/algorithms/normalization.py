@@ -47,9 +47,15 @@ class Normalization(nn.Module):
         >>> following = {"observation": seen, "reward": torch.ones(2, 1), "done": false}
         >>> (before,) = norm([TensorDict({"observation": seen, "next": following}, [2])])
         >>> norm.follow()
-        >>> before["observation"].flatten().tolist(), norm.normalize(seen).flatten().round().tolist()
-        ([1.0, 3.0], [-1.0, 1.0])
+        >>> before["observation"].flatten().tolist()
+        [1.0, 3.0]
+        >>> norm.normalize(seen).flatten().round().tolist()
+        [-1.0, 1.0]
     """
+
+    mean: Tensor
+    scale: Tensor
+    returns: Tensor
 
     def __init__(
         self, size: int, *, observations: bool, rewards: bool, gamma: float, streams: int
@@ -89,7 +95,7 @@ class Normalization(nn.Module):
 
     @torch.no_grad()
     def normalized(self, frames: TensorDictBase) -> TensorDictBase:
-        """Frames with both observations and the reward normalized, as a copy; nothing is counted."""
+        """A copy of frames with both observations and the reward normalized; nothing is counted."""
         copied = frames.copy()
         for key in ("observation", ("next", "observation")):
             copied.set(key, self.normalize(frames[key].to(self.mean.device)))
@@ -131,6 +137,10 @@ class Moments(nn.Module):
         (3.0, 2.67)
     """
 
+    mean: Tensor
+    var: Tensor
+    count: Tensor
+
     def __init__(self, size: int) -> None:
         super().__init__()
         self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
@@ -167,6 +177,9 @@ class ActingPolicy(TensorDictModuleBase):
             the unclipped action: who plays them clips them.
     """
 
+    low: Tensor | None
+    high: Tensor | None
+
     def __init__(
         self,
         policy: TensorDictModule,
@@ -188,7 +201,11 @@ class ActingPolicy(TensorDictModuleBase):
         written = self.policy(TensorDict({"observation": seen}, tensordict.batch_size))
         for key in self.out_keys:
             tensordict.set(key, written.get(key))
-        if self.low is not None and exploration_type() is not ExplorationType.RANDOM:
-            action = tensordict.get("action")
-            tensordict.set("action", torch.maximum(torch.minimum(action, self.high), self.low))
+        if exploration_type() is not ExplorationType.RANDOM:
+            tensordict.set("action", self._bounded(tensordict.get("action")))
         return tensordict
+
+    def _bounded(self, action: Tensor) -> Tensor:
+        if self.low is None or self.high is None:
+            return action
+        return torch.maximum(torch.minimum(action, self.high), self.low)
