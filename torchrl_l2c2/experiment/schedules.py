@@ -9,11 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import torch
-from tensordict import TensorDictBase
-
 from torchrl_l2c2.experiment.algorithms import PPOConfig
 from torchrl_l2c2.experiment.algorithms.base import OffPolicyConfig
+from torchrl_l2c2.experiment.frames import Frame, stack_frames
 from torchrl_l2c2.experiment.learner import Learner
 from torchrl_l2c2.experiment.player import Episode, Player
 
@@ -21,13 +19,12 @@ from torchrl_l2c2.experiment.player import Episode, Player
 def by_step(player: Player, learner: Learner, algorithm: OffPolicyConfig) -> Iterator[Episode]:
     """Updates after every frame."""
     while True:
-        frames: list[TensorDictBase] = []
-        while not frames or not frames[-1]["next", "done"][-1]:
-            (frame,) = player.step()
-            frames.append(frame)
-            learner.remember(frame)
+        frames: list[Frame] = []
+        while not (frames and frames[-1].done):
+            frames.append(player.step())
+            learner.remember_frame(frames[-1])
             _learn(learner, algorithm, 1, player.frames)
-        yield player.measured(torch.cat(frames), player.frames)
+        yield player.measured(stack_frames(frames), player.frames)
 
 
 def by_episode(player: Player, learner: Learner, algorithm: OffPolicyConfig) -> Iterator[Episode]:
