@@ -58,6 +58,7 @@ def _train_here(settings: Settings, algorithm: Any, replay: Any) -> Callable[[],
             replay=replay,
             regularizer=NoRegularizerConfig(),
             compile=settings["compile"],
+            late_share=0.0,  # The peers play no test episodes.
         )
     )
 

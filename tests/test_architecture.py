@@ -27,7 +27,7 @@ objectives.ppo_rpe
 objectives.__init__
 trainers __init__
 experiment.settings experiment.compilation experiment.spaces experiment.guard
-experiment.tracing experiment.priorities
+experiment.tracing experiment.priorities experiment.frames experiment.row_writer
 experiment.loggers
 experiment.folder
 experiment.environments experiment.lock experiment.signals

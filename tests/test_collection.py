@@ -23,6 +23,7 @@ from torchrl_l2c2.experiment import (
     TaskConfig,
     make_env,
 )
+from torchrl_l2c2.experiment.frames import Frame, stack_frames
 
 HOPPER = TaskConfig("hopper", "pybullet_envs_gymnasium:HopperBulletEnv-v0", noise_scale=0.001)
 
@@ -68,6 +69,73 @@ def test_a_batch_ends_where_the_episode_ends():
     for _ in range(3):
         episode = next(collector)
         assert episode["next", "done"].flatten().nonzero().flatten().tolist() == [len(episode) - 1]
+
+
+@pytest.mark.parametrize("other", [False, True], ids=["fast", "by TorchRL"])
+def test_frames_played_one_by_one_are_the_episode(other):
+    """Stacked they are its rollout, the random ones too; a row has all entries of each."""
+
+    def collector():
+        torch.manual_seed(0)
+        env = GymEnv("Pendulum-v1", max_episode_steps=7)
+        env = stacked(env) if other else env
+        env.set_seed(2)
+        actor = make_actor(6 if other else 3, env.action_spec)
+        return EpisodeCollector(env, actor, frames_per_batch=7, random_frames=3)
+
+    whole, alone = collector(), collector()
+    torch.manual_seed(1)
+    episodes = [whole.rollout() for _ in range(2)]
+    torch.manual_seed(1)
+    for episode in episodes:
+        frames = [alone.step() for _ in range(7)]
+        batch = stack_frames(frames)
+        assert [frame.done for frame in frames] == [False] * 6 + [True]
+        for key in batch.keys(True, True):
+            assert torch.equal(batch[key], episode[key]), key
+        row = frames[-1].row()
+        assert all(torch.equal(row[key], batch[key][-1]) for key in batch.keys(True, True))
+
+
+def test_several_environments_have_no_one_frame():
+    """They step together: a frame of theirs is a batch."""
+    env = OTHERS["several"]()
+    collector = EpisodeCollector(env, make_actor(6, env.action_spec_unbatched), frames_per_batch=20)
+    with pytest.raises(RuntimeError, match="one environment"):
+        collector.step()
+
+
+def test_an_episode_that_was_interrupted_is_not_gone_on_with(monkeypatch):
+    """Its frames are lost: the next batch is a whole episode."""
+    env, actor = make(TaskConfig("pendulum", "Pendulum-v1", noise_scale=0.0, max_steps=9))
+    collector = EpisodeCollector(env, actor, frames_per_batch=9)
+    play, calls = collector._play, iter(range(100))
+
+    def interrupted(simulator):
+        if next(calls) == 4:
+            raise KeyboardInterrupt
+        return play(simulator)
+
+    monkeypatch.setattr(collector, "_play", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        collector.rollout()
+    episode = collector.rollout()
+    assert len(episode) == 9 and episode["next", "done"].sum() == 1
+
+
+@pytest.mark.parametrize("key", ["observation", "following", "action", "reward"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_a_frame_knows_what_is_not_finite(key, value):
+    """Wherever it is."""
+    zeros = {"observation": torch.zeros(3), "following": torch.zeros(3), "reward": 0.0}
+    frame = Frame(outputs={"action": torch.zeros(1)}, terminated=False, truncated=False, **zeros)
+    assert frame.is_finite()
+    bad = torch.tensor([0.0, value, 0.0])
+    if key == "action":
+        frame = frame._replace(outputs={"action": bad})
+    else:
+        frame = frame._replace(**{key: value if key == "reward" else bad})
+    assert not frame.is_finite()
 
 
 def test_the_policys_mean_acts_on_request():

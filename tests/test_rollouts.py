@@ -156,7 +156,7 @@ def experiment(task, folder=None, optimizer=ADAM, **algorithm):
 def test_the_task_gets_clipped_actions_and_the_loss_those_that_were_drawn():
     """Their likelihood is that of the normal; the mean that is deployed is clipped, too."""
     run = experiment(MOODY, clip_actions=True, log_scale=0.0)
-    frames = torch.cat(run.player.step())
+    frames = torch.cat(run.player.play_rollout()[0])
     drawn = frames["action"].flatten()
     taken = [stream._gymnasium.unwrapped.taken for stream in run.player.collector._streams]
     assert np.concatenate(taken).max() == np.float32(0.2) and drawn.max() > 0.2
@@ -177,7 +177,7 @@ def test_what_a_cut_leaves_is_bootstrapped(monkeypatch):
     run = experiment(HOPPER, num_envs=1, frames=60, gamma=0.5, gae_lambda=0.0)
     kept = []
     monkeypatch.setattr(run.learner.replay, "extend", kept.append)
-    (frames,) = run.player.step()
+    ((frames,), _) = run.player.play_rollout()
     ends = frames["next", "terminated"].squeeze(-1)
     assert ends.any() and not ends[-1]
     run.learner.remember(frames)

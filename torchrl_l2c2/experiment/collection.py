@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from torchrl.envs import (
 )
 
 from torchrl_l2c2.experiment.compilation import compiled
+from torchrl_l2c2.experiment.frames import Frame, stack_frames
 from torchrl_l2c2.transforms import ObservationNoise
 
 # Added to the seed of an environment for its noise: the two are not to draw the same numbers.
@@ -34,7 +35,7 @@ class EpisodeCollector(Collector):
 
     It gives the batches that the collector gives, to the bit, but for the ``collector`` entry.
     What it leaves out is the work around every step: specs, nested TensorDicts and their copies.
-    An episode's entries are kept in lists and stacked once. That is for a ``GymEnv`` or
+    An episode's frames are stacked once. That is for a ``GymEnv`` or
     ``GymWrapper``, also one transformed by :class:`ObservationNoise`; environments with other
     transforms, and several at once, are played by TorchRL's own loop, at its pace, with the policy
     as it is, and a state of theirs cannot be saved.
@@ -49,7 +50,8 @@ class EpisodeCollector(Collector):
             Learning at the end of every episode needs this. Several environments, whose episodes
             end at different times, fill a batch in any case. Default ``True``.
         compile_policy (bool): whether to compile the policy. Random numbers are drawn as without.
-            Default ``False``.
+            What is written into its parameters is followed; a parameter or a setting that is
+            replaced after the first frame is overlooked. Default ``False``.
         random_frames (int): first frames whose actions are drawn from the action's bounds
             instead. Default 0.
         exploration_type (ExplorationType): default ``RANDOM``.
@@ -78,8 +80,8 @@ class EpisodeCollector(Collector):
         random_frames: int = 0,
         exploration_type: ExplorationType = ExplorationType.RANDOM,
     ) -> None:
-        simulator, self._noise = simulator_and_noise(env)
-        self._played_by_torchrl = simulator is None
+        self._simulator, self._noise = simulator_and_noise(env)
+        by_torchrl = self._simulator is None
         super().__init__(
             env,
             policy,
@@ -89,8 +91,8 @@ class EpisodeCollector(Collector):
             auto_register_policy_transforms=False,
             exploration_type=exploration_type,
             # TorchRL's loop counts them itself, and keeps no batch that one here would change.
-            init_random_frames=random_frames if self._played_by_torchrl else 0,
-            use_buffers=False if self._played_by_torchrl else None,
+            init_random_frames=random_frames if by_torchrl else 0,
+            use_buffers=False if by_torchrl else None,
         )
         self.stop_at_done = stop_at_done
         self._random_frames_left = random_frames
@@ -98,58 +100,91 @@ class EpisodeCollector(Collector):
         self._observation: Tensor | None = self._carrier.get("observation")
         self._policy_keys = [key for key in policy.out_keys if not key.startswith("_")]
         self._act = on_tensors(policy, self._policy_keys, compile_policy)
-        if simulator is not None:
-            self._simulator, self._gymnasium = simulator, simulator._env
-            self._dtype = simulator.observation_spec["observation"].dtype
-            continuous = simulator.action_spec.dtype.is_floating_point
-            self._to_action = Tensor.numpy if continuous else simulator.read_action
+        if self._simulator is not None:
+            self._gymnasium = self._simulator._env
+            self._dtype = self._simulator.observation_spec["observation"].dtype
+            continuous = self._simulator.action_spec.dtype.is_floating_point
+            self._to_action = Tensor.numpy if continuous else self._simulator.read_action
 
     def act(self, observation: Tensor) -> Tensor:
-        """The policy's action at one observation, in the exploration type that is set."""
-        return self._act(observation)[self._policy_keys.index("action")]
+        """The policy's action at one observation, in the collector's exploration type."""
+        with set_exploration_type(self.exploration_type):
+            return self._act(observation)[self._policy_keys.index("action")]
 
     @torch.no_grad()
     def rollout(self) -> TensorDictBase:
         """Plays up to ``frames_per_batch`` frames; what iterating over the collector calls."""
-        if self._played_by_torchrl:
+        if self._simulator is None:
             return self._rollout_by_torchrl()
-        action_index = self._policy_keys.index("action")
-        observation = self._observation
-        steps = []
-        with set_exploration_type(self.exploration_type):
-            for _ in range(self.frames_per_batch):
-                # Late, so that between episodes nothing of the next one has happened yet: the
-                # generators' states are then all there is to save.
-                if observation is None:
-                    observation = self._observe(self._gymnasium.reset()[0])
-                outputs = self._act(observation)
-                if self._random_frames_left > 0:
-                    self._random_frames_left -= 1
-                    outputs[action_index].copy_(self._simulator.action_spec.rand())
-                action = self._to_action(outputs[action_index])
-                seen, reward, terminated, truncated, _ = self._gymnasium.step(action)
-                following = self._observe(seen)
-                steps.append((observation, following, reward, terminated, truncated, outputs))
-                observation = following
-                if terminated or truncated:
-                    observation = None
-                    if self.stop_at_done:
+        frames: list[Frame] = []
+        try:
+            with set_exploration_type(self.exploration_type):
+                while len(frames) < self.frames_per_batch:
+                    frames.append(self._play(self._simulator))
+                    if frames[-1].done and self.stop_at_done:
                         break
-        self._observation = observation
-        return stack_steps(steps, self._policy_keys)
+        except BaseException:
+            self._observation = None  # What was played of the episode is lost.
+            raise
+        return stack_frames(frames)
+
+    @torch.no_grad()
+    def step(self) -> Frame:
+        """Plays one frame; an episode's frames, stacked, are its :meth:`rollout`.
+
+        Raises:
+            RuntimeError: there are several environments, whose frames are batches.
+        """
+        if self.env.batch_size:
+            raise RuntimeError(f"step() plays one environment, got {self.env}.")
+        if self._simulator is None:
+            return self._frame(self._steps_by_torchrl(1)[0])
+        with set_exploration_type(self.exploration_type):
+            return self._play(self._simulator)
+
+    def _play(self, simulator: GymWrapper) -> Frame:
+        # Late, so that between episodes nothing of the next one has happened yet: the
+        # generators' states are then all there is to save.
+        observation = self._observation
+        if observation is None:
+            observation = self._observe(self._gymnasium.reset()[0])
+        outputs = dict(zip(self._policy_keys, self._act(observation), strict=True))
+        action = outputs["action"]
+        if self._random_frames_left > 0:
+            self._random_frames_left -= 1
+            action.copy_(simulator.action_spec.rand())
+        seen, reward, terminated, truncated, _ = self._gymnasium.step(self._to_action(action))
+        following = self._observe(seen)
+        self._observation = None if terminated or truncated else following
+        return Frame(observation, outputs, following, reward, terminated, truncated)
 
     def _rollout_by_torchrl(self) -> TensorDictBase:
         if self.env.batch_size or not self.stop_at_done:
             return super().rollout()
+        return torch.cat(self._steps_by_torchrl(self.frames_per_batch))
+
+    def _steps_by_torchrl(self, most: int) -> list[TensorDictBase]:
+        """Frames ``[1]``, up to an episode's last one."""
         steps: list[TensorDictBase] = []
-        frames = self.frames_per_batch
-        self.frames_per_batch = 1
+        frames_per_batch, self.frames_per_batch = self.frames_per_batch, 1
         try:
-            while len(steps) < frames and not (steps and steps[-1]["next", "done"].any()):
+            while len(steps) < most and not (steps and steps[-1]["next", "done"].any()):
                 steps.append(super().rollout())
         finally:
-            self.frames_per_batch = frames
-        return torch.cat(steps)
+            self.frames_per_batch = frames_per_batch
+        return steps
+
+    def _frame(self, step: TensorDictBase) -> Frame:
+        following = step["next"]
+        return Frame(
+            step["observation"][0],
+            # TorchRL does not ask the policy for a random frame.
+            {key: step[key][0] for key in self._policy_keys if key in step.keys()},
+            following["observation"][0],
+            following["reward"].item(),
+            following["terminated"].item(),
+            following["truncated"].item(),
+        )
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
         """Seeds the simulator and, with another seed, its noise; the next episode starts anew.
@@ -174,7 +209,7 @@ class EpisodeCollector(Collector):
             RuntimeError: in the middle of an episode, whose simulator's state cannot be saved, or
                 where TorchRL's loop plays.
         """
-        if self._played_by_torchrl:
+        if self._simulator is None:
             raise RuntimeError(
                 f"the random state of {self.env} is not known; only that of one GymEnv, with no "
                 "transform but ObservationNoise, can be saved."
@@ -228,37 +263,6 @@ def play_episodes(
             yield collector.rollout()
     finally:
         collector.shutdown(close_env=False)
-
-
-def stack_steps(steps: Sequence[tuple[Any, ...]], policy_keys: Sequence[str]) -> TensorDictBase:
-    """Frames ``[T]`` of what each of them was.
-
-    Args:
-        steps (sequence of tuple): observation, the next one, reward, whether the episode terminated
-            and was truncated, and what the policy wrote.
-        policy_keys (sequence of str): names of the last.
-    """
-    observations, following, rewards, terminated, truncated, outputs = zip(*steps, strict=True)
-    ends = [torch.tensor(flags).unsqueeze(-1) for flags in (terminated, truncated)]
-    written = [torch.stack(values) for values in zip(*outputs, strict=True)]
-    false = torch.zeros_like(ends[0])
-    return TensorDict(
-        {
-            "observation": torch.stack(observations),
-            "done": false,
-            "terminated": false.clone(),
-            "truncated": false.clone(),
-            **dict(zip(policy_keys, written, strict=True)),
-            "next": {
-                "observation": torch.stack(following),
-                "reward": torch.tensor(rewards, dtype=torch.float32).unsqueeze(-1),
-                "done": ends[0] | ends[1],
-                "terminated": ends[0],
-                "truncated": ends[1],
-            },
-        },
-        [len(steps)],
-    )
 
 
 def check_finite(batch: TensorDictBase, first_frame: int) -> None:
@@ -318,6 +322,5 @@ def on_tensors(
         written = policy(TensorDict({"observation": observation}))
         return tuple(written.get(key) for key in keys)
 
-    if not compile_policy:
-        return act
-    return compiled(act)
+    # It is always called in the same exploration type, which is not checked then.
+    return compiled(act, constant_closure=True) if compile_policy else act

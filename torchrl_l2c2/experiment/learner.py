@@ -10,7 +10,9 @@ from tensordict import TensorDictBase
 from torchrl.data import TensorDictReplayBuffer
 
 from torchrl_l2c2.experiment.algorithms.agent import Agent
+from torchrl_l2c2.experiment.frames import Frame
 from torchrl_l2c2.experiment.influence import gradient_shares
+from torchrl_l2c2.experiment.row_writer import RowWriter
 from torchrl_l2c2.experiment.update import ReplayUpdate, is_loss
 from torchrl_l2c2.objectives import L2C2Loss
 from torchrl_l2c2.transforms import NeighborTransform
@@ -79,6 +81,12 @@ class Learner:
         self.compiles = compile
         self._skip_nonfinite = skip_nonfinite
         self._terms: list[torch.Tensor] = []
+        self._rows = RowWriter(replay)
+        self._read_keys = list(agent.loss.in_keys)
+        if agent.advantage is not None:
+            # Where they are missing, TorchRL's loss estimates them anew, along a minibatch, whose
+            # rows do not follow each other in time.
+            self._read_keys += [agent.advantage.advantage_key, agent.advantage.value_target_key]
         # Here, as a compiled update would not tell.
         for transform in replay.transform.transforms:
             if isinstance(agent.loss, L2C2Loss) and isinstance(transform, NeighborTransform):
@@ -101,12 +109,14 @@ class Learner:
             transitions = transitions.to(self._device)
         if self.agent.advantage is not None:
             transitions = self.agent.advantage(transitions)
-        read = list(self.agent.loss.in_keys)
-        if self.agent.advantage is not None:
-            # Where they are missing, TorchRL's loss estimates them anew, along a minibatch, whose
-            # rows do not follow each other in time.
-            read += [self.agent.advantage.advantage_key, self.agent.advantage.value_target_key]
-        self.replay.extend(transitions.select(*read, strict=False))
+        self.replay.extend(transitions.select(*self._read_keys, strict=False))
+
+    @torch.no_grad()
+    def remember_frame(self, frame: Frame) -> None:
+        """As :meth:`remember` of the one frame; for algorithms that learn after each."""
+        row = frame.row()
+        row["next", "reward"] *= self._reward_factor
+        self._rows.write({key: row[key] for key in self._read_keys if key in row})
 
     def learn(self, updates: int) -> None:
         """Makes so many updates with batches from the replay buffer, once it holds one."""

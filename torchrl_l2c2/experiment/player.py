@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from tensordict import TensorDictBase
@@ -11,9 +13,12 @@ from torchrl.modules import EGreedyModule
 
 from torchrl_l2c2.experiment.algorithms.agent import Agent
 from torchrl_l2c2.experiment.collection import EpisodeCollector, check_finite
+from torchrl_l2c2.experiment.frames import Frame, stack_frames
 from torchrl_l2c2.experiment.rollouts import RolloutCollector
 from torchrl_l2c2.experiment.workers import MultiEpisodeCollector
 from torchrl_l2c2.metrics import action_variation
+
+Played = TypeVar("Played")
 
 
 class SimulatorError(RuntimeError):
@@ -67,36 +72,70 @@ class Player:
             FloatingPointError: NaN or infinity in what the environment or the policy gave.
             SimulatorError: the environment failed.
         """
-        last_frame, episodes = self.frames, []
-        for batch in self.step():
-            last_frame += batch.numel()
-            episodes.append(self.measured(batch, last_frame))
-        for earlier in episodes[:-1]:
-            earlier.ends_round = False
+        batches, last_frame = self._batches(), self.frames
+        episodes: list[Episode] = []
+        for batch in reversed(batches):
+            episodes.insert(0, self.measured(batch, last_frame, ends_round=not episodes))
+            last_frame -= batch.numel()
         return episodes
 
-    def step(self) -> list[TensorDictBase]:
-        """What the collector gives next: episodes, or a frame of the one that is being played."""
-        first_frame = self.frames
+    def play_rollout(self) -> tuple[list[TensorDictBase], list[Episode]]:
+        """The next frames ``[T]`` of every simulator, and the episodes that ended in them.
+
+        Raises:
+            FloatingPointError: as :meth:`play`.
+            SimulatorError: as :meth:`play`.
+        """
+        assert isinstance(self.collector, RolloutCollector)  # The settings see to it.
+        first_frame, batches = self.frames, self._batches()
+        ended = self.collector.ended
+        episodes = [
+            self.measured(e.transitions, first_frame + e.frame, ends_round=e is ended[-1])
+            for e in ended
+        ]
+        return batches, episodes
+
+    def step(self) -> Frame:
+        """The next frame of the one episode that is being played.
+
+        Raises:
+            FloatingPointError: as :meth:`play`.
+            SimulatorError: as :meth:`play`.
+        """
+        assert isinstance(self.collector, EpisodeCollector)  # The settings see to it.
+        frame = self._simulate(self.collector.step)
+        if not frame.is_finite():
+            check_finite(stack_frames([frame]), self.frames)
+        self._count(1)
+        return frame
+
+    def _batches(self) -> list[TensorDictBase]:
+        """What the collector plays at once, checked and counted."""
+        played = self._simulate(self.collector.rollout)
+        batches, last_frame = played if isinstance(played, list) else [played], self.frames
+        for batch in batches:
+            check_finite(batch, last_frame)
+            last_frame += batch.numel()
+        self._count(last_frame - self.frames)
+        return batches
+
+    def _simulate(self, play: Callable[[], Played]) -> Played:
         try:
-            played = self.collector.rollout()
-            batches = played if isinstance(played, list) else [played]
-            for batch in batches:
-                check_finite(batch, self.frames)
-                self.frames += batch.numel()
-        except FloatingPointError:
-            self.frames = first_frame
-            raise
+            return play()
         except Exception as error:
             raise SimulatorError(
                 f"{self._env_id} failed after frame {self.frames}: {type(error).__name__}: {error}"
             ) from error
+
+    def _count(self, frames: int) -> None:
+        self.frames += frames
         if isinstance(self._agent.exploration, EGreedyModule):
-            self._agent.exploration.step(self.frames - first_frame)
-        return batches
+            self._agent.exploration.step(frames)
 
     @torch.no_grad()
-    def measured(self, transitions: TensorDictBase, last_frame: int) -> Episode:
+    def measured(
+        self, transitions: TensorDictBase, last_frame: int, *, ends_round: bool = True
+    ) -> Episode:
         """An episode with its return and, at its states, the smoothness of the policy's mean.
 
         With the mean scale of a stochastic policy: the Hellinger distance is relative to it, so a
@@ -111,4 +150,4 @@ class Player:
             "policy_scale": float("nan") if scale is None else scale.mean().item(),
             "length": transitions.numel(),
         }
-        return Episode(transitions, last_frame, measures)
+        return Episode(transitions, last_frame, measures, ends_round)

@@ -9,12 +9,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
-from torchrl_l2c2.experiment.collection import on_tensors, simulator_and_noise, stack_steps
+from torchrl_l2c2.experiment.collection import on_tensors, simulator_and_noise
+from torchrl_l2c2.experiment.frames import Frame, stack_frames
 
 
 class Ended(NamedTuple):
@@ -86,7 +87,7 @@ class RolloutCollector:
                 f"{frames_per_batch}."
             )
         self._policy_keys = [key for key in policy.out_keys if not key.startswith("_")]
-        self._streams = [_Stream(env, self._policy_keys) for env in envs]
+        self._streams = [_Stream(env) for env in envs]
         self._steps = frames_per_batch // len(envs)
         self._act = on_tensors(policy, self._policy_keys, compile_policy)
         self._exploration_type = exploration_type
@@ -96,21 +97,20 @@ class RolloutCollector:
     def rollout(self) -> list[TensorDictBase]:
         """The next frames ``[T]`` of every simulator."""
         self.ended = []
-        action_index, number = self._policy_keys.index("action"), len(self._streams)
-        played: list[list[tuple[Any, ...]]] = [[] for _ in self._streams]
+        played: list[list[Frame]] = [[] for _ in self._streams]
         with set_exploration_type(self._exploration_type):
             for step in range(self._steps):
                 outputs = self._act(torch.stack([stream.observation() for stream in self._streams]))
-                actions = outputs[action_index].numpy()
                 rows = zip(*(output.unbind(0) for output in outputs), strict=True)
-                for place, (stream, action, written) in enumerate(
-                    zip(self._streams, actions, rows, strict=True)
-                ):
-                    played[place].append(stream.step(action, written))
-                    if stream.has_ended:
-                        frame = step * number + place + 1
+                for place, row in enumerate(rows):
+                    stream = self._streams[place]
+                    played[place].append(
+                        stream.step(dict(zip(self._policy_keys, row, strict=True)))
+                    )
+                    if played[place][-1].done:
+                        frame = step * len(self._streams) + place + 1
                         self.ended.append(Ended(frame, stream.finish()))
-        return [stack_steps(steps, self._policy_keys) for steps in played]
+        return [stack_frames(frames) for frames in played]
 
     def generator_state(self) -> dict[str, Any]:
         """The random generators' states and the episodes that are being played."""
@@ -134,25 +134,20 @@ class RolloutCollector:
 class _Stream:
     """A simulator and the episode that it is in."""
 
-    def __init__(self, env: EnvBase, policy_keys: Sequence[str]) -> None:
+    def __init__(self, env: EnvBase) -> None:
         simulator, self._noise = simulator_and_noise(env)
         if simulator is None:
             raise ValueError(
                 "RolloutCollector plays Gymnasium environments with no transform but "
                 f"ObservationNoise, got {env}."
             )
-        self._env, self._gymnasium, self._policy_keys = env, simulator._env, policy_keys
+        self._env, self._gymnasium = env, simulator._env
         self._dtype = simulator.observation_spec["observation"].dtype
         space: Any = self._gymnasium.action_space
         self._low, self._high = space.low, space.high
         self._observation: Tensor | None = None
-        self._steps: list[tuple[Any, ...]] = []
+        self._frames: list[Frame] = []
         self._begun_with = self._generators()
-
-    @property
-    def has_ended(self) -> bool:
-        """Whether the last step was an episode's."""
-        return bool(self._steps) and (self._steps[-1][3] or self._steps[-1][4])
 
     def observation(self) -> Tensor:
         """The present one; an episode begins where there is none."""
@@ -161,46 +156,47 @@ class _Stream:
             self._observation = self._observe(self._gymnasium.reset()[0])
         return self._observation
 
-    def step(self, action: np.ndarray, written: tuple[Tensor, ...]) -> tuple[Any, ...]:
-        """Takes an action; gives the frame."""
+    def step(self, outputs: dict[str, Tensor]) -> Frame:
+        """Takes the action in what the policy wrote; gives the frame."""
         before = self.observation()
-        taken = np.clip(action, self._low, self._high)
+        taken = np.clip(outputs["action"].numpy(), self._low, self._high)
         seen, reward, terminated, truncated, _ = self._gymnasium.step(taken)
         self._observation = self._observe(seen)
-        step = (before, self._observation, reward, terminated, truncated, written)
-        self._steps.append(step)
-        return step
+        frame = Frame(before, outputs, self._observation, reward, terminated, truncated)
+        self._frames.append(frame)
+        return frame
 
     def finish(self) -> TensorDictBase:
         """The episode that has ended."""
-        episode = stack_steps(self._steps, self._policy_keys)
-        self._observation, self._steps = None, []
+        episode = stack_frames(self._frames)
+        self._observation, self._frames = None, []
         return episode
 
     def state_dict(self) -> dict[str, Any]:
-        """The generators' states at the episode's beginning, and its frames."""
-        begun = self._begun_with if self._steps else self._generators()
-        frames = stack_steps(self._steps, self._policy_keys).to_dict() if self._steps else None
-        return {"generators": begun, "frames": frames}
+        """The generators' states at the episode's beginning, and what the policy wrote in it."""
+        if not self._frames:
+            return {"generators": self._generators(), "following": None, "outputs": {}}
+        written = {key: [f.outputs[key] for f in self._frames] for key in self._frames[0].outputs}
+        return {
+            "generators": self._begun_with,
+            "following": self._frames[-1].following,
+            "outputs": {key: torch.stack(values) for key, values in written.items()},
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores it: the simulator plays the same actions again."""
         self._set_generators(state["generators"])
-        self._observation, self._steps = None, []
-        if state["frames"] is None:
-            return
-        frames = TensorDict(state["frames"], [len(state["frames"]["action"])])
-        outputs = zip(*(frames[key].unbind(0) for key in self._policy_keys), strict=True)
-        for action, written in zip(frames["action"].numpy(), outputs, strict=True):
-            self.step(action, written)
-        assert self._observation is not None
-        if not self._observation.equal(frames["next", "observation"][-1]):
+        self._observation, self._frames = None, []
+        outputs = state["outputs"]
+        for row in zip(*(values.unbind(0) for values in outputs.values()), strict=True):
+            self.step(dict(zip(outputs, row, strict=True)))
+        if self._frames and not self._frames[-1].following.equal(state["following"]):
             warnings.warn(
                 f"{self._env} plays an episode differently when it is played again: another one "
                 "begins instead, and the run is not the one that it would have been in one go.",
                 stacklevel=4,
             )
-            self._observation, self._steps = None, []
+            self._observation, self._frames = None, []
 
     def close(self) -> None:
         """Closes the simulator."""

@@ -9,11 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import torch
-from tensordict import TensorDictBase
-
 from torchrl_l2c2.experiment.algorithms import PPOConfig
 from torchrl_l2c2.experiment.algorithms.base import OffPolicyConfig
+from torchrl_l2c2.experiment.frames import Frame, stack_frames
 from torchrl_l2c2.experiment.learner import Learner
 from torchrl_l2c2.experiment.player import Episode, Player
 
@@ -21,13 +19,12 @@ from torchrl_l2c2.experiment.player import Episode, Player
 def by_step(player: Player, learner: Learner, algorithm: OffPolicyConfig) -> Iterator[Episode]:
     """Updates after every frame."""
     while True:
-        frames: list[TensorDictBase] = []
-        while not frames or not frames[-1]["next", "done"][-1]:
-            (frame,) = player.step()
-            frames.append(frame)
-            learner.remember(frame)
+        frames: list[Frame] = []
+        while not (frames and frames[-1].done):
+            frames.append(player.step())
+            learner.remember_frame(frames[-1])
             _learn(learner, algorithm, 1, player.frames)
-        yield player.measured(torch.cat(frames), player.frames)
+        yield player.measured(stack_frames(frames), player.frames)
 
 
 def by_episode(player: Player, learner: Learner, algorithm: OffPolicyConfig) -> Iterator[Episode]:
@@ -59,19 +56,14 @@ def by_frames(player: Player, learner: Learner, algorithm: PPOConfig) -> Iterato
     """Updates after so many frames, wherever episodes are then; hands out those that have ended."""
     normalization = learner.agent.normalization
     while True:
-        first_frame = player.frames
-        rollout = player.step()
-        ended = player.collector.ended
-        episodes = [player.measured(e.transitions, first_frame + e.frame) for e in ended]
+        rollout, episodes = player.play_rollout()
         for frames in rollout if normalization is None else normalization(rollout):
             learner.remember(frames)
         learner.learn_rollout(algorithm.epochs)
         if normalization is not None:
             normalization.follow()
             learner.agent.refresh_policy()
-        for number, episode in enumerate(episodes, start=1):
-            episode.ends_round = number == len(episodes)
-            yield episode
+        yield from episodes
 
 
 def _learn(learner: Learner, algorithm: OffPolicyConfig, frames: int, last_frame: int) -> None:

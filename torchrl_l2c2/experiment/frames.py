@@ -1,0 +1,81 @@
+"""One frame of an episode, as it is while it is being played: before there is a batch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor
+
+
+class Frame(NamedTuple):
+    """One transition.
+
+    Attributes:
+        observation: before the action.
+        outputs: what the policy wrote, by its keys; the action is among it.
+        following: the observation that came of it, also where the episode ends.
+        reward: of the action.
+        terminated: whether the task ended the episode.
+        truncated: whether something else did, such as a limit of steps.
+    """
+
+    observation: Tensor
+    outputs: dict[str, Tensor]
+    following: Tensor
+    reward: float
+    terminated: bool
+    truncated: bool
+
+    @property
+    def done(self) -> bool:
+        """Whether it is an episode's last."""
+        return self.terminated or self.truncated
+
+    def row(self) -> dict[NestedKey, Tensor]:
+        """The row of :func:`stack_frames` that it becomes, by its keys."""
+        false = torch.zeros(1, dtype=torch.bool)
+        return {
+            "observation": self.observation,
+            **dict.fromkeys(("done", "terminated", "truncated"), false),
+            **self.outputs,
+            ("next", "observation"): self.following,
+            ("next", "reward"): torch.tensor([self.reward], dtype=torch.float32),
+            ("next", "done"): torch.tensor([self.done]),
+            ("next", "terminated"): torch.tensor([self.terminated]),
+            ("next", "truncated"): torch.tensor([self.truncated]),
+        }
+
+    def is_finite(self) -> bool:
+        """Whether no NaN and no infinity is in it; a sum that overflows counts as one."""
+        # One number each: looking at every element takes several operations.
+        tensors = (self.observation, self.outputs["action"], self.following)
+        return math.isfinite(self.reward + sum(float(tensor.sum()) for tensor in tensors))
+
+
+def stack_frames(frames: Sequence[Frame]) -> TensorDictBase:
+    """The batch ``[T]`` of frames, as TorchRL's collectors give it: what they all have."""
+    observations, outputs, following, rewards, terminated, truncated = zip(*frames, strict=True)
+    ends = [torch.tensor(flags).unsqueeze(-1) for flags in (terminated, truncated)]
+    false = torch.zeros_like(ends[0])
+    written = [key for key in outputs[0] if all(key in each for each in outputs)]
+    return TensorDict(
+        {
+            "observation": torch.stack(observations),
+            "done": false,
+            "terminated": false.clone(),
+            "truncated": false.clone(),
+            **{key: torch.stack([each[key] for each in outputs]) for key in written},
+            "next": {
+                "observation": torch.stack(following),
+                "reward": torch.tensor(rewards, dtype=torch.float32).unsqueeze(-1),
+                "done": ends[0] | ends[1],
+                "terminated": ends[0],
+                "truncated": ends[1],
+            },
+        },
+        [len(frames)],
+    )
