@@ -51,7 +51,7 @@ experiment.reports.runs experiment.reports.groups
 experiment.reports.score
 experiment.reports.tables
 experiment.reports.comparison experiment.reports.measures
-experiment.reports.figures
+experiment.reports.figures experiment.reports.field
 experiment.reports.page experiment.reports.readme experiment.reports.results
 experiment.reports.__init__
 experiment.reports.__main__

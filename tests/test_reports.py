@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from scipy.stats import mannwhitneyu, trim_mean
 
-from torchrl_l2c2.experiment import ExperimentConfig, L2C2Config, PPORPEConfig, SACConfig
+from torchrl_l2c2.experiment import ExperimentConfig, L2C2Config, PPOConfig, PPORPEConfig, SACConfig
 from torchrl_l2c2.experiment.folder import code_commit
 from torchrl_l2c2.experiment.regularizers import REGULARIZERS
 from torchrl_l2c2.experiment.reports import (
@@ -31,6 +31,7 @@ from torchrl_l2c2.experiment.reports import (
 from torchrl_l2c2.experiment.reports.__main__ import main
 from torchrl_l2c2.experiment.reports.comparison import statistics_tables
 from torchrl_l2c2.experiment.reports.differences import differences, fingerprint
+from torchrl_l2c2.experiment.reports.field import field_table
 from torchrl_l2c2.experiment.reports.groups import group_records
 from torchrl_l2c2.experiment.reports.measures import measures_table
 from torchrl_l2c2.experiment.reports.readme import END, START, fill
@@ -151,6 +152,36 @@ class TestMeasures:
         page = write_report(tmp_path / "report", [run.record for run in runs], runs)
         assert "1.5 (0.71)" in page.read_text()
         assert measures_table(runs[:1]) is None
+
+
+class TestFieldTable:
+    def test_it_has_what_was_published_beside_the_means_over_seeds(self, tmp_path):
+        """Of those tasks with PPO and SAC alone; an interval from two runs on."""
+        preset = {"task": "hopper_v5", "algorithm": PPOConfig()}
+        for method, seeds in (("caps", 2), ("l2c2_ramp", 1)):
+            for seed in range(seeds):
+                folder = tmp_path / method / str(seed)
+                make_run(folder, make_config(regularizer=method, seed=seed, **preset), 100.0, 0.1)
+                path = folder / "evaluation.json"
+                content = json.loads(path.read_text())
+                content["summary"] |= {"sm_asap_mean": 0.4 + 0.2 * seed}
+                path.write_text(json.dumps(content))
+        make_run(tmp_path / "paper", make_config(), 10.0, 0.1)
+        table = field_table(read_runs(tmp_path))
+        assert cells(table, "hopper_v5", "ppo", "CAPS") == [
+            "0, 1",
+            "120.0 [120.0, 120.0]",
+            "0.500 [0.400, 0.600]",
+            "0.120 [0.120, 0.120]",
+            "2440",
+            "0.471",
+        ]
+        alone = ["0", "120.0", "0.400", "0.120", "", ""]
+        assert cells(table, "hopper_v5", "ppo", "L2C2, means, ramp") == alone
+        assert cells(table, "hopper_v5", "ppo", "LipsNet++")[-2:] == ["1878", "0.543"]
+        assert {row[0] for row in table.rows} == {"hopper_v5"}
+        assert "2440" in sweep_summary([tmp_path])
+        assert field_table(read_runs(tmp_path / "paper")) is None
 
 
 class TestGroups:

@@ -9,6 +9,7 @@ from pathlib import Path
 from torchrl_l2c2.experiment.folder import make_folder, write_atomically, write_json
 from torchrl_l2c2.experiment.reports.comparison import statistics_tables, summary
 from torchrl_l2c2.experiment.reports.document import picture, whole_page
+from torchrl_l2c2.experiment.reports.field import field_table
 from torchrl_l2c2.experiment.reports.figures import draw_learning_curves, draw_plane
 from torchrl_l2c2.experiment.reports.groups import group_records
 from torchrl_l2c2.experiment.reports.measures import measures_table
@@ -50,8 +51,8 @@ def write_report(
     """
     folder = make_folder(folder)
     tables, groups = all_tables(records), group_records(records)
-    if (measures := measures_table(runs)) is not None:
-        tables.insert(-1, measures)  # before every run by itself
+    # Before every run by itself.
+    tables[-1:-1] = [t for t in (field_table(runs), measures_table(runs)) if t is not None]
     pictures = _draw(folder, records, runs)
     text = "\n\n".join(
         [

@@ -40,6 +40,9 @@ METHODS = {
     "caps": ("CAPS", "#d95f02"),
     "l2c2": ("L2C2", "#1b6ca8"),
     "l2c2_policy": ("L2C2, beta=0", "#7570b3"),
+    "l2c2_mean": ("L2C2, means", "#2a9d8f"),
+    "l2c2_ramp": ("L2C2, means, ramp", "#0b3d66"),
+    "cats": ("CATS", "#b0416b"),
 }
 
 

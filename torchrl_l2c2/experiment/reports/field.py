@@ -1,0 +1,114 @@
+"""Runs on the tasks of the methods after the paper, beside what was published of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from torchrl_l2c2.experiment.reports.comparison import Estimate
+from torchrl_l2c2.experiment.reports.groups import Group, group_records
+from torchrl_l2c2.experiment.reports.runs import FinishedRun
+from torchrl_l2c2.experiment.reports.statistics import mean
+from torchrl_l2c2.experiment.reports.tables import Table, number, number_range
+from torchrl_l2c2.experiment.tasks import FIELD_TASKS
+
+
+class PublishedCell(NamedTuple):
+    """Mean return and "Sm" of ten runs, each tested by ten episodes."""
+
+    total: float
+    sm: float
+
+
+# CATS (arXiv 2610.07910), with RL Zoo's settings; by algorithm and method, in the order of tasks.
+# Its L2C2 was made with the code of ASAP, which does not follow the paper's equations.
+ROWS: dict[tuple[str, str], tuple[tuple[float, float], ...]] = {
+    ("ppo", "none"): ((-218, 0.469), (221, 0.209), (2658, 1.162), (3510, 1.682)),
+    ("ppo", "caps"): ((-175, 0.421), (206, 0.214), (2440, 0.471), (3626, 0.505)),
+    ("ppo", "l2c2"): ((-185, 0.452), (208, 0.211), (2704, 1.502), (3342, 1.744)),
+    ("ppo", "cats"): ((-184, 0.343), (227, 0.194), (3002, 0.222), (4071, 0.407)),
+    ("ppo", "grad_caps"): ((-191, 0.451), (218, 0.215), (3309, 0.578), (3384, 0.626)),
+    ("ppo", "asap"): ((-223, 0.449), (191, 0.213), (2780, 0.441), (3754, 0.490)),
+    ("ppo", "lipsnet++"): ((-671, 0.553), (135, 0.144), (1878, 0.543), (2344, 0.993)),
+    ("sac", "none"): ((-149, 0.984), (276, 0.424), (2656, 1.507), (4189, 1.268)),
+    ("sac", "caps"): ((-177, 0.376), (269, 0.355), (2856, 1.235), (4651, 1.178)),
+    ("sac", "l2c2"): ((-150, 1.189), (273, 0.441), (2965, 1.249), (4413, 1.081)),
+    ("sac", "cats"): ((-149, 0.291), (278, 0.196), (3046, 0.259), (4714, 0.419)),
+    ("sac", "grad_caps"): ((-149, 0.504), (250, 0.371), (2978, 0.898), (4381, 0.905)),
+    ("sac", "asap"): ((-148, 0.485), (276, 0.248), (3014, 0.655), (4466, 0.795)),
+    ("sac", "lipsnet++"): ((-148, 0.694), (260, 0.358), (2570, 0.886), (4419, 1.093)),
+}
+PUBLISHED: dict[tuple[str, str, str], PublishedCell] = {
+    (task, algorithm, method): PublishedCell(*cell)
+    for (algorithm, method), cells in ROWS.items()
+    for task, cell in zip(FIELD_TASKS, cells, strict=True)
+}
+NAMES = {"grad_caps": "Grad-CAPS", "asap": "ASAP", "lipsnet++": "LipsNet++"}
+# As evaluation.json names them: how they are told, and the quantity whose digits they have.
+MEASURES = {
+    "return": ("return", "return"),
+    "sm_asap": ("Sm", "sm"),
+    "action_variation": ("action variation", "action_variation"),
+}
+LEGEND = (
+    "Means over seeds of the last policy's test episodes with its mean actions, 95% intervals of "
+    "the bootstrap over seeds in brackets. Sm as the published one: `(2 / N) sum_i f_i |FFT_i|` at "
+    "one action per unit of time, the mean over the action's dimensions; it grows with the length "
+    "N of an episode, the action variation does not. Published: CATS (arXiv 2610.07910), ten seeds "
+    "by ten episodes; its L2C2 is that of ASAP's code, which does not follow the paper's equations."
+)
+
+
+def field_table(runs: Sequence[FinishedRun]) -> Table | None:
+    """A row for every group of runs on these tasks, then what else was published of them.
+
+    Args:
+        runs (sequence of FinishedRun): of any tasks; others are passed over.
+
+    Returns:
+        Table: ``None`` where no run is of such a task with PPO or SAC.
+    """
+    ours = [run for run in runs if (run.task, run.algorithm, "none") in PUBLISHED]
+    if not ours:
+        return None
+    summaries = {run.record.identity: run.evaluation.get("summary", {}) for run in ours}
+    groups = group_records(run.record for run in ours)
+    rows = []
+    for task, algorithm in dict.fromkeys((g.first.task, g.first.algorithm) for g in groups):
+        together = [g for g in groups if (g.first.task, g.first.algorithm) == (task, algorithm)]
+        rows += [_row(group, summaries) for group in together]
+        rows += _others(task, algorithm)
+    columns = ["task", "algorithm", "method", "seeds", *(name for name, _ in MEASURES.values())]
+    columns += ["published: return", "published: Sm"]
+    return Table("Beside the published table", columns, rows, [LEGEND])
+
+
+def _row(group: Group, summaries: dict[tuple[str | int, ...], dict[str, float]]) -> list[str]:
+    first = group.first
+    cells = [first.task, first.algorithm, group.name, number_range(group.seeds)]
+    own = [summaries[record.identity] for record in group.records]
+    for name, (_, quantity) in MEASURES.items():
+        found = (each.get(f"{name}_mean") for each in own)
+        values = [value for value in found if value is not None and not np.isnan(value)]
+        center = Estimate.of(mean, np.array(values).reshape(-1, 1))
+        if center is None:
+            cells.append("-")
+        else:
+            write = partial(number, quantity=quantity, beside=center.value)
+            cells.append(center.text(write))
+    return [*cells, *_published(PUBLISHED.get((first.task, first.algorithm, first.method)))]
+
+
+def _others(task: str, algorithm: str) -> list[list[str]]:
+    """What no run of this package is of."""
+    return [
+        [task, algorithm, name, "", "", "", "", *_published(PUBLISHED[task, algorithm, method])]
+        for method, name in NAMES.items()
+    ]
+
+
+def _published(cell: PublishedCell | None) -> tuple[str, str]:
+    return ("", "") if cell is None else (f"{cell.total:g}", f"{cell.sm:.3f}")
