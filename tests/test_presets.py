@@ -1,0 +1,110 @@
+"""What is learned with the RL Zoo's settings: the equations of Stable-Baselines3, by hand."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from test_experiment_config import composed
+from torch.distributions import Normal
+
+from torchrl_l2c2.experiment import ExperimentConfig
+
+
+def agent_of(task, algorithm, *more):
+    config = ExperimentConfig.from_dict(
+        composed(
+            "preset=rl_zoo", f"task={task}", f"algorithm={algorithm}", "regularizer=none", *more
+        )
+    )
+    torch.manual_seed(0)
+    return config, config.make_agent(config.make_env())
+
+
+def batch_of(agent, size, observations, actions):
+    generator = torch.Generator().manual_seed(0)
+    draw = torch.randn(6, size, 1, generator=generator)
+    seen = torch.randn(2, size, observations, generator=generator)
+    done = draw[5] > 0.5
+    following = {"observation": seen[1], "reward": draw[0], "terminated": done, "done": done}
+    return TensorDict(
+        {
+            "observation": seen[0],
+            "action": torch.randn(size, actions, generator=generator),
+            "action_log_prob": draw[1].squeeze(-1) - 4.0,
+            "advantage": 3.0 * draw[2] + 1.0,
+            "value_target": draw[3],
+            "next": following,
+        },
+        [size],
+    )
+
+
+def test_ppo_has_the_loss_of_stable_baselines():
+    """The surrogate with normalized advantages, the entropy, the squared error of the values."""
+    config, agent = agent_of("hopper_v5", "ppo")
+    chosen, batch = config.algorithm, batch_of(agent, 32, 11, 3)
+    terms = agent.loss(batch.copy())
+    written = agent.loss.actor_network(batch.copy())
+    policy = Normal(written["loc"], written["scale"])
+    log_prob = policy.log_prob(batch["action"]).sum(-1)
+    ratio = (log_prob - batch["action_log_prob"]).exp()
+    advantage = batch["advantage"].squeeze(-1)
+    advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+    clipped = ratio.clamp(1 - chosen.clip_epsilon, 1 + chosen.clip_epsilon)
+    surrogate = -torch.min(advantage * ratio, advantage * clipped).mean()
+    entropy = policy.entropy().sum(-1).mean()
+    value = agent.advantage.value_network(batch.copy())["state_value"]
+    error = (value - batch["value_target"]).square().mean()
+    torch.testing.assert_close(terms["loss_objective"], surrogate)
+    torch.testing.assert_close(terms["loss_entropy"], -0.00229519 * entropy)
+    torch.testing.assert_close(terms["loss_critic"], 0.835671 * error)
+    assert written["scale"].log().flatten().tolist() == pytest.approx([-2.0] * 96)
+
+
+def test_sac_has_the_targets_of_stable_baselines():
+    """The lesser of two target values, less temperature times likelihood, unless it ended."""
+    _, agent = agent_of("hopper_v5", "sac", "algorithm.hidden=[8]")
+    loss, batch = agent.loss, batch_of(agent, 32, 11, 3)
+    batch["action"].clamp_(-0.9, 0.9)
+    assert loss.target_entropy.item() == -3.0
+    torch.manual_seed(1)
+    terms = loss(batch.copy())
+    # The values' loss draws first.
+    torch.manual_seed(1)
+    with torch.no_grad():
+        drawn = _critic_draw(loss, batch)
+        values = loss._vmap_qnetworkN0(
+            drawn.select(*loss.qvalue_network.in_keys), loss.target_qvalue_network_params
+        )["state_action_value"]
+        soft = values.min(0).values - loss._alpha * drawn["action_log_prob"].unsqueeze(-1)
+        ended = batch["next", "terminated"]
+        target = batch["next", "reward"] + 0.99 * soft * ~ended
+    predicted = loss._vmap_qnetworkN0(
+        batch.select(*loss.qvalue_network.in_keys), loss.qvalue_network_params
+    )["state_action_value"]
+    expected = (predicted - target).square().sum(0).mean()
+    torch.testing.assert_close(terms["loss_qvalue"], expected)
+
+
+def _critic_draw(loss, batch):
+    following = TensorDict({"observation": batch["next", "observation"]}, batch.batch_size)
+    with loss.actor_network_params.to_module(loss.actor_network):
+        distribution = loss.actor_network.get_dist(following)
+    action = distribution.rsample()
+    log_prob = distribution.log_prob(action)
+    return following.update({"action": action, "action_log_prob": log_prob})
+
+
+def test_first_weights_are_orthogonal_and_the_first_policy_near_zero():
+    """Gains of the root of 2, of .01 and of 1."""
+    _, agent = agent_of("pendulum", "ppo")
+    actor = agent.loss.actor_network_params.flatten_keys(".")
+    critic = agent.loss.critic_network_params.flatten_keys(".")
+    gains = {}
+    for name, network in (("actor", actor), ("critic", critic)):
+        weights = [value.detach() for key, value in network.items() if key.endswith("weight")]
+        gains[name] = [torch.linalg.matrix_norm(weight, 2).item() for weight in weights]
+        biases = [value for key, value in network.items() if key.endswith("bias")]
+        assert len(biases) == 3 and not any(bias.any() for bias in biases)
+    root = 2**0.5
+    assert gains["actor"] == pytest.approx([root, root, 0.01], rel=1e-4)
+    assert gains["critic"] == pytest.approx([root, root, 1.0], rel=1e-4)
