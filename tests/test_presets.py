@@ -85,6 +85,20 @@ def test_sac_has_the_targets_of_stable_baselines():
     torch.testing.assert_close(terms["loss_qvalue"], expected)
 
 
+def test_sacs_temperature_keeps_the_entropy_of_scaled_actions():
+    """Halved, Pendulum's have an entropy of -1; the temperature's loss is of what differs."""
+    _, agent = agent_of("pendulum", "sac", "algorithm.hidden=[8]")
+    halved = torch.distributions.AffineTransform(0.0, 0.5)
+    log_density = -halved.log_abs_det_jacobian(torch.zeros(()), torch.zeros(()))
+    target = agent.loss.target_entropy.item()
+    assert target - log_density.item() == pytest.approx(-1.0, abs=1e-5)
+    torch.manual_seed(0)
+    terms = agent.loss(batch_of(agent, 16, 3, 1))
+    assert terms["loss_alpha"].item() == 0.0  # of a temperature of 1, whose logarithm is 0
+    (gradient,) = torch.autograd.grad(terms["loss_alpha"], agent.loss.log_alpha)
+    assert gradient.item() == pytest.approx(terms["entropy"].item() - target, rel=1e-4)
+
+
 def _critic_draw(loss, batch):
     following = TensorDict({"observation": batch["next", "observation"]}, batch.batch_size)
     with loss.actor_network_params.to_module(loss.actor_network):

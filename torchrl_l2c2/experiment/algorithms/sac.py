@@ -25,6 +25,11 @@ class SACConfig(OffPolicyConfig):
     gamma: float = Field(default=0.99, ge=0, lt=1, description="discount")
     tau: float = Field(default=0.005, gt=0, le=1, description="pace of the target networks")
     alpha_init: float = Field(default=1.0, gt=0, description="first temperature; it is learned")
+    target_entropy: float | None = Field(
+        default=None,
+        description="entropy that the temperature keeps, of actions in the task's units: actions "
+        "over twice the range have log 2 more; null: minus the number of their dimensions",
+    )
     hidden: Layers = Field(
         default=(256, 256), description="neurons of the hidden layers of all networks"
     )
@@ -75,6 +80,7 @@ class SACConfig(OffPolicyConfig):
             loss_function="l2",
             alpha_init=self.alpha_init,
             action_spec=env.action_spec,
+            target_entropy="auto" if self.target_entropy is None else self.target_entropy,
         )
         loss.make_value_estimator(gamma=self.gamma)
         # A buffer that is made when first read: in a compiled function it would be lost again.
