@@ -36,7 +36,8 @@ experiment.tasks experiment.replay experiment.collection
 experiment.rollouts
 experiment.regularizers.base
 experiment.regularizers.none experiment.regularizers.caps experiment.regularizers.l2c2
-experiment.regularizers.cats experiment.regularizers.lcp experiment.regularizers.sr2l
+experiment.regularizers.cats experiment.regularizers.grad_caps experiment.regularizers.lcp
+experiment.regularizers.sr2l
 experiment.regularizers.__init__
 experiment.algorithms.normalization
 experiment.algorithms.agent experiment.algorithms.networks experiment.algorithms.base

@@ -30,6 +30,7 @@ from torchrl_l2c2.experiment import (
     CATSConfig,
     Experiment,
     ExperimentConfig,
+    GradCAPSConfig,
     LCPConfig,
     PPORPEConfig,
     SR2LConfig,
@@ -136,6 +137,15 @@ class TestGradCAPS:
             actions = net(torch.cat((states[:1], states, played["next", "observation"][-1:])))
             expected = grad_caps_term(actions[:-2], actions[1:-1], actions[2:], 0.1).mean()
         torch.testing.assert_close(found.detach(), expected)
+
+    def test_the_observation_before_may_be_an_entry_of_its_own(self):
+        """The same as of frames; the loss asks for it."""
+        batch, base = self.batch(), linear_base()
+        expected = GradCAPSLoss(base, 0.3).policy_regularizer(batch)["loss_grad_caps"]
+        loss = GradCAPSLoss(base, 0.3, previous_key="before")
+        batch["before"] = batch.pop("frames")[:, :3]
+        assert loss.policy_regularizer(batch)["loss_grad_caps"].equal(expected)
+        assert "before" in loss.in_keys
 
     def test_other_batches_are_refused_with_what_to_do(self):
         """Without frames, or with three."""
@@ -402,7 +412,12 @@ def test_cats_compiles_into_one_graph():
 
 @pytest.mark.parametrize(
     ("regularizer", "compiled"),
-    [(CATSConfig(), True), (SR2LConfig(steps=2), False), (LCPConfig(), False)],
+    [
+        (CATSConfig(), True),
+        (GradCAPSConfig(), True),
+        (SR2LConfig(steps=2), False),
+        (LCPConfig(), False),
+    ],
     ids=lambda value: getattr(value, "name", ""),
 )
 def test_they_run(regularizer, compiled):

@@ -96,6 +96,22 @@ def test_episodes_in_the_middle_are_saved(task):
         assert (ours.transitions == theirs).all()
 
 
+@pytest.mark.parametrize("kind", ["rollouts", "episodes"])
+def test_the_observation_before_is_kept(kind):
+    """Over cuts, but not over ends: in an episode's first frame it is the frame's own."""
+    if kind == "rollouts":
+        (frames,) = played(collector_of(NOISY, [3], 5, keep_previous=True), 4)
+    else:
+        env = make_env(NOISY, 3)
+        options = {"frames_per_batch": 5, "stop_at_done": False, "keep_previous": True}
+        collector = EpisodeCollector(env, actor_of(env), **options)
+        frames = torch.cat([collector.rollout() for _ in range(4)])
+    seen, before = frames["observation"], frames["previous_observation"]
+    first = torch.tensor([step % 9 == 0 for step in range(20)])
+    assert before[first].equal(seen[first])
+    assert before[1:][~first[1:]].equal(seen[:-1][~first[1:]])
+
+
 class Moody(gymnasium.Env):
     """Shows what no generator of its own has drawn, and keeps the actions that it gets."""
 

@@ -7,6 +7,7 @@ from .optimizers import AdamConfig, AdaTermConfig
 from .regularizers import (
     CAPSConfig,
     CATSConfig,
+    GradCAPSConfig,
     L2C2Config,
     LCPConfig,
     NoRegularizerConfig,
@@ -30,6 +31,7 @@ __all__ = [
     "Evaluation",
     "Experiment",
     "ExperimentConfig",
+    "GradCAPSConfig",
     "L2C2Config",
     "LCPConfig",
     "LoggerConfig",

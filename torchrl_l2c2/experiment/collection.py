@@ -26,6 +26,7 @@ from torchrl_l2c2.experiment.compilation import compiled
 from torchrl_l2c2.experiment.frames import Frame, stack_frames
 from torchrl_l2c2.transforms import ObservationNoise
 
+PREVIOUS = "previous_observation"
 # Added to the seed of an environment for its noise: the two are not to draw the same numbers.
 NOISE_SEED = 7_919
 
@@ -55,6 +56,8 @@ class EpisodeCollector(Collector):
         random_frames (int): first frames whose actions are drawn from the action's bounds
             instead. Default 0.
         exploration_type (ExplorationType): default ``RANDOM``.
+        keep_previous (bool): whether frames have the observation before theirs as well, as
+            ``"previous_observation"``; in an episode's first it is their own. Default ``False``.
 
     Examples:
         >>> from torchrl.envs import GymEnv
@@ -79,6 +82,7 @@ class EpisodeCollector(Collector):
         compile_policy: bool = False,
         random_frames: int = 0,
         exploration_type: ExplorationType = ExplorationType.RANDOM,
+        keep_previous: bool = False,
     ) -> None:
         self._simulator, self._noise = simulator_and_noise(env)
         by_torchrl = self._simulator is None
@@ -94,7 +98,14 @@ class EpisodeCollector(Collector):
             init_random_frames=random_frames if by_torchrl else 0,
             use_buffers=False if by_torchrl else None,
         )
+        if keep_previous and by_torchrl:
+            raise ValueError(
+                "keep_previous needs one Gymnasium simulator with no transform but "
+                f"ObservationNoise, got {env}: append CatFrames to it instead."
+            )
         self.stop_at_done = stop_at_done
+        self._keep_previous = keep_previous
+        self._previous: Tensor | None = None
         self._random_frames_left = random_frames
         # The collector has reset the environment when it was made.
         self._observation: Tensor | None = self._carrier.get("observation")
@@ -148,7 +159,11 @@ class EpisodeCollector(Collector):
         observation = self._observation
         if observation is None:
             observation = self._observe(self._gymnasium.reset()[0])
+            self._previous = observation
         outputs = dict(zip(self._policy_keys, self._act(observation), strict=True))
+        if self._keep_previous:
+            outputs[PREVIOUS] = observation if self._previous is None else self._previous
+            self._previous = observation
         action = outputs["action"]
         if self._random_frames_left > 0:
             self._random_frames_left -= 1

@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
-from torchrl_l2c2.experiment.collection import on_tensors, simulator_and_noise
+from torchrl_l2c2.experiment.collection import PREVIOUS, on_tensors, simulator_and_noise
 from torchrl_l2c2.experiment.frames import Frame, stack_frames
 
 
@@ -51,6 +51,7 @@ class RolloutCollector:
         frames_per_batch (int): of a rollout, a multiple of the number of environments.
         compile_policy (bool): whether to compile the policy. Default ``False``.
         exploration_type (ExplorationType): default ``RANDOM``.
+        keep_previous (bool): as for :class:`~torchrl_l2c2.experiment.EpisodeCollector`.
 
     Attributes:
         ended: the episodes that ended in the last rollout, in the order of their ends.
@@ -80,6 +81,7 @@ class RolloutCollector:
         frames_per_batch: int,
         compile_policy: bool = False,
         exploration_type: ExplorationType = ExplorationType.RANDOM,
+        keep_previous: bool = False,
     ) -> None:
         if frames_per_batch % len(envs):
             raise ValueError(
@@ -87,7 +89,7 @@ class RolloutCollector:
                 f"{frames_per_batch}."
             )
         self._policy_keys = [key for key in policy.out_keys if not key.startswith("_")]
-        self._streams = [_Stream(env) for env in envs]
+        self._streams = [_Stream(env, keep_previous) for env in envs]
         self._steps = frames_per_batch // len(envs)
         self._act = on_tensors(policy, self._policy_keys, compile_policy)
         self._exploration_type = exploration_type
@@ -134,7 +136,7 @@ class RolloutCollector:
 class _Stream:
     """A simulator and the episode that it is in."""
 
-    def __init__(self, env: EnvBase) -> None:
+    def __init__(self, env: EnvBase, keep_previous: bool) -> None:
         simulator, self._noise = simulator_and_noise(env)
         if simulator is None:
             raise ValueError(
@@ -142,6 +144,7 @@ class _Stream:
                 f"ObservationNoise, got {env}."
             )
         self._env, self._gymnasium = env, simulator._env
+        self._keep_previous = keep_previous
         self._dtype = simulator.observation_spec["observation"].dtype
         space: Any = self._gymnasium.action_space
         self._low, self._high = space.low, space.high
@@ -162,6 +165,8 @@ class _Stream:
         taken = np.clip(outputs["action"].numpy(), self._low, self._high)
         seen, reward, terminated, truncated, _ = self._gymnasium.step(taken)
         self._observation = self._observe(seen)
+        if self._keep_previous:
+            outputs[PREVIOUS] = self._frames[-1].observation if self._frames else before
         frame = Frame(before, outputs, self._observation, reward, terminated, truncated)
         self._frames.append(frame)
         return frame

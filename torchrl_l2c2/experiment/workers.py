@@ -32,7 +32,10 @@ def make_collector(
     config: ExperimentConfig, env: EnvBase, agent: Agent, *, compile: bool
 ) -> EpisodeCollector | MultiEpisodeCollector | RolloutCollector:
     """What plays a run's episodes: this process, or as many others as the settings say."""
-    options: dict[str, Any] = {"compile_policy": compile and agent.policy_compiles}
+    options: dict[str, Any] = {
+        "compile_policy": compile and agent.policy_compiles,
+        "keep_previous": config.regularizer.reads_previous,
+    }
     algorithm = config.algorithm
     if isinstance(algorithm, PPOConfig) and algorithm.num_envs is not None:
         seeds = (config.seed + SEEDS_APART * i for i in range(1, algorithm.num_envs))
@@ -75,6 +78,7 @@ class MultiEpisodeCollector(MultiSyncCollector):
         random_frames (int): rounds that begin before so many frames draw their actions from the
             action's bounds. Default 0.
         exploration_type (ExplorationType): default ``RANDOM``.
+        keep_previous (bool): as for :class:`EpisodeCollector`. Default ``False``.
 
     Raises:
         RuntimeError: an environment or a policy failed in a process, or the process died.
@@ -102,6 +106,7 @@ class MultiEpisodeCollector(MultiSyncCollector):
         compile_policy: bool = False,
         random_frames: int = 0,
         exploration_type: ExplorationType = ExplorationType.RANDOM,
+        keep_previous: bool = False,
     ) -> None:
         # Python would wait for the processes to end before it ends itself.
         self._at_exit = partial(_shut_down, weakref.ref(self))
@@ -115,7 +120,9 @@ class MultiEpisodeCollector(MultiSyncCollector):
             total_frames=-1,
             init_random_frames=random_frames,
             exploration_type=exploration_type,
-            collector_class=partial(_EpisodeWorker, compiled_policy=compile_policy),
+            collector_class=partial(
+                _EpisodeWorker, compiled_policy=compile_policy, keep_previous=keep_previous
+            ),
             init_fn=_leave_signals_to_parent,
             update_at_each_batch=True,
             use_buffers=False,
@@ -164,6 +171,7 @@ class _EpisodeWorker(EpisodeCollector):
         frames_per_batch: int,
         exploration_type: ExplorationType,
         compiled_policy: bool,
+        keep_previous: bool,
         **_: Any,
     ) -> None:
         torch.set_num_threads(1)
@@ -173,6 +181,7 @@ class _EpisodeWorker(EpisodeCollector):
             frames_per_batch=frames_per_batch,
             compile_policy=compiled_policy,
             exploration_type=exploration_type,
+            keep_previous=keep_previous,
         )
         self._use_buffers = False
 

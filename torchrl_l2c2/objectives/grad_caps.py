@@ -34,7 +34,9 @@ class GradCAPSLoss(RegularizedLoss):
         CatFrames(N=2, dim=-1, in_keys=["observation"], out_keys=["frames"])
 
     appended to the environment: the first half of ``frames`` is that observation, in the first step
-    of an episode the state itself. Runs of this package's experiment do not collect it.
+    of an episode the state itself. Or it is an entry of its own, such as the
+    ``"previous_observation"`` that the collectors of this package's experiment keep, named by
+    ``previous_key``.
 
     Args:
         base_loss (LossModule): the loss; see :class:`RegularizedLoss` for how it is wrapped. Its
@@ -46,6 +48,8 @@ class GradCAPSLoss(RegularizedLoss):
 
     Keyword Args:
         frames_key (NestedKey): the entry that ``CatFrames`` writes. Defaults to ``"frames"``.
+        previous_key (NestedKey, optional): the entry that is the observation before, which is read
+            in the place of frames. Defaults to ``None``.
         mean (str): ``"loc"`` compares means before the squashing, ``"action"`` deterministic
             actions. Defaults to ``"loc"``.
 
@@ -78,6 +82,7 @@ class GradCAPSLoss(RegularizedLoss):
         epsilon: float = 0.1,
         *,
         frames_key: NestedKey = "frames",
+        previous_key: NestedKey | None = None,
         mean: Literal["loc", "action"] = "loc",
     ) -> None:
         check_choice("mean", mean, ("loc", "action"))
@@ -85,10 +90,12 @@ class GradCAPSLoss(RegularizedLoss):
         if not self.policy_networks():
             raise TypeError(f"GradCAPSLoss needs a policy: {type(base_loss).__name__} has none.")
         self.grad_caps_epsilon, self.grad_caps_mean = float(epsilon), mean
-        self.grad_caps_frames_key = frames_key
+        self.grad_caps_frames_key, self.grad_caps_previous_key = frames_key, previous_key
         self.register_coefficient("grad_caps_lambda", lambda_temporal)
         self.declare_networks(self.policy_networks())
         self.declare_terms(policy=["loss_grad_caps"])
+        if previous_key is not None and self.in_keys:
+            self.in_keys = [*self.in_keys, previous_key]
 
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
         terms = super().policy_regularizer(tensordict)
@@ -108,6 +115,14 @@ class GradCAPSLoss(RegularizedLoss):
                 "them with CatTensors."
             )
         ((key, (state, successor)),) = transitions.items()
+        before = self._before(tensordict, key, state).detach()
+        states = torch.stack((before, finite_successor(state, successor)))
+        return TensorDict({key: states}, batch_size=[2, *tensordict.batch_size])
+
+    def _before(self, tensordict: TensorDictBase, key: NestedKey, state: Tensor) -> Tensor:
+        if self.grad_caps_previous_key is not None:
+            previous: Tensor = tensordict.get(self.grad_caps_previous_key)
+            return previous
         frames = tensordict.get(self.grad_caps_frames_key, None)
         if frames is None:
             raise KeyError(
@@ -121,9 +136,7 @@ class GradCAPSLoss(RegularizedLoss):
                 f"{(*state.shape[:-1], 2 * state.shape[-1])}, got {tuple(frames.shape)}: make them "
                 "with CatFrames(N=2, dim=-1)."
             )
-        before = frames[..., : state.shape[-1]].detach()
-        states = torch.stack((before, finite_successor(state, successor)))
-        return TensorDict({key: states}, batch_size=[2, *tensordict.batch_size])
+        return frames[..., : state.shape[-1]]
 
 
 def grad_caps_term(

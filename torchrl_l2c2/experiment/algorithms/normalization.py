@@ -97,7 +97,9 @@ class Normalization(nn.Module):
     def normalized(self, frames: TensorDictBase) -> TensorDictBase:
         """A copy of frames with both observations and the reward normalized; nothing is counted."""
         copied = frames.copy()
-        for key in ("observation", ("next", "observation")):
+        for key in ("observation", ("next", "observation"), "previous_observation"):
+            if key not in frames.keys(True):
+                continue
             copied.set(key, self.normalize(frames[key].to(self.mean.device)))
         if self._rewards:
             scaled = frames["next", "reward"].to(self.mean.device) / self.gained.scale.float()

@@ -172,6 +172,8 @@ def _batch(agent: Agent, config: ExperimentConfig, env: EnvBase, max_steps: int)
         episode: TensorDictBase = env.rollout(max_steps, agent.policy)
         reward = episode["next", "reward"] * config.algorithm.reward_factor
         episode.set(("next", "reward"), reward)
+        seen = episode["observation"]
+        episode.set("previous_observation", torch.cat((seen[:1], seen[:-1])))
         if agent.normalization is not None:
             episode = agent.normalization.normalized(episode)
         if agent.advantage is not None:

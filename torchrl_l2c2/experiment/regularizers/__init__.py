@@ -3,6 +3,7 @@
 from torchrl_l2c2.experiment.regularizers.base import GainConfig, RegularizerConfig
 from torchrl_l2c2.experiment.regularizers.caps import CAPSConfig
 from torchrl_l2c2.experiment.regularizers.cats import CATSConfig
+from torchrl_l2c2.experiment.regularizers.grad_caps import GradCAPSConfig
 from torchrl_l2c2.experiment.regularizers.l2c2 import L2C2Config
 from torchrl_l2c2.experiment.regularizers.lcp import LCPConfig
 from torchrl_l2c2.experiment.regularizers.none import NoRegularizerConfig
@@ -13,6 +14,7 @@ __all__ = [
     "CAPSConfig",
     "CATSConfig",
     "GainConfig",
+    "GradCAPSConfig",
     "L2C2Config",
     "LCPConfig",
     "NoRegularizerConfig",
@@ -24,6 +26,7 @@ REGULARIZERS: dict[str, RegularizerConfig] = {
     "none": NoRegularizerConfig(),
     "caps": CAPSConfig(),
     "cats": CATSConfig(),
+    "grad_caps": GradCAPSConfig(),
     "sr2l": SR2LConfig(),
     "lcp": LCPConfig(),
     "l2c2": L2C2Config(),

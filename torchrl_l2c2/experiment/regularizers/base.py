@@ -19,9 +19,11 @@ class RegularizerConfig:
 
     Attributes:
         compilable: whether the regularized loss compiles into one graph where the plain one does.
+        reads_previous: whether its batches are to have the observation before each state.
     """
 
     compilable: ClassVar[bool] = True
+    reads_previous: ClassVar[bool] = False
 
     name: str
 

@@ -46,7 +46,15 @@ PUBLISHED: dict[tuple[str, str, str], PublishedCell] = {
     for (algorithm, method), cells in ROWS.items()
     for task, cell in zip(FIELD_TASKS, cells, strict=True)
 }
-NAMES = {"grad_caps": "Grad-CAPS", "asap": "ASAP", "lipsnet++": "LipsNet++"}
+NAMES = {
+    "none": "vanilla",
+    "caps": "CAPS",
+    "cats": "CATS",
+    "l2c2": "L2C2",
+    "grad_caps": "Grad-CAPS",
+    "asap": "ASAP",
+    "lipsnet++": "LipsNet++",
+}
 # As evaluation.json names them: how they are told, and the quantity whose digits they have.
 MEASURES = {
     "return": ("return", "return"),
@@ -80,7 +88,7 @@ def field_table(runs: Sequence[FinishedRun]) -> Table | None:
     for task, algorithm in dict.fromkeys((g.first.task, g.first.algorithm) for g in groups):
         together = [g for g in groups if (g.first.task, g.first.algorithm) == (task, algorithm)]
         rows += [_row(group, summaries) for group in together]
-        rows += _others(task, algorithm)
+        rows += _others(task, algorithm, {g.first.method for g in together})
     columns = ["task", "algorithm", "method", "seeds", *(name for name, _ in MEASURES.values())]
     columns += ["published: return", "published: Sm"]
     return Table("Beside the published table", columns, rows, [LEGEND])
@@ -102,11 +110,12 @@ def _row(group: Group, summaries: dict[tuple[str | int, ...], dict[str, float]])
     return [*cells, *_published(PUBLISHED.get((first.task, first.algorithm, first.method)))]
 
 
-def _others(task: str, algorithm: str) -> list[list[str]]:
-    """What no run of this package is of."""
+def _others(task: str, algorithm: str, methods: set[str]) -> list[list[str]]:
+    """What was published, and what no run here is of."""
     return [
         [task, algorithm, name, "", "", "", "", *_published(PUBLISHED[task, algorithm, method])]
         for method, name in NAMES.items()
+        if method not in methods
     ]
 
 

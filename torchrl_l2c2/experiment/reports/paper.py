@@ -43,6 +43,7 @@ METHODS = {
     "l2c2_mean": ("L2C2, means", "#2a9d8f"),
     "l2c2_ramp": ("L2C2, means, ramp", "#0b3d66"),
     "cats": ("CATS", "#b0416b"),
+    "grad_caps": ("Grad-CAPS", "#8a6d1d"),
 }
 
 

@@ -1,0 +1,45 @@
+"""Grad-CAPS, a rival: the change of the action's change."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+from pydantic import Field
+
+from torchrl_l2c2.experiment.regularizers.base import GainConfig
+from torchrl_l2c2.experiment.settings import settings
+
+if TYPE_CHECKING:
+    from torchrl.objectives import LossModule
+
+
+@settings
+class GradCAPSConfig(GainConfig):
+    """A rival, :class:`~torchrl_l2c2.GradCAPSLoss`; frames keep the observation before theirs."""
+
+    reads_previous: ClassVar[bool] = True
+
+    name: str = "grad_caps"
+    lambda_temporal: float = Field(
+        default=0.01, ge=0, description="gain of the change of the action's change [inferred]"
+    )
+    epsilon: float = Field(
+        default=0.1, gt=0, description="smaller ones punish zigzags around one place more"
+    )
+    mean: Literal["loc", "action"] = Field(
+        default="loc", description="means compared before or after the squashing [inferred: loc]"
+    )
+
+    def wrap(self, loss: LossModule) -> LossModule:
+        from torchrl_l2c2.objectives import GradCAPSLoss
+
+        return GradCAPSLoss(
+            loss,
+            self.lambda_temporal,
+            self.epsilon,
+            previous_key="previous_observation",
+            mean=self.mean,
+        )
+
+    def set_gains(self, loss: LossModule, policy: float, value: float) -> None:
+        loss.grad_caps_lambda = policy * self.lambda_temporal
