@@ -195,6 +195,8 @@ def _shares(axes: Sequence[Any], one: Diagnosis) -> None:
     kinds = (("size", "of the loss's size", COLORS[0]), ("gradient", "gradient", COLORS[1]))
     for kind, label, color in kinds:
         values = [getattr(one.shares[name], kind) for name in names]
+        if all(map(math.isnan, values)):
+            continue
         height = 0.4 if kind == "size" else -0.4
         axis.barh(names, values, height, align="edge", label=label, color=color)
         for place, value in enumerate(values):
