@@ -23,8 +23,8 @@ from torchrl_l2c2.experiment import (
     evaluate_policy,
 )
 from torchrl_l2c2.experiment.environments import control_rate
-from torchrl_l2c2.experiment.evaluate import load_policy
 from torchrl_l2c2.experiment.export import export_policy, main
+from torchrl_l2c2.experiment.trained import load_policy
 
 onnxruntime = pytest.importorskip("onnxruntime")
 ROOT = Path(__file__).parents[1]
@@ -59,8 +59,9 @@ def onnx_actor(path):
     session = onnxruntime.InferenceSession(path)
 
     def act(observation):
-        batch = observation.reshape(1, *observation.shape).numpy()
-        return torch.from_numpy(session.run(["action"], {"observation": batch})[0][0])
+        rows = observation.reshape(-1, observation.shape[-1]).numpy()
+        action = torch.from_numpy(session.run(["action"], {"observation": rows})[0])
+        return action.reshape(*observation.shape[:-1], -1)
 
     return TensorDictModule(act, in_keys=["observation"], out_keys=["action"])
 
