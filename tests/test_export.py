@@ -80,13 +80,15 @@ def test_over_ten_episodes_the_return_is_that_of_pytorch(pendulum):
 
 def test_the_contract_says_what_the_simulator_says(pendulum):
     """Order, bounds and rate; the difference was measured on a whole episode."""
-    exported, _ = pendulum
+    exported, folder = pendulum
     contract = json.loads((exported.folder / "contract.json").read_text())
     assert contract == exported.contract
     assert contract["task"] == "Pendulum-v1" and contract["noise_scale"] == 0.05
     assert contract["observation"]["shape"] == ["batch", 3]
     assert contract["observation"]["entries"][2] == "observation[2]"
     assert contract["action"]["low"] == [-2.0] and contract["action"]["high"] == [2.0]
+    tested = json.loads((folder / "evaluation.json").read_text())["summary"]
+    assert contract["test"].items() < tested.items() and contract["test"]["episodes"] == 1
     assert contract["actions_per_second"] == 20.0 and contract["longest_episode"] == 40
     assert contract["agreement"]["observations"] == 40
     assert contract["agreement"]["largest_difference"] < 1e-5
