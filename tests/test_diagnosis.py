@@ -421,6 +421,8 @@ class TestPage:
         flipping = made_up(0.5 * FLIPPING, name="other", shares={"caps": TermShare(True, 0.1)})
         text = page([made_up(name="first"), flipping])
         assert text.count("<div class=card>") == 2
+        # A step of the sine is 4 * .5 / 100 in the mean, of the other one 1.
+        assert re.findall(r"width:([\d.]+)%", text) == ["2.0", "100.0"]
         assert "<th></th><th>first</th><th>other</th>" in text
         for name, pictures in (("first", 4), ("other", 5)):
             assert text.count(f"<figcaption>{name}</figcaption>") == pictures

@@ -80,10 +80,11 @@ def page(diagnoses: Sequence[Diagnosis]) -> str:
         return _section(title, text, diagnoses, draw(diagnoses))
 
     most = max(one.measures["action_variation"] for one in diagnoses)
+    scale = most if len(diagnoses) > 1 else None
     parts = [
         "<h1>Why a policy shakes</h1>",
         f"<p>{_EPISODE}</p>",
-        _side([_card(one, most) for one in diagnoses]),
+        _side([_card(one, scale) for one in diagnoses]),
         *(f"<p>{html.escape(text)}</p>" for text in comparison(diagnoses)),
         section("Actions over time", _ACTIONS, draw_actions),
         *_videos(diagnoses),
@@ -128,13 +129,13 @@ _TERMS = (
 )
 
 
-def _card(one: Diagnosis, most: float) -> str:
-    """Its numbers, with a bar beside that of the largest action variation, and its words."""
+def _card(one: Diagnosis, most: float | None) -> str:
+    """Its numbers, with a bar for its share of the largest action variation, and its words."""
     variation = one.measures["action_variation"]
+    bar = f"<span class=bar><i style='width:{variation / most:.1%}'></i></span>" if most else ""
     glance = (
         f"<div class=glance><div><b>{_number(one.measures['return'])}</b>return</div>"
-        f"<div><b>{_number(variation)}</b>action variation<span class=bar>"
-        f"<i style='width:{variation / most if most else 0:.1%}'></i></span></div></div>"
+        f"<div><b>{_number(variation)}</b>action variation{bar}</div></div>"
     )
     told = "".join(
         f"<p class='{'fault' if each.fault else each.kind}'>{html.escape(each.text)}</p>"
