@@ -198,16 +198,23 @@ class TestWords:
 def test_policies_are_compared_with_the_first():
     """By the paper's measure and the return."""
     measured = {"previous_action_gain": 1.0}
-    first, second, third = (
+    first, second, third, fourth = (
         made_up(name=name, measures={**measured, "return": r, "action_variation": v})
-        for name, r, v in (("one", -200.0, 0.4), ("two", -100.0, 0.1), ("three", -200.0, 0.5))
+        for name, r, v in (
+            ("one", -200.0, 0.4),
+            ("two", -100.0, 0.1),
+            ("three", -200.0, 0.5),
+            ("four", -300.0, 4.0),
+        )
     )
     assert comparison([first]) == []
-    assert comparison([first, second, third]) == [
+    assert comparison([first, second, third, fourth]) == [
         "two changes its action 75% less from step to step than one (0.1, 0.4), and its return is "
         "higher (-100, -200).",
         "three changes its action 25% more from step to step than one (0.5, 0.4), and its return "
         "is the same (-200, -200).",
+        "four changes its action 10 times as much from step to step as one (4, 0.4), and its return "
+        "is lower (-300, -200).",
     ]
 
 

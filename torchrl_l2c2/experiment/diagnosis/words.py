@@ -120,14 +120,16 @@ def _beside(first: Diagnosis, other: Diagnosis) -> str:
     (before, old), (now, new) = (
         (one.measures["action_variation"], one.measures["return"]) for one in (first, other)
     )
-    moves = f"{other.name} changes its action "
-    if before > 0.0:
-        moves += f"{abs(now / before - 1):.0%} {'less' if now < before else 'more'}"
+    ratio = now / before if before > 0.0 else math.inf if now > 0.0 else 1.0
+    if ratio > 2.0:
+        change = f"{ratio:.2g} times as much from step to step as"
     else:
-        moves += "more" if now > before else "as little"
+        more = "less" if ratio < 1.0 else "more"
+        change = f"{abs(ratio - 1):.0%} {more} from step to step than"
     return (
-        f"{moves} from step to step than {first.name} ({now:.3g}, {before:.3g}), and its return is "
-        f"{'higher' if new > old else 'lower' if new < old else 'the same'} ({new:.4g}, {old:.4g})."
+        f"{other.name} changes its action {change} {first.name} ({now:.3g}, {before:.3g}), and its "
+        f"return is {'higher' if new > old else 'lower' if new < old else 'the same'} "
+        f"({new:.4g}, {old:.4g})."
     )
 
 
