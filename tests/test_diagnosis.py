@@ -213,8 +213,8 @@ def test_policies_are_compared_with_the_first():
         "higher (-100, -200).",
         "three changes its action 25% more from step to step than one (0.5, 0.4), and its return "
         "is the same (-200, -200).",
-        "four changes its action 10 times as much from step to step as one (4, 0.4), and its return "
-        "is lower (-300, -200).",
+        "four changes its action 10 times as much from step to step as one (4, 0.4), and its "
+        "return is lower (-300, -200).",
     ]
 
 
