@@ -28,7 +28,7 @@ def run(notebook: nbformat.NotebookNode, monkeypatch: pytest.MonkeyPatch) -> Non
     # A backend chosen outside would keep the pictures out of the notebook.
     monkeypatch.delenv("MPLBACKEND", raising=False)
     folder = {"metadata": {"path": str(FOLDER)}}
-    NotebookClient(notebook, timeout=300, kernel_name="python3", resources=folder).execute()
+    NotebookClient(notebook, timeout=900, kernel_name="python3", resources=folder).execute()
 
 
 def pictures(cell: nbformat.NotebookNode) -> int:
