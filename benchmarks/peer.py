@@ -47,7 +47,9 @@ def _train_here(settings: Settings, algorithm: Any, replay: Any) -> Callable[[],
         NoRegularizerConfig,
         TaskConfig,
     )
+    from torchrl_l2c2.experiment.process import keep_freed_memory
 
+    keep_freed_memory()  # As train.py does.
     task = TaskConfig(
         env_id=settings["env_id"], max_steps=settings["frames"], episodes=1, noise_scale=0.0
     )

@@ -39,6 +39,9 @@ def play(folder: Path, episodes: int) -> None:
     env.close()
     print(f"return {np.mean(returns):.1f}")
     print(f"action variation {np.mean(changes):.3f}")
+    # On seeds of its own, so that they agree but for chance.
+    if "test" in contract:
+        print(f"return in the run's own test {contract['test']['return_mean']:.1f}")
 
 
 if __name__ == "__main__":

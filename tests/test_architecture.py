@@ -56,9 +56,11 @@ experiment.reports.figures experiment.reports.field
 experiment.reports.page experiment.reports.readme experiment.reports.results
 experiment.reports.__init__
 experiment.reports.__main__
+experiment.trained
+experiment.video
 experiment.workers
 experiment.evaluate experiment.update experiment.player experiment.manual
-experiment.influence experiment.best_policy experiment.export experiment.video
+experiment.influence experiment.best_policy experiment.export
 experiment.diagnosis.measured
 experiment.diagnosis.words experiment.diagnosis.pictures experiment.diagnosis.run
 experiment.diagnosis.film

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks.speed import matrix_products
+from benchmarks.setups import matrix_products
 from benchmarks.timing import Row, alternate, to_markdown
 
 REPOSITORY = Path(__file__).parent.parent

@@ -5,8 +5,16 @@ from dataclasses import replace
 
 import pytest
 import torch
+from tensordict.nn import TensorDictModule
+from torchrl.envs import GymEnv
 
-from torchrl_l2c2.experiment import Experiment, ExperimentConfig, TaskConfig, load_policy
+from torchrl_l2c2.experiment import (
+    Experiment,
+    ExperimentConfig,
+    TaskConfig,
+    evaluate_policy,
+    load_policy,
+)
 from torchrl_l2c2.experiment.evaluate import main
 
 TASK = TaskConfig("pendulum", "Pendulum-v1", episodes=6, max_steps=40)
@@ -81,6 +89,25 @@ def test_evaluate_plays_as_it_is_told(folder):
         # The last of two seeds counts.
         differs = evaluated(folder, "--seed", "5", *other)["episodes"]["action_variations"]
         assert differs != first["episodes"]["action_variations"]
+
+
+def test_evaluate_records_its_first_episode(folder, tmp_path):
+    """Of 40 steps; of mean actions alone."""
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    pytest.importorskip("pygame")
+    evaluated(folder, "--record", str(tmp_path / "test.mp4"))
+    assert ffmpeg.count_frames_and_secs(str(tmp_path / "test.mp4"))[0] == 41
+    with pytest.raises(SystemExit):
+        evaluated(folder, "--record", str(tmp_path / "other.mp4"), "--sampled")
+
+
+def test_sensitivity_to_noise_is_among_the_measures():
+    """Half the square of .01 times the slope of a linear policy, about."""
+    policy = TensorDictModule(lambda seen: 0.3 * seen[..., 2:], ["observation"], ["action"])
+    measures = evaluate_policy(policy, GymEnv("Pendulum-v1"), 2, max_steps=200).measures
+    first, second = measures["noise_sensitivity"]
+    assert first == pytest.approx(second, rel=1e-3)
+    assert first == pytest.approx(0.5 * (0.3 * 0.01) ** 2, rel=0.2)
 
 
 def test_evaluate_refuses_what_cannot_be(folder, tmp_path):

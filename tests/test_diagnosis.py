@@ -29,6 +29,7 @@ from torchrl_l2c2.experiment.diagnosis import (
     THRESHOLDS,
     Diagnosis,
     TermShare,
+    comparison,
     diagnose,
     diagnose_run,
     findings,
@@ -37,7 +38,7 @@ from torchrl_l2c2.experiment.diagnosis import (
 )
 from torchrl_l2c2.experiment.diagnosis.film import film
 from torchrl_l2c2.experiment.diagnosis.page import page
-from torchrl_l2c2.metrics import previous_action_gain
+from torchrl_l2c2.metrics import action_variation, previous_action_gain
 
 STEPS = torch.arange(100.0)
 SINE = torch.sin(2 * torch.pi * STEPS / 100).unsqueeze(-1)
@@ -52,6 +53,7 @@ def made_up(actions=0.5 * SINE, **known):
             "name": "made up",
             "measures": {
                 "return": 1.0,
+                "action_variation": action_variation(actions).item(),
                 "previous_action_gain": previous_action_gain(actions).item(),
             },
             "actions": actions,
@@ -95,7 +97,7 @@ class TestWords:
     def test_an_action_that_alternates_flips(self):
         """By half of the range at every step, at half of 20 Hz."""
         found = said(made_up(0.5 * FLIPPING, rate=20.0), "flips")
-        assert kinds(made_up(0.5 * FLIPPING)) == ["flips"] and found.fault
+        assert kinds(made_up(0.5 * FLIPPING)) == ["flips", "steepest"] and found.fault
         for words in ("10 Hz", "100% of the steps", "50.0% of its range", "throughout"):
             assert words in found.text
 
@@ -110,10 +112,18 @@ class TestWords:
         actions = torch.cat([0.5 * SINE, 0.5 * FLIPPING], 1)
         assert said(made_up(actions), "flips").text.startswith("action[1]")
 
+    def test_where_it_is_steepest_is_told_in_what_it_observes(self):
+        """Of a policy that shakes; steps are the first entry here, their squares the second."""
+        constants = torch.ones(100)
+        constants[7] = 6.0
+        found = said(made_up(0.5 * FLIPPING, policy_lipschitz=constants), "steepest")
+        assert "at step 7, where it observes speed = 7, angle = 49: " in found.text
+        assert "is 6 there and 1 in the median" in found.text and not found.fault
+
     def test_a_square_wave_is_bang_bang(self):
         """From bound to bound every ten steps: nine jumps in a hundred steps."""
         square = torch.where((STEPS // 10) % 2 == 0, 1.0, -1.0).unsqueeze(-1)
-        assert kinds(made_up(square)) == ["bang-bang"]
+        assert kinds(made_up(square)) == ["bang-bang", "steepest"]
         text = said(made_up(square), "bang-bang").text
         assert "in 100% of the steps" in text and "9 times, one in 11 steps" in text
 
@@ -183,6 +193,29 @@ class TestWords:
         constants = {name: value for name, value in vars(words).items() if name.isupper()}
         del constants["THRESHOLDS"]
         assert {name: number for name, (number, _) in THRESHOLDS.items()} == constants
+
+
+def test_policies_are_compared_with_the_first():
+    """By the paper's measure and the return."""
+    measured = {"previous_action_gain": 1.0}
+    first, second, third, fourth = (
+        made_up(name=name, measures={**measured, "return": r, "action_variation": v})
+        for name, r, v in (
+            ("one", -200.0, 0.4),
+            ("two", -100.0, 0.1),
+            ("three", -200.0, 0.5),
+            ("four", -300.0, 4.0),
+        )
+    )
+    assert comparison([first]) == []
+    assert comparison([first, second, third, fourth]) == [
+        "two changes its action 75% less from step to step than one (0.1, 0.4), and its return is "
+        "higher (-100, -200).",
+        "three changes its action 25% more from step to step than one (0.5, 0.4), and its return "
+        "is the same (-200, -200).",
+        "four changes its action 10 times as much from step to step as one (4, 0.4), and its "
+        "return is lower (-300, -200).",
+    ]
 
 
 class Walk(gymnasium.Env):
@@ -388,13 +421,15 @@ class TestPage:
         assert "<link" not in text and "@import" not in text and "href" not in text
         sources = re.findall(r"src=.(.{11})", text)
         assert len(sources) == 4 and set(sources) == {"data:image/"}
-        assert "width=device-width" in text and "a &lt;b&gt;" in text and "<b>" not in text
+        assert "width=device-width" in text and "a &lt;b&gt;" in text and "a <b>" not in text
 
     def test_several_stand_side_by_side(self):
         """Each has its words, a column of the table and every picture."""
         flipping = made_up(0.5 * FLIPPING, name="other", shares={"caps": TermShare(True, 0.1)})
         text = page([made_up(name="first"), flipping])
         assert text.count("<div class=card>") == 2
+        # A step of the sine is 4 * .5 / 100 in the mean, of the other one 1.
+        assert re.findall(r"width:([\d.]+)%", text) == ["2.0", "100.0"]
         assert "<th></th><th>first</th><th>other</th>" in text
         for name, pictures in (("first", 4), ("other", 5)):
             assert text.count(f"<figcaption>{name}</figcaption>") == pictures
@@ -414,7 +449,7 @@ class TestPage:
         (tmp_path / "film.mp4").write_bytes(film(both))
         frames, seconds = ffmpeg.count_frames_and_secs(str(tmp_path / "film.mp4"))
         assert frames == 51 and seconds == pytest.approx(51 / 30, abs=0.05)
-        assert next(ffmpeg.read_frames(tmp_path / "film.mp4"))["size"] == (512, 320)
+        assert next(ffmpeg.read_frames(tmp_path / "film.mp4"))["size"] == (640, 400)
 
 
 class Blank(Walk):

@@ -23,8 +23,8 @@ from torchrl_l2c2.experiment import (
     evaluate_policy,
 )
 from torchrl_l2c2.experiment.environments import control_rate
-from torchrl_l2c2.experiment.evaluate import load_policy
 from torchrl_l2c2.experiment.export import export_policy, main
+from torchrl_l2c2.experiment.trained import load_policy
 
 onnxruntime = pytest.importorskip("onnxruntime")
 ROOT = Path(__file__).parents[1]
@@ -59,8 +59,9 @@ def onnx_actor(path):
     session = onnxruntime.InferenceSession(path)
 
     def act(observation):
-        batch = observation.reshape(1, *observation.shape).numpy()
-        return torch.from_numpy(session.run(["action"], {"observation": batch})[0][0])
+        rows = observation.reshape(-1, observation.shape[-1]).numpy()
+        action = torch.from_numpy(session.run(["action"], {"observation": rows})[0])
+        return action.reshape(*observation.shape[:-1], -1)
 
     return TensorDictModule(act, in_keys=["observation"], out_keys=["action"])
 
@@ -79,13 +80,15 @@ def test_over_ten_episodes_the_return_is_that_of_pytorch(pendulum):
 
 def test_the_contract_says_what_the_simulator_says(pendulum):
     """Order, bounds and rate; the difference was measured on a whole episode."""
-    exported, _ = pendulum
+    exported, folder = pendulum
     contract = json.loads((exported.folder / "contract.json").read_text())
     assert contract == exported.contract
     assert contract["task"] == "Pendulum-v1" and contract["noise_scale"] == 0.05
     assert contract["observation"]["shape"] == ["batch", 3]
     assert contract["observation"]["entries"][2] == "observation[2]"
     assert contract["action"]["low"] == [-2.0] and contract["action"]["high"] == [2.0]
+    tested = json.loads((folder / "evaluation.json").read_text())["summary"]
+    assert contract["test"].items() < tested.items() and contract["test"]["episodes"] == 1
     assert contract["actions_per_second"] == 20.0 and contract["longest_episode"] == 40
     assert contract["agreement"]["observations"] == 40
     assert contract["agreement"]["largest_difference"] < 1e-5

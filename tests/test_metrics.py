@@ -147,7 +147,7 @@ def test_the_spectrum_of_known_signals():
     actions = 3 + 2 * torch.sin(2 * torch.pi * 5 * time) + 0.5 * torch.cos(2 * torch.pi * 20 * time)
     frequencies, amplitudes = amplitude_spectrum(actions.unsqueeze(-1), sampling_rate=50.0)
     found = {f: a for f, a in zip(frequencies.tolist(), amplitudes[:, 0].tolist(), strict=True)}
-    expected = {0.0: 6.0, 5.0: 2.0, 20.0: 0.5}
+    expected = {0.0: 3.0, 5.0: 2.0, 20.0: 0.5}
     for frequency, amplitude in found.items():
         assert amplitude == pytest.approx(expected.get(frequency, 0.0), abs=1e-4)
     assert roughness(actions.unsqueeze(-1), 50.0).item() == pytest.approx(
@@ -155,9 +155,9 @@ def test_the_spectrum_of_known_signals():
     )
 
 
-@pytest.mark.parametrize("steps", [50, 1000])
+@pytest.mark.parametrize("steps", [50, 51, 1000])
 def test_the_two_forms_of_sm_are_the_published_ones_and_convert(steps):
-    """Each written out as its authors print it; one is (T - 2) / 4 times the other."""
+    """Each written out as its authors print it; one is (T - 2) / 4 times the other, T even."""
     torch.manual_seed(0)
     actions = torch.randn(steps, 3, dtype=torch.float64)
     spectrum = np.abs(np.fft.fft(actions.numpy(), axis=0))[: steps // 2]
@@ -166,7 +166,20 @@ def test_the_two_forms_of_sm_are_the_published_ones_and_convert(steps):
     asap = np.mean(2 / steps * (frequencies[:, None] * spectrum).sum(0))
     assert spectral_smoothness(actions).item() == pytest.approx(caps)
     assert spectral_smoothness(actions, "asap").item() == pytest.approx(asap)
-    assert asap / caps == pytest.approx((steps - 2) / 4)
+    if steps % 2 == 0:
+        assert asap / caps == pytest.approx((steps - 2) / 4)
+
+
+def test_the_highest_frequency_is_left_out_of_sm_and_kept_in_roughness():
+    """Of six steps, by hand: 3 + cos(pi t / 3) + 2 (-1)^t has 3, 1, 0 and 2 at 0, 1/6, 1/3, 1/2."""
+    actions = torch.tensor([[6.0], [1.5], [4.5], [0.0], [4.5], [1.5]])
+    frequencies, amplitudes = amplitude_spectrum(actions)
+    torch.testing.assert_close(frequencies, torch.tensor([0.0, 1 / 6, 1 / 3, 1 / 2]))
+    torch.testing.assert_close(amplitudes[:, 0], torch.tensor([3.0, 1.0, 0.0, 2.0]))
+    # Weights 0, 1/2 and 1 in the mean of three; frequencies in the sum.
+    assert spectral_smoothness(actions).item() == pytest.approx(1 / 6)
+    assert spectral_smoothness(actions, "asap").item() == pytest.approx(1 / 6)
+    assert roughness(actions).item() == pytest.approx((1 / 6 + 2 / 2) / 3)
 
 
 def test_roughness_is_free_of_amplitude_offset_and_length():

@@ -23,9 +23,22 @@ def outputs(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
     return [output for cell in notebook.cells for output in cell.get("outputs", [])]
 
 
-def test_the_quickstart_is_among_them() -> None:
-    """Without it the tests below would have nothing to run."""
-    assert "quickstart.ipynb" in NOTEBOOKS
+def run(notebook: nbformat.NotebookNode, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a fresh kernel; an error of a cell is one here."""
+    # A backend chosen outside would keep the pictures out of the notebook.
+    monkeypatch.delenv("MPLBACKEND", raising=False)
+    folder = {"metadata": {"path": str(FOLDER)}}
+    NotebookClient(notebook, timeout=900, kernel_name="python3", resources=folder).execute()
+
+
+def pictures(cell: nbformat.NotebookNode) -> int:
+    """How many a cell shows without a live kernel."""
+    return sum("image/png" in output.get("data", {}) for output in cell.get("outputs", []))
+
+
+def test_all_four_are_there() -> None:
+    """Without them the tests below would have nothing to run."""
+    assert NOTEBOOKS == ["experiment.ipynb", "idea.ipynb", "quickstart.ipynb", "results.ipynb"]
 
 
 def test_stored_without_outputs(notebook: nbformat.NotebookNode) -> None:
@@ -35,15 +48,20 @@ def test_stored_without_outputs(notebook: nbformat.NotebookNode) -> None:
     assert all(cell.execution_count is None for cell in notebook.cells if cell.cell_type == "code")
 
 
+def test_what_has_sliders_is_a_picture_first(
+    notebook: nbformat.NotebookNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the short form: of cells that say so, the source in their metadata."""
+    for cell in notebook.cells:
+        cell.source = cell.metadata.get("short", cell.source)
+    run(notebook, monkeypatch)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    with_sliders = [n for n, cell in enumerate(code) if "interact(" in cell.source][1:]
+    assert with_sliders and all(pictures(code[n - 1]) for n in with_sliders)
+
+
+@pytest.mark.slow
 def test_runs_and_draws(notebook: nbformat.NotebookNode, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every cell runs in a fresh kernel without an error, and a picture comes out."""
-    # A backend chosen outside would keep the pictures out of the notebook.
-    monkeypatch.delenv("MPLBACKEND", raising=False)
-    client = NotebookClient(
-        notebook,
-        timeout=300,
-        kernel_name="python3",
-        resources={"metadata": {"path": str(FOLDER)}},
-    )
-    client.execute()
-    assert any("image/png" in output.get("data", {}) for output in outputs(notebook))
+    """Every cell as it stands, without an error, and pictures come out."""
+    run(notebook, monkeypatch)
+    assert sum(map(pictures, notebook.cells)) >= 3

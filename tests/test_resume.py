@@ -28,8 +28,8 @@ from torchrl_l2c2.experiment import (
 )
 from torchrl_l2c2.experiment.config import GROUPS, OtherRunError
 from torchrl_l2c2.experiment.continuation import check_same_settings
-from torchrl_l2c2.experiment.evaluate import load_policy
 from torchrl_l2c2.experiment.folder import list_checkpoints, load_checkpoint, save_checkpoint
+from torchrl_l2c2.experiment.trained import load_policy
 
 ROOT = Path(__file__).parent.parent
 SWINGUP = TaskConfig(episodes=6, max_steps=60)

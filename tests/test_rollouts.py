@@ -21,6 +21,7 @@ from torchrl_l2c2.experiment import (
     load_policy,
     make_env,
 )
+from torchrl_l2c2.experiment.diagnosis.run import value_function
 from torchrl_l2c2.experiment.rollouts import RolloutCollector
 
 NOISY = TaskConfig("pendulum", "Pendulum-v1", noise_scale=0.1, max_steps=9)
@@ -234,6 +235,10 @@ def test_a_policy_is_read_back_with_its_normalization(tmp_path):
                 for each in (policy, run.agent.policy)
             )
         assert ours.equal(theirs)
+    seen = run.agent.normalization.normalize(observation)
+    expected = run.agent.advantage.value_network(TensorDict({"observation": seen}, [1]))
+    value = value_function(run.agent.loss, run.agent.normalization)
+    assert value(observation, torch.zeros(1, 1)).equal(expected["state_value"])
 
 
 def test_the_learning_rate_falls_in_a_line():

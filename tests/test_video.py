@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig, PPORPEConfig, TaskConfig
-from torchrl_l2c2.experiment.evaluate import load_policy
+from torchrl_l2c2.experiment.trained import load_policy
 from torchrl_l2c2.experiment.video import main, play_pictures, record_video
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")

@@ -2,7 +2,7 @@ from .algorithms import DQNConfig, PPOConfig, PPORPEConfig, SACConfig, TD3Config
 from .collection import EpisodeCollector
 from .config import ExperimentConfig, LoggerConfig
 from .environments import make_env
-from .evaluate import Evaluation, evaluate_policy, load_policy
+from .evaluate import Evaluation, evaluate_policy
 from .optimizers import AdamConfig, AdaTermConfig
 from .regularizers import (
     CAPSConfig,
@@ -15,6 +15,7 @@ from .regularizers import (
 )
 from .replay import PrioritizedReplayConfig, RolloutReplayConfig, UniformReplayConfig
 from .tasks import FIELD_TASKS, PAPER_TASKS, TASKS, TaskConfig
+from .trained import load_policy
 from .training import Experiment
 from .workers import MultiEpisodeCollector
 

@@ -187,6 +187,7 @@ def run(values: dict[str, Any], standing: str = "") -> FinishedRun | None:
     config = ExperimentConfig.from_dict(values)
     # Here, as settings are checked before anything waits for torch.
     from torchrl_l2c2.experiment.folder import save_policy
+    from torchrl_l2c2.experiment.process import keep_freed_memory
     from torchrl_l2c2.experiment.reports import compare_with_paper, finished_run
     from torchrl_l2c2.experiment.training import Experiment
     from torchrl_l2c2.experiment.video import check_video, record_video
@@ -195,6 +196,7 @@ def run(values: dict[str, Any], standing: str = "") -> FinishedRun | None:
         check_video()
     for chatty in ("torchrl", "matplotlib", "torch"):
         logging.getLogger(chatty).setLevel(logging.ERROR)
+    keep_freed_memory()
     warnings.simplefilter("ignore", FutureWarning)
     warnings.filterwarnings("ignore", "No target network updater")
     folder = run_folder(config, values["outputs"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
@@ -176,7 +177,9 @@ class ExperimentConfig:
                 f"must be one that PyTorch finds; it finds {torch.cuda.device_count()} CUDA "
                 f"devices, got {self.device!r}: use device=cpu.",
             )
-        with device:
+        with device, warnings.catch_warnings():
+            # Target networks get updaters of this package's.
+            warnings.filterwarnings("ignore", "No target network updater")
             agent = self.algorithm.make_agent(env, self.regularizer, self.optimizer)
         if device.type != "cpu":
             agent.act_on_cpu()

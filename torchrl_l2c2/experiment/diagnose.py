@@ -7,9 +7,16 @@ import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from torchrl_l2c2.experiment.diagnosis import Diagnosis, diagnose_run, findings, write_page
+from torchrl_l2c2.experiment.diagnosis import (
+    Diagnosis,
+    comparison,
+    diagnose_run,
+    findings,
+    write_page,
+)
 from torchrl_l2c2.experiment.environments import TEST_SEED
 from torchrl_l2c2.experiment.folder import make_folder
+from torchrl_l2c2.experiment.reports.paper import method_name
 
 
 def main(arguments: Iterable[str] | None = None) -> None:
@@ -36,7 +43,9 @@ def main(arguments: Iterable[str] | None = None) -> None:
         write_page(path, diagnoses)
     except (ValueError, OSError, RuntimeError, ImportError) as error:
         sys.exit(f"error: {error}")
-    print("\n\n".join([*map(_told, diagnoses), f"page: {path}"]))
+    compared = "\n".join(comparison(diagnoses))
+    parts = [*map(_told, diagnoses), *([compared] if compared else []), f"page: {path}"]
+    print("\n\n".join(parts))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -56,21 +65,25 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _told(one: Diagnosis) -> str:
-    return "\n".join([one.name, *(f"  - {found.text}" for found in findings(one))])
+    total, variation = (one.measures[name] for name in ("return", "action_variation"))
+    head = f"{one.name}: return {total:.4g}, action variation {variation:.3g}"
+    return "\n".join([head, *(f"  - {found.text}" for found in findings(one))])
 
 
 def _names(folders: Sequence[str]) -> list[str]:
     """The ends of the folders' paths that tell them apart, without what these have in common.
 
+    Methods have the names that they have in tables.
+
     Examples:
         >>> _names(["a/sac/none/seed_0", "a/sac/caps/seed_0"])
-        ['none', 'caps']
+        ['vanilla', 'CAPS']
         >>> _names(["a/sac/none/seed_0", "a/td3/none/seed_0", "b/sac/caps/seed_0"])
-        ['sac/none', 'td3/none', 'sac/caps']
+        ['sac/vanilla', 'td3/vanilla', 'sac/CAPS']
         >>> _names(["/a/sac/none/seed_0"])
-        ['sac/none/seed_0']
+        ['sac/vanilla/seed_0']
     """
-    paths = [Path(folder).resolve().parts for folder in folders]
+    paths = [tuple(map(method_name, Path(folder).resolve().parts)) for folder in folders]
     if len(paths) == 1:
         return ["/".join(paths[0][-3:])]
     if len(set(paths)) < len(paths):

@@ -11,28 +11,29 @@ import math
 import statistics
 import sys
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import partial
-from pathlib import Path
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 from tqdm import tqdm
 
 from torchrl_l2c2.experiment.collection import EpisodeCollector, check_finite, play_episodes
-from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
-from torchrl_l2c2.experiment.folder import load_newest, write_json
+from torchrl_l2c2.experiment.folder import write_json
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.tasks import TaskConfig
+from torchrl_l2c2.experiment.trained import load_policy
+from torchrl_l2c2.experiment.video import check_video, record_video
 from torchrl_l2c2.metrics import (
     action_fluctuation_ratio,
     action_jerk,
     action_rate,
     action_variation,
+    noise_sensitivity,
     previous_action_gain,
     roughness,
     saturation,
@@ -50,6 +51,7 @@ MEASURES: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
     "previous_action_gain": previous_action_gain,
 }
 LEAST_STEPS = 4  # that each of them can be taken of
+NOISE = 0.01  # standard deviation, that sensitivity is measured with: that of the paper's tasks
 
 
 @dataclass(frozen=True)
@@ -62,8 +64,9 @@ class Evaluation:
             paper's "L2 norm of temporal actions". Smaller is smoother.
         lengths: steps of the episodes.
         measures: other measures of the mean action's smoothness (``torchrl_l2c2.metrics``), with
-            ``saturation`` where actions have bounds; of an episode that played samples, those of
-            the samples as well, as ``sampled_...``. NaN where an episode is too short.
+            ``saturation`` where actions have bounds and ``noise_sensitivity``, to noise of .01,
+            where they are numbers; of an episode that played samples, those of the samples as
+            well, as ``sampled_...``. NaN where an episode is too short.
     """
 
     returns: list[float]
@@ -96,7 +99,8 @@ def evaluate_policy(
     """Plays episodes with the policy's mean action, or with samples.
 
     Args:
-        policy (TensorDictModule): acts deterministically under ``ExplorationType.DETERMINISTIC``.
+        policy (TensorDictModule): acts deterministically under ``ExplorationType.DETERMINISTIC``,
+            for one observation and for a batch of them.
         env (EnvBase): one Gymnasium environment, as :class:`EpisodeCollector` takes it.
         episodes (int): how many, at least 1. More give a surer mean.
         max_steps (int): longest episode. Default 1000.
@@ -148,6 +152,8 @@ def evaluate_policy(
         for prefix, kind in played.items():
             for name, value in measure(kind, env.action_spec).items():
                 measures.setdefault(prefix + name, []).append(value)
+        if env.action_spec.dtype.is_floating_point:
+            measures.setdefault("noise_sensitivity", []).append(_sensitivity(policy, episode))
         lengths.append(len(episode))
         bar.set_postfix_str(f"return {statistics.fmean(returns):.1f}")
     return Evaluation(returns, variations, lengths, measures)
@@ -172,6 +178,16 @@ def mean_actions(policy: TensorDictModule, episode: TensorDictBase) -> torch.Ten
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         actions: torch.Tensor = policy(episode.select("observation"))["action"]
     return actions
+
+
+def _sensitivity(policy: TensorDictModule, episode: TensorDictBase) -> float:
+    """To noise that is the same at every call."""
+
+    def act(observation: torch.Tensor) -> torch.Tensor:
+        return mean_actions(policy, TensorDict({"observation": observation}, observation.shape[:1]))
+
+    generator = torch.Generator().manual_seed(0)
+    return noise_sensitivity(act, episode["observation"], NOISE, generator=generator).item()
 
 
 class LateTests:
@@ -234,74 +250,6 @@ def _variation(actions: torch.Tensor) -> float:
     return action_variation(actions.float()).item() if actions.shape[-2] > 1 else 0.0
 
 
-def load_policy(
-    folder: str | Path,
-    *,
-    seed: int | None = None,
-    noise_scale: float | None = None,
-    best: bool = False,
-    render: bool = False,
-) -> tuple[TensorDictModule, EnvBase, int]:
-    """A run's acting policy and a fresh environment of its task, from its folder alone.
-
-    The policy is a TorchRL actor: it reads ``"observation"`` and writes ``"action"``, the mean
-    under ``set_exploration_type(ExplorationType.DETERMINISTIC)`` and a sample otherwise.
-
-    Args:
-        folder (str or Path): of a run, finished or not.
-
-    Keyword Args:
-        seed (int, optional): of the environment and its noise. Default: that of the run's test.
-        noise_scale (float, optional): of the environment's noise; larger values are harder.
-            Default: the task's.
-        best (bool): whether to take the best policy of the tests during training, where
-            ``evaluate_every`` had some, instead of the last. Default ``False``.
-        render (bool): whether the simulator draws pictures, as for
-            :func:`~.environments.make_env`. Default ``False``.
-
-    Returns:
-        The policy, the environment and the longest episode.
-
-    Raises:
-        FileNotFoundError: the folder is not a run's, or holds no such policy nor a checkpoint.
-        CheckpointError: its checkpoints are damaged.
-        SettingError: a scale of noise below zero.
-
-    Examples:
-        >>> import tempfile
-        >>> from torchrl_l2c2.experiment import Experiment, ExperimentConfig, TaskConfig
-        >>> task = TaskConfig("pendulum", "Pendulum-v1", episodes=1, max_steps=20)
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     experiment = Experiment(ExperimentConfig(task=task, compile=False), folder)
-        ...     _ = experiment.train()
-        ...     policy, env, max_steps = load_policy(folder, seed=1)
-        ...     experiment.close()
-        >>> env.rollout(max_steps, policy)["action"].shape
-        torch.Size([20, 1])
-    """
-    folder = Path(folder)
-    if not (folder / "config.json").exists():
-        raise FileNotFoundError(f"{str(folder)!r} is not the folder of a run: no config.json.")
-    config = ExperimentConfig.from_dict(json.loads((folder / "config.json").read_text()))
-    config = replace(config, device="cpu")
-    noise = config.task.noise_scale if noise_scale is None else noise_scale
-    task = replace(config.task, noise_scale=noise)
-    env = make_env(task, config.seed + TEST_SEED if seed is None else seed, render=render)
-    agent = config.make_agent(env)
-    saved = folder / ("policy_best.pt" if best else "policy.pt")
-    if saved.exists():
-        agent.policy.load_state_dict(torch.load(saved, weights_only=True))
-    elif best:
-        raise FileNotFoundError(f"{str(saved)!r} does not exist; evaluate_every=N makes it.")
-    elif newest := load_newest(folder):
-        agent.loss.load_state_dict(newest[1]["loss"])
-        if agent.normalization is not None:
-            agent.normalization.load_state_dict(newest[1]["normalization"])
-    else:
-        raise FileNotFoundError(f"{str(folder)!r} holds neither policy.pt nor a checkpoint yet.")
-    return agent.policy, env, config.task.time_limit
-
-
 def main(arguments: Iterable[str] | None = None) -> None:
     """The command line: plays test episodes and prints their summary as JSON."""
     parser = argparse.ArgumentParser(
@@ -314,8 +262,15 @@ def main(arguments: Iterable[str] | None = None) -> None:
     parser.add_argument("--sampled", action="store_true", help="act with samples, as in training")
     parser.add_argument("--best", action="store_true", help="policy_best.pt instead of policy.pt")
     parser.add_argument("--output", help="a JSON file for the summary and every episode")
+    parser.add_argument(
+        "--record", metavar="VIDEO", help="a file such as test.mp4: a video of the first episode"
+    )
     chosen = parser.parse_args(arguments)
+    if chosen.record and chosen.sampled:
+        parser.error("--record shows mean actions; leave it or --sampled out")
     try:
+        if chosen.record:
+            check_video()
         policy, env, max_steps = load_policy(
             chosen.folder, seed=chosen.seed, noise_scale=chosen.noise, best=chosen.best
         )
@@ -328,10 +283,18 @@ def main(arguments: Iterable[str] | None = None) -> None:
                 sampled=chosen.sampled,
                 progress=True,
             )
+        if chosen.record:
+            record_video(
+                chosen.folder,
+                chosen.record,
+                seed=chosen.seed,
+                noise_scale=chosen.noise,
+                best=chosen.best,
+            )
         if chosen.output:
             played = {"arguments": vars(chosen), "summary": result.summary()}
             write_json(chosen.output, {**played, "episodes": asdict(result)})
-    except (ValueError, OSError, RuntimeError) as error:
+    except (ValueError, OSError, RuntimeError, ImportError) as error:
         sys.exit(f"error: {error}")
     print(json.dumps(result.summary(), indent=2))
 

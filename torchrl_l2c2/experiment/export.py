@@ -29,9 +29,9 @@ from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
 from torchrl_l2c2.experiment.collection import play_episodes
 from torchrl_l2c2.experiment.environments import control_rate
-from torchrl_l2c2.experiment.evaluate import load_policy
 from torchrl_l2c2.experiment.folder import make_folder, versions, write_atomically, write_json
 from torchrl_l2c2.experiment.process import ProcessState
+from torchrl_l2c2.experiment.trained import load_policy
 
 NEEDED = ("onnx", "onnxruntime", "onnxscript")
 # Of the largest action there is: float32 kernels that sum in another order stay far below.
@@ -82,8 +82,9 @@ def export_policy(
     ``policy.onnx`` has an input ``observation`` ``[batch, *F]`` and an output ``action``
     ``[batch, A]`` (``[batch]`` of whole numbers where actions are discrete), float32;
     ``policy.pt2`` is the same as a ``torch.export`` program. ``contract.json`` says in which order
-    observations and actions come, their bounds, how often an action is due, how far the exported
-    policy is from PyTorch's on recorded observations, and how long one action takes.
+    observations and actions come, their bounds, how often an action is due, what the run's test
+    found, how far the exported policy is from PyTorch's on recorded observations, and how long one
+    action takes.
 
     Args:
         run (str or Path): a run's folder.
@@ -120,6 +121,7 @@ def export_policy(
         "action": _describe_action(env),
         "actions_per_second": control_rate(env),
         "longest_episode": max_steps,
+        **_expected(Path(run), best),
         "agreement": agreement,
         "microseconds_per_action": {
             "onnxruntime": _microseconds(lambda: act(observations[:1].numpy())),
@@ -199,6 +201,16 @@ def _origin(run: Path, best: bool) -> dict[str, Any]:
         "policy": "policy_best.pt" if best else "policy.pt",
         "versions": versions(),
     }
+
+
+def _expected(run: Path, best: bool) -> dict[str, Any]:
+    """What the run's own test found of the policy, where it had one."""
+    path = run / "evaluation.json"
+    if best or not path.exists():
+        return {}
+    summary = json.loads(path.read_text())["summary"]
+    names = ("episodes", "return_mean", "return_std", "action_variation_mean")
+    return {"test": {name: summary[name] for name in names}}
 
 
 def _describe_observation(env: EnvBase) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import random
 from collections.abc import Mapping
@@ -10,6 +11,11 @@ from typing import Any
 
 import numpy as np
 import torch
+
+# Of glibc's mallopt: what is larger is mapped anew at every allocation, and how much may be free at
+# the heap's end before it is given back; both are bytes, up to the largest int.
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
+_LARGEST = 2**31 - 1
 
 _States = tuple[Any, Any, torch.Tensor, list[torch.Tensor]]
 """Of Python, of NumPy, of PyTorch and of its CUDA devices, where there are any."""
@@ -86,6 +92,24 @@ class ProcessState:
         self._inside = (python, numpy, state["torch"], state.get("cuda", []))
         if self._outside is not None:
             _set_states(self._inside)
+
+
+def keep_freed_memory() -> bool:
+    """Lets the process keep the memory that it frees, for the next update, which needs as much.
+
+    Otherwise the tensors of larger batches are handed out anew by the system at every update, page
+    by page, which takes as long as the arithmetic. The process then holds the most that it ever
+    needed, to its end. For processes that train and do little else: ``train.py`` calls it.
+
+    Returns:
+        bool: whether the C library took it; others than glibc have settings of their own.
+    """
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (AttributeError, OSError, TypeError):
+        return False
+    kept = mallopt(_TRIM_THRESHOLD, _LARGEST) and mallopt(_MMAP_THRESHOLD, _LARGEST // 2)
+    return bool(kept)
 
 
 def _states() -> _States:

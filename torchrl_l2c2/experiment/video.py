@@ -19,8 +19,8 @@ from tensordict import TensorDictBase
 
 from torchrl_l2c2.experiment.collection import play_episodes
 from torchrl_l2c2.experiment.environments import control_rate
-from torchrl_l2c2.experiment.evaluate import load_policy
 from torchrl_l2c2.experiment.process import ProcessState
+from torchrl_l2c2.experiment.trained import load_policy
 
 Picture = NDArray[np.uint8]
 

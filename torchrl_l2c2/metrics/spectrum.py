@@ -15,11 +15,13 @@ def amplitude_spectrum(actions: Tensor, sampling_rate: float = 1.0) -> tuple[Ten
     r"""Amplitudes of the frequencies that an episode's actions are made of.
 
     .. math::
-        M_i = \frac{2}{T} \Big| \sum_t a_t\, e^{-2 \pi \mathrm{i}\, i t / T} \Big|, \qquad
-        f_i = \frac{i f_s}{T}, \qquad i = 0, \dots, \lfloor T / 2 \rfloor - 1
+        M_i = \frac{c_i}{T} \Big| \sum_t a_t\, e^{-2 \pi \mathrm{i}\, i t / T} \Big|, \qquad
+        f_i = \frac{i f_s}{T}, \qquad i = 0, \dots, \lfloor T / 2 \rfloor
 
-    A sine of amplitude 1 whose period divides the episode has the amplitude 1 at its frequency, and
-    0 elsewhere. The first is twice the mean.
+    with :math:`c_i = 2`, as a frequency between 0 and :math:`f_s / 2` stands for two of opposite
+    sign, and 1 at these two ends. A sine of amplitude 1 whose period divides the episode has the
+    amplitude 1 at its frequency, and 0 elsewhere. The first is the size of the mean; of even
+    :math:`T` the last, at half the rate, is that of an action that flips from step to step.
 
     Args:
         actions (Tensor): of whole episodes, shape ``[*B, T, A]`` with at least four steps.
@@ -38,13 +40,19 @@ def amplitude_spectrum(actions: Tensor, sampling_rate: float = 1.0) -> tuple[Ten
         >>> sine = torch.sin(2 * torch.pi * torch.arange(8.0) / 4).unsqueeze(-1)
         >>> frequencies, amplitudes = amplitude_spectrum(sine, sampling_rate=100.0)
         >>> frequencies.tolist(), amplitudes.squeeze(-1).round(decimals=3).abs().tolist()
-        ([0.0, 12.5, 25.0, 37.5], [0.0, 0.0, 1.0, 0.0])
+        ([0.0, 12.5, 25.0, 37.5, 50.0], [0.0, 0.0, 1.0, 0.0, 0.0])
+        >>> flipping = torch.tensor([[1.0], [-1.0], [1.0], [-1.0]])
+        >>> amplitude_spectrum(flipping)[1].squeeze(-1).tolist()
+        [0.0, 0.0, 1.0]
     """
     check_episodes("amplitude_spectrum", actions, 4)
     check_real("amplitude_spectrum: sampling_rate", sampling_rate, above=0)
     steps = actions.shape[-2]
-    amplitudes = 2.0 / steps * torch.fft.rfft(actions, dim=-2).abs()[..., : steps // 2, :]
-    frequencies = torch.arange(steps // 2, dtype=actions.dtype, device=actions.device)
+    amplitudes = 2.0 / steps * torch.fft.rfft(actions, dim=-2).abs()
+    amplitudes[..., 0, :] /= 2.0
+    if steps % 2 == 0:
+        amplitudes[..., -1, :] /= 2.0
+    frequencies = torch.arange(steps // 2 + 1, dtype=actions.dtype, device=actions.device)
     return frequencies * sampling_rate / steps, amplitudes
 
 
@@ -59,8 +67,13 @@ def spectral_smoothness(actions: Tensor, form: Literal["caps", "asap"] = "caps")
     the authors of CAPS plot; the second what ASAP, PAVE and CATS print, where the transform is not
     normalized: :math:`\frac{2}{T f_s} \sum_i f_i |\mathrm{FFT}_i|`. Both are means over the
     action's dimensions. Smaller is smoother. For even :math:`T` the second is :math:`(T - 2) / 4`
-    times the first: it grows with the episode's length, so that returns of different lengths are
-    not to be compared by it. :func:`roughness` is nearly free of the length.
+    times the first: it grows with the episode's length, so that episodes of different lengths are
+    not to be compared by it.
+
+    Both leave the highest frequency out, as their authors' code does: sums and means are over
+    :math:`i = 0, \dots, n - 1`. For even :math:`T` that is half the rate, and an action that flips
+    from step to step, the worst there is, counts as perfectly smooth. :func:`roughness` keeps it,
+    and is nearly free of the length.
 
     Args:
         actions (Tensor): of whole episodes, shape ``[*B, T, A]`` with at least four steps.
@@ -78,12 +91,17 @@ def spectral_smoothness(actions: Tensor, form: Literal["caps", "asap"] = "caps")
         >>> sine = torch.sin(2 * torch.pi * torch.arange(8.0) / 4).unsqueeze(-1)
         >>> spectral_smoothness(sine), spectral_smoothness(sine, "asap")
         (tensor(0.1667), tensor(0.2500))
+        >>> flipping = torch.tensor([[1.0], [-1.0], [1.0], [-1.0]])
+        >>> spectral_smoothness(flipping)
+        tensor(0.)
     """
     check_choice("spectral_smoothness: form", form, ("caps", "asap"))
+    bins = actions.shape[-2] // 2
     frequencies, amplitudes = amplitude_spectrum(actions)
+    frequencies, amplitudes = frequencies[:bins], amplitudes[..., :bins, :]
     if form == "asap":
         return (amplitudes * frequencies.unsqueeze(-1)).sum(-2).mean(-1)
-    weights = torch.linspace(0, 1, len(frequencies), dtype=actions.dtype, device=actions.device)
+    weights = torch.linspace(0, 1, bins, dtype=actions.dtype, device=actions.device)
     return (amplitudes * weights.unsqueeze(-1)).mean((-2, -1))
 
 
@@ -93,10 +111,10 @@ def roughness(actions: Tensor, sampling_rate: float = 1.0) -> Tensor:
     .. math::
         \frac{\sum_{i \ge 1} M_i f_i}{f_s \sum_{i \ge 1} M_i}
 
-    with :math:`M_i` and :math:`f_i` of :func:`amplitude_spectrum`; the mean over the action's
-    dimensions. Between 0 and .5, of which white noise has .25, whatever the amplitude and nearly
-    whatever the length: it says how fast an action moves and not how much. The constant part is
-    left out.
+    with :math:`M_i` and :math:`f_i` of :func:`amplitude_spectrum`, up to half the rate; the mean
+    over the action's dimensions. Between 0 and .5: white noise has .25, an action that flips from
+    step to step .5, whatever the amplitude and nearly whatever the length. It says how fast an
+    action moves and not how much. The constant part is left out.
 
     Args:
         actions (Tensor): of whole episodes, shape ``[*B, T, A]`` with at least four steps.
@@ -115,6 +133,8 @@ def roughness(actions: Tensor, sampling_rate: float = 1.0) -> Tensor:
         >>> sine = torch.sin(2 * torch.pi * torch.arange(8.0) / 4).unsqueeze(-1)
         >>> roughness(3 + 2 * sine)
         tensor(0.2500)
+        >>> roughness(torch.tensor([[1.0], [-1.0], [1.0], [-1.0]]))
+        tensor(0.5000)
     """
     frequencies, amplitudes = amplitude_spectrum(actions, sampling_rate)
     moving, weights = amplitudes[..., 1:, :], frequencies[1:].unsqueeze(-1)

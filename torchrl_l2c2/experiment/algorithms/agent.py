@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModule
@@ -54,6 +56,12 @@ class Agent:
     def device(self) -> torch.device:
         """Where the loss's parameters are, and batches have to be."""
         return next(self.loss.parameters()).device
+
+    def load_networks(self, state: Mapping[str, Any]) -> None:
+        """Restores the networks, and what they are normalized by, of a run's checkpoint."""
+        self.loss.load_state_dict(state["loss"])
+        if self.normalization is not None:
+            self.normalization.load_state_dict(state["normalization"])
 
     def act_on_cpu(self) -> None:
         """Has a copy of the policy act on the CPU, whatever the device of the loss is.

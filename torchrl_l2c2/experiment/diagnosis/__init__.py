@@ -7,13 +7,19 @@
 from torchrl_l2c2.experiment.diagnosis.measured import Diagnosis, TermShare, diagnose
 from torchrl_l2c2.experiment.diagnosis.page import write_page
 from torchrl_l2c2.experiment.diagnosis.run import diagnose_run, value_function
-from torchrl_l2c2.experiment.diagnosis.words import THRESHOLDS, Finding, findings
+from torchrl_l2c2.experiment.diagnosis.words import (
+    THRESHOLDS,
+    Finding,
+    comparison,
+    findings,
+)
 
 __all__ = [
     "THRESHOLDS",
     "Diagnosis",
     "Finding",
     "TermShare",
+    "comparison",
     "diagnose",
     "diagnose_run",
     "findings",

@@ -15,8 +15,8 @@ from torchrl_l2c2.experiment.diagnosis.pictures import COLORS, busiest
 from torchrl_l2c2.experiment.reports.figures import drawn, subplots
 from torchrl_l2c2.experiment.video import Picture, write_video
 
-WIDTH = 256  # of a policy's column, in pixels
-STRIP = 80  # height of its strip
+WIDTH = 320  # of a policy's column, in pixels
+STRIP = 100  # height of its strip
 FASTEST = 30.0  # pictures a second; of more some are left out
 USUAL_RATE = 30.0  # where the simulator does not say
 CURSOR = (194, 24, 43)

@@ -17,7 +17,12 @@ from torchrl_l2c2.experiment.diagnosis.pictures import (
     draw_spectra,
     draw_steepness,
 )
-from torchrl_l2c2.experiment.diagnosis.words import THRESHOLDS, findings
+from torchrl_l2c2.experiment.diagnosis.words import (
+    THRESHOLDS,
+    comparison,
+    findings,
+    listed,
+)
 from torchrl_l2c2.experiment.folder import write_atomically
 from torchrl_l2c2.experiment.reports.document import inside, picture, whole_page
 from torchrl_l2c2.experiment.reports.measures import MEASURES
@@ -32,10 +37,18 @@ STYLE = """
 .card { border: 1px solid #ddd; border-radius: 6px; padding: .8rem 1rem; }
 .card p { color: #222; margin: .5rem 0 0; padding-left: .7rem; border-left: 3px solid #bbb; }
 .card p.fault { border-color: #c2182b; } .card p.smooth { border-color: #2a7f62; }
+.glance { display: flex; gap: 1.5rem; font-size: 13px; color: #555; margin-bottom: .6rem; }
+.glance b { display: block; font-size: 1.35rem; color: #222; }
+.glance div:last-child { flex: 1; }
+.bar { display: block; height: .45rem; background: #eee; margin-top: .25rem; }
+.bar i { display: block; height: 100%; background: #1f5fa8; }
 video { max-width: 100%; } p { max-width: 60rem; }
-th { max-width: 11rem; overflow-wrap: anywhere; }
+th { max-width: 11rem; overflow-wrap: break-word; }
+body > .wide:last-child td { white-space: normal; }
+@media (max-width: 40rem) {
+  th, td { padding: .25rem .35rem; } td:first-child { white-space: normal; }
+}
 """
-LISTED = 8  # coordinates of an observation, in the tables
 FIRST = {"return": "return", "length": "steps", "action_variation": "action variation (the paper)"}
 
 
@@ -62,20 +75,24 @@ def write_page(path: str | Path, diagnoses: Sequence[Diagnosis]) -> Path:
 
 def page(diagnoses: Sequence[Diagnosis]) -> str:
     """The page as text."""
-    pictures: list[tuple[str, str, Callable[[Sequence[Diagnosis]], list[bytes]]]] = [
-        ("Actions over time", _ACTIONS, draw_actions),
-        ("Spectra of the actions", _SPECTRA, draw_spectra),
-        ("Where policy and value are steep", _STEEP, draw_steepness),
-    ]
+
+    def section(title: str, text: str, draw: Callable[[Sequence[Diagnosis]], list[bytes]]) -> str:
+        return _section(title, text, diagnoses, draw(diagnoses))
+
+    most = max(one.measures["action_variation"] for one in diagnoses)
+    scale = most if len(diagnoses) > 1 else None
     parts = [
         "<h1>Why a policy shakes</h1>",
         f"<p>{_EPISODE}</p>",
-        _side([_card(one) for one in diagnoses]),
-        _measures(diagnoses).html(),
+        _side([_card(one, scale) for one in diagnoses]),
+        *(f"<p>{html.escape(text)}</p>" for text in comparison(diagnoses)),
+        section("Actions over time", _ACTIONS, draw_actions),
         *_videos(diagnoses),
-        *(_section(title, text, diagnoses, draw(diagnoses)) for title, text, draw in pictures),
+        _measures(diagnoses).html(),
+        section("Spectra of the actions", _SPECTRA, draw_spectra),
+        section("Where policy and value are steep", _STEEP, draw_steepness),
         *(_worst(one).html() for one in diagnoses),
-        _section("Neighbors", _NEIGHBORS, diagnoses, draw_neighborhoods(diagnoses)),
+        section("Neighbors", _NEIGHBORS, draw_neighborhoods),
         _unmoved(diagnoses).html(),
         *_terms(diagnoses),
         _rules().html(),
@@ -84,8 +101,9 @@ def page(diagnoses: Sequence[Diagnosis]) -> str:
 
 
 _EPISODE = (
-    "Words and pictures are of the first test episode of each policy with its mean actions. Red: "
-    "to mend; green: smooth."
+    "Words and pictures are of the first test episode of each policy with its mean actions; "
+    "numbers are means over all. Action variation, the paper's measure, is how much the action "
+    "changes from step to step. Red: to mend; green: smooth."
 )
 _ACTIONS = (
     "Mean actions of one test episode, and the shaded part of it close by: where they change most. "
@@ -111,12 +129,19 @@ _TERMS = (
 )
 
 
-def _card(one: Diagnosis) -> str:
+def _card(one: Diagnosis, most: float | None) -> str:
+    """Its numbers, with a bar for its share of the largest action variation, and its words."""
+    variation = one.measures["action_variation"]
+    bar = f"<span class=bar><i style='width:{variation / most:.1%}'></i></span>" if most else ""
+    glance = (
+        f"<div class=glance><div><b>{_number(one.measures['return'])}</b>return</div>"
+        f"<div><b>{_number(variation)}</b>action variation{bar}</div></div>"
+    )
     told = "".join(
         f"<p class='{'fault' if each.fault else each.kind}'>{html.escape(each.text)}</p>"
         for each in findings(one)
     )
-    return f"<div class=card><h3>{html.escape(one.name)}</h3>{told}</div>"
+    return f"<div class=card><h3>{html.escape(one.name)}</h3>{glance}{told}</div>"
 
 
 def _measures(diagnoses: Sequence[Diagnosis]) -> Table:
@@ -169,8 +194,7 @@ def _unmoved(diagnoses: Sequence[Diagnosis]) -> Table:
     rows = []
     for one in diagnoses:
         never = [name for name, share in zip(one.entries, one.unmoved, strict=True) if share == 1.0]
-        listed = ", ".join(never[:LISTED]) + (", ..." if len(never) > LISTED else "")
-        rows.append([one.name, f"{one.unmoved.mean():.1%}", listed or "none"])
+        rows.append([one.name, f"{one.unmoved.mean():.1%}", listed(never) or "none"])
     note = (
         "Such coordinates have no neighbors but their own value: nothing that is drawn from the "
         "box of a transition smooths a policy along them."
@@ -192,7 +216,9 @@ def _videos(diagnoses: Sequence[Diagnosis]) -> list[str]:
     for rate in dict.fromkeys(one.rate for one in diagnoses if one.pictures):
         shown = [one for one in diagnoses if one.pictures and one.rate == rate]
         source = inside(film(shown), "video/mp4")
-        parts.append(f'<p><video controls muted loop playsinline src="{source}"></video></p>')
+        parts.append(
+            f'<p><video controls autoplay muted loop playsinline src="{source}"></video></p>'
+        )
     without = [one.name for one in diagnoses if not one.pictures]
     if without:
         parts.append(f"<p>Without pictures: {html.escape(', '.join(without))}.</p>")
@@ -222,5 +248,4 @@ def _number(value: float) -> str:
 
 
 def _vector(values: Sequence[float]) -> str:
-    rest = ", ..." if len(values) > LISTED else ""
-    return "(" + ", ".join(f"{value:.3g}" for value in values[:LISTED]) + rest + ")"
+    return f"({listed([f'{value:.3g}' for value in values])})"

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchrl_l2c2.experiment.diagnosis.measured import Diagnosis
 from torchrl_l2c2.experiment.reports.figures import drawn, subplots
+from torchrl_l2c2.metrics import amplitude_spectrum
 
 WIDTH = 4.6  # inches, of every picture
 ZOOM = 60  # steps that are shown close by
@@ -27,7 +28,9 @@ def draw_actions(diagnoses: Sequence[Diagnosis]) -> list[bytes]:
 
 def draw_spectra(diagnoses: Sequence[Diagnosis]) -> list[bytes]:
     """Amplitudes of the frequencies that the actions are made of, as shares of their range."""
-    spectra = [spectrum(one.relative[:, busiest(one)], one.rate or 1.0) for one in diagnoses]
+    spectra = [
+        amplitude_spectrum(one.relative[:, busiest(one)], one.rate or 1.0) for one in diagnoses
+    ]
     top = max(float(amplitudes[1:].max()) for _, amplitudes in spectra) or 1.0
 
     return [
@@ -52,25 +55,6 @@ def draw_neighborhoods(diagnoses: Sequence[Diagnosis]) -> list[bytes]:
 def draw_shares(diagnoses: Sequence[Diagnosis]) -> list[bytes]:
     """Bars of how much of the loss, and of its gradient, every term is."""
     return [_draw(1, 0.9 + 0.32 * len(one.shares), _shares, one) for one in diagnoses]
-
-
-def spectrum(actions: Tensor, sampling_rate: float = 1.0) -> tuple[Tensor, Tensor]:
-    """Frequencies ``[F]`` and amplitudes ``[F, A]`` of actions ``[T, A]``, up to half the rate.
-
-    :func:`~torchrl_l2c2.metrics.amplitude_spectrum` and what is made of it leave the highest
-    frequency out, as published; an action that flips at every step has all of its amplitude there.
-
-    Examples:
-        >>> flipping = torch.tensor([[1.0], [-1.0], [1.0], [-1.0]])
-        >>> frequencies, amplitudes = spectrum(flipping, sampling_rate=20.0)
-        >>> frequencies.tolist(), amplitudes.squeeze(-1).tolist()
-        ([0.0, 5.0, 10.0], [0.0, 0.0, 1.0])
-    """
-    steps = len(actions)
-    amplitudes = 2.0 / steps * torch.fft.rfft(actions, dim=0).abs()
-    if steps % 2 == 0:
-        amplitudes[-1] /= 2.0  # It stands for one frequency, all others for two of opposite sign.
-    return torch.fft.rfftfreq(steps, 1.0 / sampling_rate), amplitudes
 
 
 def busiest(one: Diagnosis) -> list[int]:
@@ -211,6 +195,8 @@ def _shares(axes: Sequence[Any], one: Diagnosis) -> None:
     kinds = (("size", "of the loss's size", COLORS[0]), ("gradient", "gradient", COLORS[1]))
     for kind, label, color in kinds:
         values = [getattr(one.shares[name], kind) for name in names]
+        if all(map(math.isnan, values)):
+            continue
         height = 0.4 if kind == "size" else -0.4
         axis.barh(names, values, height, align="edge", label=label, color=color)
         for place, value in enumerate(values):

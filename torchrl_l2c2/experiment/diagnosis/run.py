@@ -19,14 +19,15 @@ from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 from torchrl.objectives import LossModule
 
 from torchrl_l2c2.experiment.algorithms.agent import Agent
+from torchrl_l2c2.experiment.algorithms.normalization import Normalization
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.diagnosis.measured import Diagnosis, TermShare, Value, diagnose
 from torchrl_l2c2.experiment.environments import TEST_SEED
-from torchrl_l2c2.experiment.evaluate import load_policy
 from torchrl_l2c2.experiment.export import entry_names
 from torchrl_l2c2.experiment.folder import load_newest
 from torchrl_l2c2.experiment.influence import gradient_shares
 from torchrl_l2c2.experiment.process import ProcessState
+from torchrl_l2c2.experiment.trained import load_policy
 from torchrl_l2c2.experiment.video import play_pictures
 from torchrl_l2c2.objectives.evaluation import VALUE_NETWORKS, Evaluation, is_ensemble
 
@@ -77,7 +78,7 @@ def diagnose_run(
             episodes=episodes,
             max_steps=max_steps,
             neighborhood=getattr(config.regularizer, "neighborhood", None),
-            value=None if agent is None else value_function(agent.loss),
+            value=None if agent is None else value_function(agent.loss, agent.normalization),
             noise_scale=noise or 0.01,
         )
         shares = _shares(folder, config, agent, env, max_steps)
@@ -88,11 +89,12 @@ def diagnose_run(
     return replace(found, shares=shares, entries=entries, pictures=pictures)
 
 
-def value_function(loss: LossModule) -> Value | None:
+def value_function(loss: LossModule, normalization: Normalization | None = None) -> Value | None:
     """The value function of a loss, all of its heads; ``None`` where it has none.
 
     Args:
         loss (LossModule): any that says what its networks read and write.
+        normalization (Normalization, optional): of the observations that it reads. Default: none.
 
     Returns:
         callable: observations ``[N, *F]`` and actions ``[N, *A]`` to values ``[N, M]``. State
@@ -106,6 +108,8 @@ def value_function(loss: LossModule) -> Value | None:
     dim = int(is_ensemble(loss, network))
 
     def value(observation: Tensor, action: Tensor) -> Tensor:
+        if normalization is not None:
+            observation = normalization.normalize(observation)
         batch = TensorDict({"observation": observation, "action": action}, observation.shape[:1])
         states = batch.select("observation").unsqueeze(0)
         _, there = evaluation.values_at(loss, network, batch, states)
@@ -121,7 +125,7 @@ def _trained(folder: Path, config: ExperimentConfig, env: EnvBase) -> Agent | No
     if newest is None:
         return None
     agent = replace(config, device="cpu").make_agent(env)
-    agent.loss.load_state_dict(newest[1]["loss"])
+    agent.load_networks(newest[1])
     return agent
 
 

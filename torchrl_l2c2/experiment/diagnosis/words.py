@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -100,9 +100,37 @@ def findings(diagnosis: Diagnosis) -> list[Finding]:
     if all(_still(diagnosis)):
         told = [_stillness(diagnosis)]
     else:
-        told = list(_actions(diagnosis)) or [_plain(diagnosis)]
+        told = list(_actions(diagnosis))
+        told = [*told, *_steepest(diagnosis)] if told else [_plain(diagnosis)]
         told += _reasons(diagnosis)
     return [*told, *_training(diagnosis)]
+
+
+def comparison(diagnoses: Sequence[Diagnosis]) -> list[str]:
+    """What is different about each policy, in a sentence, beside the first of them.
+
+    Args:
+        diagnoses (sequence of Diagnosis): of one task, at least one.
+    """
+    first, *others = diagnoses
+    return [_beside(first, other) for other in others]
+
+
+def _beside(first: Diagnosis, other: Diagnosis) -> str:
+    (before, old), (now, new) = (
+        (one.measures["action_variation"], one.measures["return"]) for one in (first, other)
+    )
+    ratio = now / before if before > 0.0 else math.inf if now > 0.0 else 1.0
+    if ratio > 2.0:
+        change = f"{ratio:.2g} times as much from step to step as"
+    else:
+        more = "less" if ratio < 1.0 else "more"
+        change = f"{abs(ratio - 1):.0%} {more} from step to step than"
+    return (
+        f"{other.name} changes its action {change} {first.name} ({now:.3g}, {before:.3g}), and its "
+        f"return is {'higher' if new > old else 'lower' if new < old else 'the same'} "
+        f"({new:.4g}, {old:.4g})."
+    )
 
 
 def _still(diagnosis: Diagnosis) -> list[bool]:
@@ -171,6 +199,21 @@ def _flips(name: str, action: Tensor, gain: float, rate: float | None) -> Findin
         f"before is {gain:.2f} and it turns back at {back.mean():.0%} of the steps, by "
         f"{_change(action):.1%} of its range in the mean; {_where(back * change[1:].abs())}.",
     )
+
+
+def _steepest(diagnosis: Diagnosis) -> Iterator[Finding]:
+    """Where among the observations."""
+    for step in diagnosis.worst(1):
+        values = diagnosis.observations[step].tolist()
+        seen = [f"{e} = {v:.2g}" for e, v in zip(diagnosis.entries, values, strict=True)]
+        constants = diagnosis.policy_lipschitz
+        yield Finding(
+            "steepest",
+            f"It is steepest at step {step}, where it observes {listed(seen)}: its local Lipschitz "
+            f"constant is {constants[step]:.3g} there and {constants.nanmedian():.3g} in the "
+            "median.",
+            fault=False,
+        )
 
 
 def _reasons(diagnosis: Diagnosis) -> Iterator[Finding]:
@@ -259,3 +302,13 @@ def _where(amount: Tensor) -> str:
         return "throughout the episode"
     start = most * length
     return f"{share:.0%} of it in steps {start} to {min(start + length, len(amount)) - 1}"
+
+
+def listed(texts: Sequence[str], most: int = 8) -> str:
+    """The first of them, with commas.
+
+    Examples:
+        >>> listed(["a", "b", "c"], most=2)
+        'a, b, ...'
+    """
+    return ", ".join([*texts[:most], *(["..."] if len(texts) > most else [])])

@@ -21,11 +21,13 @@ MEASURES = {
     "sm_asap": "Sm (ASAP)",
     "previous_action_gain": "gain on the action before",
     "saturation": "at the bounds",
+    "noise_sensitivity": "sensitivity to noise",
 }
 LEGEND = (
     "Means over the test episodes of the last policy with its mean actions, over seeds; standard "
     "deviations over seeds in brackets. Definitions and units: torchrl_l2c2.metrics, at one action "
-    "per unit of time. Sm (ASAP) grows with the length of the episodes."
+    "per unit of time. Sm (ASAP) grows with the length of the episodes; sensitivity is to noise of "
+    ".01."
 )
 
 

@@ -1,0 +1,108 @@
+"""Rows about playing."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable
+from functools import partial
+
+import gymnasium
+import torch
+from torchrl.envs import ExplorationType, set_exploration_type
+
+from benchmarks.setups import Effort
+from benchmarks.timing import Row, alternate
+from torchrl_l2c2.experiment import (
+    PAPER_TASKS,
+    EpisodeCollector,
+    MultiEpisodeCollector,
+    TaskConfig,
+    make_env,
+)
+from torchrl_l2c2.experiment.environments import quiet_output
+from torchrl_l2c2.modules import make_actor
+
+
+def collection_rows(effort: Effort) -> Iterable[Row]:
+    """Frames with noise, stored as batches, against the simulator's with the same policy."""
+    for name, task in PAPER_TASKS.items():
+        task = dataclasses.replace(task, max_steps=min(task.max_steps, effort.steps))
+        env = make_env(task, seed=0)
+        actor = make_actor(env.observation_spec["observation"].shape[-1], env.action_spec)
+        collector = EpisodeCollector(
+            env,
+            actor,
+            frames_per_batch=min(250, effort.steps),
+            stop_at_done=False,
+            compile_policy=effort.compile,
+        )
+        times = alternate(
+            {
+                "collector": lambda collector=collector: collector.rollout().numel(),
+                "simulator": _simulation(task, collector),
+            },
+            repeats=2 * effort.rounds,
+        )
+        fps = {what: 1.0 / seconds for what, seconds in times.items()}
+        collector.shutdown()
+        yield Row(
+            "collection",
+            f"collected frames / simulated frames, {name}",
+            fps["collector"] / fps["simulator"],
+            at_least=0.6,
+            parts={"collected frames/s": fps["collector"], "simulated frames/s": fps["simulator"]},
+        )
+
+
+def worker_rows(effort: Effort) -> Iterable[Row]:
+    """Episodes of two processes at once, against one after another in this process."""
+    for name in ("swingup", "ant"):
+        task = dataclasses.replace(PAPER_TASKS[name], max_steps=min(1000, effort.steps))
+        env = make_env(task, seed=0)
+        actor = make_actor(env.observation_spec["observation"].shape[-1], env.action_spec)
+        one = EpisodeCollector(
+            env, actor, frames_per_batch=task.max_steps, compile_policy=effort.compile
+        )
+        two = MultiEpisodeCollector(
+            partial(make_env, task, 0),
+            actor,
+            num_workers=2,
+            max_steps=task.max_steps,
+            compile_policy=effort.compile,
+        )
+        times = alternate(
+            {
+                "one": lambda one=one: one.rollout().numel(),
+                "two": lambda two=two: sum(episode.numel() for episode in two.rollout()),
+            },
+            repeats=effort.rounds,
+        )
+        fps = {what: 1.0 / seconds for what, seconds in times.items()}
+        one.shutdown()
+        two.shutdown()
+        yield Row(
+            "workers",
+            f"frames of num_workers=2 / frames of num_workers=1, {name}",
+            fps["two"] / fps["one"],
+            parts={"two frames/s": fps["two"], "one frames/s": fps["one"]},
+        )
+
+
+def _simulation(task: TaskConfig, collector: EpisodeCollector) -> Callable[[], int]:
+    """As many frames as the collector's batch has, by the collector's own compiled policy."""
+    with quiet_output():
+        simulator = gymnasium.make(task.env_id, max_episode_steps=task.max_steps)
+        observation, _ = simulator.reset()
+
+    @torch.no_grad()
+    def simulate() -> int:
+        nonlocal observation
+        with set_exploration_type(ExplorationType.RANDOM):
+            for _ in range(collector.frames_per_batch):
+                acted = collector.act(torch.as_tensor(observation, dtype=torch.float32))
+                observation, _, terminated, truncated, _ = simulator.step(acted.numpy())
+                if terminated or truncated:
+                    observation, _ = simulator.reset()
+        return collector.frames_per_batch
+
+    return simulate

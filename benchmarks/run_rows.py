@@ -1,0 +1,182 @@
+"""Rows about a whole run, from its start on, and about several at once."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterable
+from functools import partial
+from pathlib import Path
+from statistics import median
+
+import torch
+
+from benchmarks.setups import Effort, paper_config, play_episode
+from benchmarks.timing import Row, alternate
+from torchrl_l2c2.experiment import Experiment
+from torchrl_l2c2.experiment.folder import MetricsLog
+
+ROOT = Path(__file__).parent.parent
+
+
+def run_rows(effort: Effort) -> Iterable[Row]:
+    """A whole run of the paper's experiment, in frames, against what it is made of."""
+    with tempfile.TemporaryDirectory() as folder:
+        config = paper_config(effort)
+        run, parts = Experiment(config, folder), Experiment(config, Path(folder) / "parts")
+        parts_episode = play_episode(parts)
+        parts_episode()
+        learner, row = parts.learner.update, parts.metrics[-1]
+        log = MetricsLog(Path(folder) / "parts")
+        draw = learner.draw()
+        priority = torch.rand(len(draw.rows))
+        episode = parts.player.collector.rollout()
+        frames = config.task.max_steps
+        summed = {
+            "collect": lambda: parts.player.collector.rollout().numel(),
+            "store": lambda: parts.learner.remember(episode) or frames,
+            "learn": partial(_repeat, lambda: learner(True), frames),
+            "log": lambda: log.write(row) or frames,
+            "checkpoint": lambda: parts.save() and frames,
+        }
+        # What learning is made of: shown, but a loop of one of them alone flatters it.
+        detail = {
+            "draw": partial(_repeat, learner.draw, frames),
+            "update": partial(_repeat, lambda: learner.update(True, *draw), frames),
+            "prioritize": partial(_repeat, lambda: learner.prioritize(draw.rows, priority), frames),
+        }
+        times = alternate(
+            {"run": play_episode(run), **summed, **detail}, repeats=max(1, effort.rounds // 3)
+        )
+    yield Row(
+        "run",
+        "whole Swingup run / sum of its parts, per frame",
+        times["run"] / sum(times[name] for name in summed),
+        at_most=1.15,
+        parts={f"{name} us": 1e6 * seconds for name, seconds in times.items()},
+    )
+    yield Row(
+        "run",
+        "drawing rows and setting priorities / update",
+        (times["draw"] + times["prioritize"]) / times["update"],
+        at_most=0.15,
+        parts={f"{name} us": 1e6 * times[name] for name in detail},
+    )
+
+
+def start_rows(effort: Effort) -> Iterable[Row]:
+    """How long a run waits for its first update, where one like it was compiled before."""
+    command = [sys.executable, "-c", START, "" if effort.compile else "--quick"]
+
+    def seconds() -> float:
+        done = subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT)
+        return float(done.stdout.splitlines()[-1])
+
+    first, later = seconds(), median(seconds() for _ in range(max(1, effort.rounds // 5)))
+    yield Row(
+        "start",
+        "second run, from having imported torch to the first update",
+        later,
+        unit="s",
+        at_most=8.0,
+        # What was compiled on this machine before helps it, too.
+        parts={"first run s": first, "second run s": later},
+    )
+
+
+START = """
+import sys, time
+import torch
+start = time.perf_counter()
+from benchmarks.setups import QUICK, Effort, paper_config
+from torchrl_l2c2.experiment import Experiment
+experiment = Experiment(paper_config(QUICK if sys.argv[1] else Effort(steps=100)))
+experiment.learner.remember(experiment.player.collector.rollout())
+experiment.learner.update(True)
+print(time.perf_counter() - start)
+"""
+
+
+def process_rows(effort: Effort) -> Iterable[Row]:
+    """What the second core gives to a second run."""
+    command = [sys.executable, "-m", "benchmarks.speed", "--worker"]
+    command += [] if effort.compile else ["--quick"]
+    pipe = subprocess.PIPE
+    # One after the other: the second finds what the first has compiled.
+    workers = []
+    for _ in range(2):
+        worker = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, cwd=ROOT)
+        worker.stdout.readline()
+        workers.append(worker)
+
+    def play(*chosen: subprocess.Popen) -> int:
+        for worker in chosen:
+            print("go", file=worker.stdin, flush=True)
+        return sum(int(worker.stdout.readline()) for worker in chosen)
+
+    times = alternate(
+        {
+            "one": lambda: play(workers[0]) + play(workers[1]),
+            "two": lambda: play(*workers),
+        },
+        repeats=max(1, effort.rounds // 3),
+    )
+    for worker in workers:
+        worker.communicate()
+    yield Row(
+        "processes",
+        "two runs side by side / one, frames/s",
+        times["one"] / times["two"],
+        at_least=1.8,
+        parts={"one frames/s": 1.0 / times["one"], "two frames/s": 1.0 / times["two"]},
+    )
+
+
+def work(effort: Effort) -> None:
+    """What a process of ``process_rows`` does: an episode for every line that it is sent."""
+    play = play_episode(Experiment(paper_config(effort)))
+    play()
+    print("ready", flush=True)
+    for _ in sys.stdin:
+        print(play(), flush=True)
+
+
+def import_rows(effort: Effort) -> Iterable[Row]:
+    """What importing this package adds to importing TorchRL."""
+    # The parts of TorchRL that the package builds on; `import torchrl` alone loads them late.
+    parts_of_torchrl = "torchrl.data, torchrl.envs, torchrl.modules, torchrl.objectives"
+    statements = {
+        "import torchrl_l2c2 s": ("import torchrl", "import torchrl_l2c2"),
+        "every name of it beyond those of torchrl s": (
+            f"import {parts_of_torchrl}",
+            "from torchrl_l2c2 import *",
+        ),
+    }
+    parts = {
+        name: median(_import_seconds(*pair) for _ in range(max(1, effort.rounds // 3)))
+        for name, pair in statements.items()
+    }
+    yield Row(
+        "import",
+        "import torchrl_l2c2 beyond import torchrl",
+        parts["import torchrl_l2c2 s"],
+        unit="s",
+        at_most=0.2,
+        parts=parts,
+    )
+
+
+def _import_seconds(before: str, statement: str) -> float:
+    code = (
+        f"import time; {before}; start = time.perf_counter()\n"
+        f"{statement}; print(time.perf_counter() - start)"
+    )
+    command = [sys.executable, "-c", code]
+    return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+
+
+def _repeat(action: Callable[[], object], times: int) -> int:
+    for _ in range(times):
+        action()
+    return times

@@ -1,0 +1,125 @@
+"""What the rows measure: runs, episodes and updates of the paper's agent."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from torchrl_l2c2.experiment import (
+    Experiment,
+    ExperimentConfig,
+    L2C2Config,
+    NoRegularizerConfig,
+    PPORPEConfig,
+    PrioritizedReplayConfig,
+    TaskConfig,
+)
+from torchrl_l2c2.experiment.update import ReplayUpdate, make_update
+from torchrl_l2c2.updaters import TSoftUpdate
+
+REGULARIZERS = {
+    "vanilla": NoRegularizerConfig(),
+    "l2c2": L2C2Config(),
+    "quarter": L2C2Config(fraction=0.25),
+}
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How long to measure, whether anything is compiled, and the interpreter of the peers."""
+
+    rounds: int = 15
+    steps: int = 1000
+    compile: bool = True
+    peer_python: str = sys.executable
+
+
+# Shows that everything runs; its numbers say nothing.
+QUICK = Effort(rounds=1, steps=60, compile=False)
+
+
+def paper_config(effort: Effort) -> ExperimentConfig:
+    """The paper's L2C2 on Swingup with one update a frame, for as long as one asks."""
+    return ExperimentConfig(
+        task=TaskConfig(max_steps=effort.steps, episodes=1),
+        algorithm=PPORPEConfig(updates=effort.steps),
+        compile=effort.compile,
+        late_share=0.0,  # A test episode is not training.
+    )
+
+
+def play_episode(experiment: Experiment) -> Callable[[], int]:
+    """Training of one more episode, as a function; returns its frames."""
+
+    def play() -> int:
+        before = experiment.player.frames
+        experiment.train(len(experiment.metrics) + 1)
+        return experiment.player.frames - before
+
+    return play
+
+
+def updates(
+    effort: Effort, size: int, regularizer: str, compile: bool, device: str = "cpu"
+) -> Callable[[], Tensor]:
+    """Updates of a new agent with one batch."""
+    config = dataclasses.replace(
+        paper_config(effort),
+        regularizer=REGULARIZERS[regularizer],
+        replay=PrioritizedReplayConfig(capacity=max(10_000, size), batch_size=size),
+        compile=False,
+    )
+    experiment = Experiment(config)
+    learner, agent = experiment.learner, experiment.agent
+    learner.remember(experiment.player.collector.rollout())
+    if device == "cpu":
+        update = ReplayUpdate(agent, learner.replay, compile=compile)
+        draw = update.draw()
+        return lambda: update.update(True, *draw)
+    agent.loss.to(device)
+    agent.optimizer = config.optimizer.make(agent.loss.parameters())
+    agent.target_updater = TSoftUpdate(agent.loss)
+    step = make_update(agent, compile=False)
+    if compile:
+        torch._dynamo.config.trace_autograd_ops = True
+        step = torch.compile(step, fullgraph=True, mode="reduce-overhead")
+    batch = learner.replay.sample().to(device)
+    return lambda: step(True, batch)
+
+
+def matrix_products(update: Callable[[], object]) -> partial[None]:
+    """The matrix products that an eager update makes, forward and backward, and nothing else."""
+    with _Recorder() as recorder:
+        update()
+    products = [
+        (left, right, torch.empty(*left.shape[:-1], right.shape[-1]))
+        for left, right in recorder.factors
+    ]
+    return partial(_multiply, products)
+
+
+@torch.no_grad()
+def _multiply(products: list[tuple[Tensor, Tensor, Tensor]]) -> None:
+    for left, right, out in products:
+        torch.matmul(left, right, out=out)
+
+
+class _Recorder(TorchDispatchMode):
+    """Keeps the factors of every matrix product, with the strides that they had."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.factors: list[tuple[Tensor, Tensor]] = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        aten = torch.ops.aten
+        if func.overloadpacket in (aten.mm, aten.bmm, aten.addmm, aten.baddbmm):
+            self.factors.append(tuple(factor.detach().clone() for factor in args[-2:]))
+        return func(*args, **(kwargs or {}))

@@ -1,0 +1,126 @@
+"""Rows about one update."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from functools import partial
+
+import torch
+
+from benchmarks.setups import REGULARIZERS, Effort, matrix_products, updates
+from benchmarks.timing import Row, alternate
+from torchrl_l2c2.experiment import (
+    Experiment,
+    ExperimentConfig,
+    NoRegularizerConfig,
+    PPOConfig,
+    TaskConfig,
+)
+from torchrl_l2c2.experiment.update import ReplayUpdate
+
+
+def update_rows(effort: Effort) -> Iterable[Row]:
+    """The update of the paper's agent at its batch size, against three others."""
+    small = partial(updates, effort, 32)
+    l2c2 = small("l2c2", effort.compile)
+    times = alternate(
+        {
+            "l2c2": l2c2,
+            "vanilla": small("vanilla", effort.compile),
+            "eager": small("l2c2", False),
+            "products": matrix_products(small("l2c2", False)),
+        },
+        repeats=effort.rounds,
+        calls=20,
+        warm_up=5,
+    )
+    us = {name: 1e6 * seconds for name, seconds in times.items()}
+    yield Row(
+        "update",
+        "eager update / compiled update, batch 32",
+        us["eager"] / us["l2c2"],
+        at_least=4.0,
+        parts={"eager us": us["eager"], "compiled us": us["l2c2"]},
+    )
+    yield _smoothing_row("update", 32, us, 1.2)
+    yield Row(
+        "update",
+        "compiled update / its matrix products alone, batch 32",
+        us["l2c2"] / us["products"],
+        at_most=3.0,
+        parts={"compiled us": us["l2c2"], "products us": us["products"]},
+    )
+
+
+def ppo_update_rows(effort: Effort) -> Iterable[Row]:
+    """PPO's update at batch 64, two layers of 64."""
+    config = ExperimentConfig(
+        task=TaskConfig(max_steps=effort.steps, episodes=1),
+        algorithm=PPOConfig(),
+        regularizer=NoRegularizerConfig(),
+        compile=False,
+    )
+    actions = {}
+    for name, compile in {"eager": False, "compiled": effort.compile}.items():
+        experiment = Experiment(config)
+        experiment.learner.remember(experiment.player.collector.rollout())
+        update = ReplayUpdate(experiment.agent, experiment.learner.replay, compile=compile)
+        draw = update.draw()
+        actions[name] = partial(update.update, True, *draw)
+    times = alternate(actions, repeats=effort.rounds, calls=20, warm_up=5)
+    us = {f"{name} us": 1e6 * seconds for name, seconds in times.items()}
+    yield Row(
+        "ppo_update",
+        "eager PPO update / compiled PPO update, batch 64",
+        us["eager us"] / us["compiled us"],
+        at_least=3.0,
+        parts=us,
+    )
+
+
+def large_update_rows(effort: Effort) -> Iterable[Row]:
+    """The price of the regularization where arithmetic, and no call's overhead, is what counts."""
+    actions = {name: updates(effort, 4096, name, effort.compile) for name in REGULARIZERS}
+    times = alternate(actions, repeats=effort.rounds, calls=2)
+    us = {name: 1e6 * seconds for name, seconds in times.items()}
+    yield _smoothing_row("update_4096", 4096, us, 1.9)
+    yield Row(
+        "update_4096",
+        "L2C2 update with fraction .25 / vanilla update, batch 4096",
+        us["quarter"] / us["vanilla"],
+        at_most=1.3,
+        parts={"l2c2 us": us["quarter"], "vanilla us": us["vanilla"]},
+    )
+
+
+def _smoothing_row(group: str, size: int, us: dict[str, float], at_most: float) -> Row:
+    return Row(
+        group,
+        f"L2C2 update / vanilla update, batch {size}",
+        us["l2c2"] / us["vanilla"],
+        at_most=at_most,
+        parts={"l2c2 us": us["l2c2"], "vanilla us": us["vanilla"]},
+    )
+
+
+def cuda_rows(effort: Effort) -> Iterable[Row]:
+    """The update on a CUDA device: eager, and compiled into CUDA graphs."""
+    for size in (32, 1024, 16384):
+        name = f"eager update / compiled update with CUDA graphs, batch {size}"
+        if not torch.cuda.is_available():
+            yield Row("cuda", name, note="not measured: no CUDA device")
+            continue
+        actions = {
+            "eager": updates(effort, size, "l2c2", False, "cuda"),
+            "graphs": updates(effort, size, "l2c2", effort.compile, "cuda"),
+        }
+        waiting = {what: partial(_synchronized, action) for what, action in actions.items()}
+        times = alternate(waiting, repeats=effort.rounds, warm_up=5)
+        us = {f"{what} us": 1e6 * seconds / 20 for what, seconds in times.items()}
+        yield Row("cuda", name, us["eager us"] / us["graphs us"], parts=us)
+
+
+def _synchronized(action: Callable[[], object]) -> None:
+    for _ in range(20):
+        action()
+    torch.cuda.synchronize()

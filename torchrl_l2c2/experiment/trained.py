@@ -1,0 +1,81 @@
+"""What a run has trained, from its folder alone."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from tensordict.nn import TensorDictModule
+from torchrl.envs import EnvBase
+
+from torchrl_l2c2.experiment.config import ExperimentConfig
+from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
+from torchrl_l2c2.experiment.folder import load_newest
+
+
+def load_policy(
+    folder: str | Path,
+    *,
+    seed: int | None = None,
+    noise_scale: float | None = None,
+    best: bool = False,
+    render: bool = False,
+) -> tuple[TensorDictModule, EnvBase, int]:
+    """A run's acting policy and a fresh environment of its task, from its folder alone.
+
+    The policy is a TorchRL actor: it reads ``"observation"`` and writes ``"action"``, the mean
+    under ``set_exploration_type(ExplorationType.DETERMINISTIC)`` and a sample otherwise.
+
+    Args:
+        folder (str or Path): of a run, finished or not.
+
+    Keyword Args:
+        seed (int, optional): of the environment and its noise. Default: that of the run's test.
+        noise_scale (float, optional): of the environment's noise; larger values are harder.
+            Default: the task's.
+        best (bool): whether to take the best policy of the tests during training, where
+            ``evaluate_every`` had some, instead of the last. Default ``False``.
+        render (bool): whether the simulator draws pictures, as for
+            :func:`~.environments.make_env`. Default ``False``.
+
+    Returns:
+        The policy, the environment and the longest episode.
+
+    Raises:
+        FileNotFoundError: the folder is not a run's, or holds no such policy nor a checkpoint.
+        CheckpointError: its checkpoints are damaged.
+        SettingError: a scale of noise below zero.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_l2c2.experiment import Experiment, ExperimentConfig, TaskConfig
+        >>> task = TaskConfig("pendulum", "Pendulum-v1", episodes=1, max_steps=20)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     experiment = Experiment(ExperimentConfig(task=task, compile=False), folder)
+        ...     _ = experiment.train()
+        ...     policy, env, max_steps = load_policy(folder, seed=1)
+        ...     experiment.close()
+        >>> env.rollout(max_steps, policy)["action"].shape
+        torch.Size([20, 1])
+    """
+    folder = Path(folder)
+    if not (folder / "config.json").exists():
+        raise FileNotFoundError(f"{str(folder)!r} is not the folder of a run: no config.json.")
+    config = ExperimentConfig.from_dict(json.loads((folder / "config.json").read_text()))
+    config = replace(config, device="cpu")
+    noise = config.task.noise_scale if noise_scale is None else noise_scale
+    task = replace(config.task, noise_scale=noise)
+    env = make_env(task, config.seed + TEST_SEED if seed is None else seed, render=render)
+    agent = config.make_agent(env)
+    saved = folder / ("policy_best.pt" if best else "policy.pt")
+    if saved.exists():
+        agent.policy.load_state_dict(torch.load(saved, weights_only=True))
+    elif best:
+        raise FileNotFoundError(f"{str(saved)!r} does not exist; evaluate_every=N makes it.")
+    elif newest := load_newest(folder):
+        agent.load_networks(newest[1])
+    else:
+        raise FileNotFoundError(f"{str(folder)!r} holds neither policy.pt nor a checkpoint yet.")
+    return agent.policy, env, config.task.time_limit
