@@ -29,6 +29,7 @@ def update_rows(effort: Effort) -> Iterable[Row]:
             "vanilla": small("vanilla", effort.compile),
             "eager": small("l2c2", False),
             "products": matrix_products(small("l2c2", False)),
+            "vanilla products": matrix_products(small("vanilla", False)),
         },
         repeats=effort.rounds,
         calls=20,
@@ -42,7 +43,10 @@ def update_rows(effort: Effort) -> Iterable[Row]:
         at_least=4.0,
         parts={"eager us": us["eager"], "compiled us": us["l2c2"]},
     )
-    yield _smoothing_row("update", 32, us, 1.2)
+    row = _smoothing_row("update", 32, us, 1.2)
+    row.parts["l2c2's products us"] = us["products"]
+    row.parts["vanilla's products us"] = us["vanilla products"]
+    yield row
     yield Row(
         "update",
         "compiled update / its matrix products alone, batch 32",
