@@ -32,6 +32,15 @@ def sac_here(settings: Settings) -> Callable[[], object]:
     return _train_here(settings, algorithm, replay)
 
 
+def paper_here(settings: Settings) -> Callable[[], object]:
+    """The paper's algorithm with L2C2: one update a frame on average, prioritized replay."""
+    from torchrl_l2c2.experiment import L2C2Config, PPORPEConfig, PrioritizedReplayConfig
+
+    algorithm = PPORPEConfig(hidden=tuple(settings["layers"]), updates=settings["frames"])
+    replay = PrioritizedReplayConfig(capacity=10_000, batch_size=settings["batch"])
+    return _train_here(settings, algorithm, replay, L2C2Config())
+
+
 def ppo_here(settings: Settings) -> Callable[[], object]:
     """This package's PPO: ten passes over every turn's frames, no regularizer."""
     from torchrl_l2c2.experiment import PPOConfig, RolloutReplayConfig
@@ -40,7 +49,9 @@ def ppo_here(settings: Settings) -> Callable[[], object]:
     return _train_here(settings, algorithm, RolloutReplayConfig(batch_size=settings["batch"]))
 
 
-def _train_here(settings: Settings, algorithm: Any, replay: Any) -> Callable[[], object]:
+def _train_here(
+    settings: Settings, algorithm: Any, replay: Any, regularizer: Any = None
+) -> Callable[[], object]:
     from torchrl_l2c2.experiment import (
         Experiment,
         ExperimentConfig,
@@ -58,7 +69,7 @@ def _train_here(settings: Settings, algorithm: Any, replay: Any) -> Callable[[],
             task=task,
             algorithm=algorithm,
             replay=replay,
-            regularizer=NoRegularizerConfig(),
+            regularizer=regularizer or NoRegularizerConfig(),
             compile=settings["compile"],
             late_share=0.0,  # The peers play no test episodes.
         )
@@ -77,6 +88,15 @@ def sac_sbx(settings: Settings) -> Callable[[], object]:
     from sbx import SAC
 
     return _learn(settings, SAC, _off_policy(settings))
+
+
+def sac_sb3(settings: Settings) -> Callable[[], object]:
+    """The SAC of Stable-Baselines3."""
+    import torch
+    from stable_baselines3 import SAC
+
+    torch.set_num_threads(1)
+    return _learn(settings, SAC, {**_off_policy(settings), "device": "cpu"})
 
 
 def ppo_sb3(settings: Settings) -> Callable[[], object]:
@@ -110,7 +130,14 @@ def _learn(settings: Settings, kind: Any, options: Settings) -> Callable[[], obj
     return lambda: model.learn(settings["turn"], reset_num_timesteps=False, log_interval=None)
 
 
-PEERS = {"sac": sac_here, "ppo": ppo_here, "sbx sac": sac_sbx, "sb3 ppo": ppo_sb3}
+PEERS = {
+    "sac": sac_here,
+    "ppo": ppo_here,
+    "paper": paper_here,
+    "sbx sac": sac_sbx,
+    "sb3 sac": sac_sb3,
+    "sb3 ppo": ppo_sb3,
+}
 
 
 def main(name: str, settings: str) -> None:

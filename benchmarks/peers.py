@@ -10,10 +10,34 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from benchmarks.setups import Effort
 from benchmarks.timing import Row
+from torchrl_l2c2.experiment import PAPER_TASKS
 
 HERE = Path(__file__).parent
 CLOCKS = ("wall", "CPU")
+
+
+def peer_rows(effort: Effort) -> Iterable[Row]:
+    """Whole training by other libraries, on the same task, networks and batches."""
+    steps = min(512, effort.steps)
+    settings = {
+        "env_id": PAPER_TASKS["swingup"].env_id,
+        "frames": steps,
+        "turn": 4 * steps,
+        "compile": effort.compile,
+    }
+    how = {"rounds": max(1, effort.rounds // 3), "python": effort.peer_python}
+    for layer, batch in ((100, 32), (256, 256)):
+        same = {**settings, "layers": [layer, layer], "batch": batch}
+        what = f"SAC here / SBX SAC, layers of {layer}, batch {batch}"
+        yield from against(what, "sac", "sbx sac", same, at_most=0.9, **how)
+    same = {**settings, "layers": [100, 100], "batch": 32}
+    what = "L2C2 here / Stable-Baselines3 SAC without it, layers of 100, batch 32"
+    yield from against(what, "paper", "sb3 sac", same, at_most=0.25, **how)
+    same = {**settings, "layers": [64, 64], "batch": 64}
+    what = "PPO here / Stable-Baselines3 PPO, layers of 64, batch 64"
+    yield from against(what, "ppo", "sb3 ppo", same, at_most=0.4, **how)
 
 
 class Peer:

@@ -24,7 +24,7 @@ import torch
 from tqdm import tqdm
 
 from benchmarks.collection_rows import collection_rows, worker_rows
-from benchmarks.library_rows import baseline_rows, peer_rows
+from benchmarks.peers import peer_rows
 from benchmarks.run_rows import import_rows, process_rows, run_rows, start_rows, work
 from benchmarks.setups import QUICK, Effort
 from benchmarks.timing import Row, machine, to_markdown, to_text
@@ -40,7 +40,6 @@ ROWS: dict[str, Callable[[Effort], Iterable[Row]]] = {
     "workers": worker_rows,
     "run": run_rows,
     "start": start_rows,
-    "sb3": baseline_rows,
     "peers": peer_rows,
     "processes": process_rows,
     "cuda": cuda_rows,

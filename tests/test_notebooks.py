@@ -23,12 +23,16 @@ def outputs(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
     return [output for cell in notebook.cells for output in cell.get("outputs", [])]
 
 
-def run(notebook: nbformat.NotebookNode, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In a fresh kernel; an error of a cell is one here."""
+def run(notebook: nbformat.NotebookNode, monkeypatch: pytest.MonkeyPatch, timeout: float) -> None:
+    """In a fresh kernel, so many seconds a cell at most; an error of a cell is one here."""
     # A backend chosen outside would keep the pictures out of the notebook.
     monkeypatch.delenv("MPLBACKEND", raising=False)
     folder = {"metadata": {"path": str(FOLDER)}}
-    NotebookClient(notebook, timeout=900, kernel_name="python3", resources=folder).execute()
+    client = NotebookClient(notebook, timeout=timeout, kernel_name="python3", resources=folder)
+    # Nobody looks at the widgets, and answering them now and then leaves the client waiting for a
+    # kernel that has long finished.
+    client.comm_open_handlers = {}
+    client.execute()
 
 
 def pictures(cell: nbformat.NotebookNode) -> int:
@@ -54,7 +58,7 @@ def test_what_has_sliders_is_a_picture_first(
     """In the short form: of cells that say so, the source in their metadata."""
     for cell in notebook.cells:
         cell.source = cell.metadata.get("short", cell.source)
-    run(notebook, monkeypatch)
+    run(notebook, monkeypatch, timeout=120)
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
     with_sliders = [n for n, cell in enumerate(code) if "interact(" in cell.source][1:]
     assert with_sliders and all(pictures(code[n - 1]) for n in with_sliders)
@@ -63,5 +67,5 @@ def test_what_has_sliders_is_a_picture_first(
 @pytest.mark.slow
 def test_runs_and_draws(notebook: nbformat.NotebookNode, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every cell as it stands, without an error, and pictures come out."""
-    run(notebook, monkeypatch)
+    run(notebook, monkeypatch, timeout=900)
     assert sum(map(pictures, notebook.cells)) >= 3
