@@ -323,7 +323,7 @@ def test_scale_per_coordinate():
     clean = GymEnv("Pendulum-v1").observation_spec["observation"].space
     assert (rollout[:, 0].abs() <= clean.high[0]).all()
     radius = rollout[:, 0].square() + rollout[:, 1].square()  # cos^2 + sin^2
-    assert (radius - 1).abs().min() > 1e-4
+    assert (radius - 1).abs().median() > 1e-2  # One of them may be there by chance.
     silent = noisy(scale=0.0).rollout(10)["next", "observation"]
     torch.testing.assert_close(silent[:, :2].square().sum(-1), torch.ones(10))
 
