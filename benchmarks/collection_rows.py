@@ -8,6 +8,7 @@ from functools import partial
 
 import gymnasium
 import torch
+from torch import Tensor
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from benchmarks.setups import Effort
@@ -19,6 +20,7 @@ from torchrl_l2c2.experiment import (
     TaskConfig,
     make_env,
 )
+from torchrl_l2c2.experiment.collection import on_tensors
 from torchrl_l2c2.experiment.environments import quiet_output
 from torchrl_l2c2.modules import make_actor
 
@@ -39,7 +41,9 @@ def collection_rows(effort: Effort) -> Iterable[Row]:
         times = alternate(
             {
                 "collector": lambda collector=collector: collector.rollout().numel(),
-                "simulator": _simulation(task, collector),
+                "simulator": _simulation(
+                    task, on_tensors(actor, ["action"], effort.compile), collector.frames_per_batch
+                ),
             },
             repeats=2 * effort.rounds,
         )
@@ -88,8 +92,10 @@ def worker_rows(effort: Effort) -> Iterable[Row]:
         )
 
 
-def _simulation(task: TaskConfig, collector: EpisodeCollector) -> Callable[[], int]:
-    """As many frames as the collector's batch has, by the collector's own compiled policy."""
+def _simulation(
+    task: TaskConfig, act: Callable[[Tensor], tuple[Tensor, ...]], frames: int
+) -> Callable[[], int]:
+    """So many frames by a policy, of which nothing is kept."""
     with quiet_output():
         simulator = gymnasium.make(task.env_id, max_episode_steps=task.max_steps)
         observation, _ = simulator.reset()
@@ -98,11 +104,11 @@ def _simulation(task: TaskConfig, collector: EpisodeCollector) -> Callable[[], i
     def simulate() -> int:
         nonlocal observation
         with set_exploration_type(ExplorationType.RANDOM):
-            for _ in range(collector.frames_per_batch):
-                acted = collector.act(torch.as_tensor(observation, dtype=torch.float32))
+            for _ in range(frames):
+                (acted,) = act(torch.as_tensor(observation, dtype=torch.float32))
                 observation, _, terminated, truncated, _ = simulator.step(acted.numpy())
                 if terminated or truncated:
                     observation, _ = simulator.reset()
-        return collector.frames_per_batch
+        return frames
 
     return simulate

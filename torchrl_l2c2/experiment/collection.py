@@ -36,10 +36,10 @@ class EpisodeCollector(Collector):
 
     It gives the batches that the collector gives, to the bit, but for the ``collector`` entry.
     What it leaves out is the work around every step: specs, nested TensorDicts and their copies.
-    An episode's frames are stacked once. That is for a ``GymEnv`` or
-    ``GymWrapper``, also one transformed by :class:`ObservationNoise`; environments with other
-    transforms, and several at once, are played by TorchRL's own loop, at its pace, with the policy
-    as it is, and a state of theirs cannot be saved.
+    An episode's frames are stacked once. That is for a ``GymEnv`` or ``GymWrapper``, also one
+    transformed by :class:`ObservationNoise`; environments with other transforms, and several at
+    once, are played by TorchRL's own loop, at its pace, with the policy as it is, and a state of
+    theirs cannot be saved.
 
     Args:
         env (EnvBase): on the CPU, with one tensor of observations under ``"observation"``.
@@ -116,11 +116,6 @@ class EpisodeCollector(Collector):
             self._dtype = self._simulator.observation_spec["observation"].dtype
             continuous = self._simulator.action_spec.dtype.is_floating_point
             self._to_action = Tensor.numpy if continuous else self._simulator.read_action
-
-    def act(self, observation: Tensor) -> Tensor:
-        """The policy's action at one observation, in the collector's exploration type."""
-        with set_exploration_type(self.exploration_type):
-            return self._act(observation)[self._policy_keys.index("action")]
 
     @torch.no_grad()
     def rollout(self) -> TensorDictBase:

@@ -72,11 +72,11 @@ class Player:
             FloatingPointError: NaN or infinity in what the environment or the policy gave.
             SimulatorError: the environment failed.
         """
-        batches, last_frame = self._batches(), self.frames
-        episodes: list[Episode] = []
-        for batch in reversed(batches):
-            episodes.insert(0, self.measured(batch, last_frame, ends_round=not episodes))
-            last_frame -= batch.numel()
+        last_frame, batches = self.frames, self._batches()
+        episodes = []
+        for batch in batches:
+            last_frame += batch.numel()
+            episodes.append(self.measured(batch, last_frame, ends_round=batch is batches[-1]))
         return episodes
 
     def play_rollout(self) -> tuple[list[TensorDictBase], list[Episode]]:

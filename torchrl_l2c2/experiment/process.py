@@ -98,7 +98,7 @@ def keep_freed_memory() -> bool:
     """Lets the process keep the memory that it frees, for the next update, which needs as much.
 
     Otherwise the tensors of larger batches are handed out anew by the system at every update, page
-    by page, which takes as long as the arithmetic. The process then holds the most that it ever
+    by page, which takes long. The process then holds the most that it ever
     needed, to its end. For processes that train and do little else: ``train.py`` calls it.
 
     Returns:
