@@ -174,12 +174,68 @@ def test_a_sweep_says_how_much_of_it_is_left():
     """By the mean of what is finished: 15 of 18 runs at 40 minutes, two at once."""
     with begin_sweep(["-m", "seed=0,1,2", "~logger"]) as begun:
         params = {"seed": "range(0,18)", "task": "a,b", "regularizer": "none,caps,l2c2"}
-        assert begun.standing(1, params, 1) == "run 1 of 18"
-        for seconds in (1800.0, 3000.0, float("nan")):
-            begun.add_finished(Path("run"), seconds)
+        assert begun.standing(1, params) == "run 1 of 18"
+        for number, seconds in enumerate((1800.0, 3000.0, float("nan"))):
+            begun.add_finished(number, Path("run"), seconds)
         # As a job sees it, in whatever process.
-        assert Sweep.of_this_job().standing(4, params, 2) == "run 4 of 18, about 5.3 h left"
-        assert begun.standing(18, params, 1) == "run 18 of 18, about 40 min left"
+        with begun.job(3, "seed=1"), begun.job(4, "seed=2"):
+            standing = Sweep.of_this_job().standing(4, params)
+            assert standing == "run 4 of 18, about 5.3 h left"
+        assert begun.standing(18, params) == "run 18 of 18, about 40 min left"
+
+
+def test_a_job_that_did_not_end_is_named_and_known_when_it_begins_again(tmp_path):
+    """Unless it was stopped; one that failed or ended is not."""
+    with begin_sweep() as begun:
+        begun.share(tmp_path)
+        with pytest.raises(KeyboardInterrupt), begun.job(0, "seed=0") as before:
+            assert not before
+            raise KeyboardInterrupt
+        with begun.job(1, "seed=1"):
+            Sweep.of_this_job().add_failure(1, "seed=1", "no room")
+        ((lost, why), failed) = begun.failures
+        assert lost == "seed=0" and why.startswith("lost with its process or machine")
+        assert failed == ("seed=1", "no room")
+        with begun.job(0, "seed=0") as before:
+            assert before
+        assert begun.failures == [("seed=1", "no room")]
+
+
+def test_a_job_of_a_sweep_that_ended_does_not_begin(tmp_path):
+    """One that waited in a cluster's queue; and the folder that they shared is gone."""
+    with begin_sweep() as begun:
+        begun.share(tmp_path)
+        job = Sweep.of_this_job()
+        assert job.stopped_by is None
+    assert job.stopped_by == signal.SIGTERM
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_machine_without_the_outputs_is_named(tmp_path):
+    """It would write where nobody looks."""
+    with begin_sweep() as begun:
+        begun.share(tmp_path / "outputs")
+        (tmp_path / "outputs").rename(tmp_path / "moved")
+        with pytest.raises(RuntimeError, match=r"outputs' is not on .* all machines share"):
+            Sweep.of_this_job()
+
+
+@pytest.mark.slow
+def test_two_sweeps_share_a_folder(tmp_path):
+    """At the same time: every run is made by one of them, and the same command finds all done."""
+    command = ("-m", "seed=0,1,2,3", "task.episodes=40", "compile=false", f"outputs={tmp_path}/o")
+    assert start(tmp_path / "alone", *command[:-1]).wait(500) == 0
+    pair = [start(tmp_path / name, *command) for name in ("one", "other")]
+    ended = [process.wait(500) for process in pair]
+    texts = [said(tmp_path / name) for name in ("one", "other")]
+    assert 1 in ended, texts
+    assert any("in use by process" in text for text in texts)
+    last = start(tmp_path / "last", *command)
+    assert last.wait(500) == 0, said(tmp_path / "last")
+    ours, theirs = runs(tmp_path), runs(tmp_path / "alone")
+    assert ours.keys() == theirs.keys() and len(ours) == 4
+    for seed in ours:
+        assert numbers(ours[seed]) == numbers(theirs[seed])
 
 
 def numbers(folder):
