@@ -21,11 +21,11 @@ SETTINGS = (
 LAUNCHERS = {"basic": [], "joblib": ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]}
 
 
-def start(folder, *overrides):
+def start(folder, *overrides, log="said"):
     """The command in a session of its own, as a terminal has one."""
     folder.mkdir(exist_ok=True)
     # Into a file: a pipe that nobody reads is full after some hundred lines of progress.
-    with open(folder / "said", "w") as output:
+    with open(folder / log, "w") as output:
         return subprocess.Popen(
             [sys.executable, ROOT / "train.py", *overrides, *SETTINGS, f"outputs={folder / 'o'}"],
             stdout=output,
@@ -35,8 +35,8 @@ def start(folder, *overrides):
         )
 
 
-def said(folder):
-    return (folder / "said").read_text()
+def said(folder, log="said"):
+    return (folder / log).read_text()
 
 
 def wait_until(condition, seconds=120.0):
@@ -223,16 +223,16 @@ def test_a_machine_without_the_outputs_is_named(tmp_path):
 @pytest.mark.slow
 def test_two_sweeps_share_a_folder(tmp_path):
     """At the same time: every run is made by one of them, and the same command finds all done."""
-    command = ("-m", "seed=0,1,2,3", "task.episodes=40", "compile=false", f"outputs={tmp_path}/o")
-    assert start(tmp_path / "alone", *command[:-1]).wait(500) == 0
-    pair = [start(tmp_path / name, *command) for name in ("one", "other")]
+    command = ("-m", "seed=0,1,2,3", "task.episodes=40", "compile=false")
+    alone, both = tmp_path / "alone", tmp_path / "both"
+    assert start(alone, *command).wait(500) == 0, said(alone)
+    pair = [start(both, *command, log=log) for log in ("one", "other")]
     ended = [process.wait(500) for process in pair]
-    texts = [said(tmp_path / name) for name in ("one", "other")]
-    assert 1 in ended, texts
-    assert any("in use by process" in text for text in texts)
-    last = start(tmp_path / "last", *command)
-    assert last.wait(500) == 0, said(tmp_path / "last")
-    ours, theirs = runs(tmp_path), runs(tmp_path / "alone")
+    told = said(both, "one") + said(both, "other")
+    assert 1 in ended and "in use by process" in told and "Traceback" not in told, told
+    assert start(both, *command).wait(500) == 0, said(both)
+    assert "episode 1 of" not in said(both)
+    ours, theirs = runs(both), runs(alone)
     assert ours.keys() == theirs.keys() and len(ours) == 4
     for seed in ours:
         assert numbers(ours[seed]) == numbers(theirs[seed])
