@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import heapq
+import logging
 import math
 import statistics
 import time
@@ -94,6 +95,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.cores", description=__doc__)
     parser.add_argument("--records", default=RECORDS, help="default: results/runs.csv")
     chosen = parser.parse_args()
+    logging.getLogger("torchrl").setLevel(logging.ERROR)
     records, runs, where = read_records(chosen.records), sweep(), machine()
     lines = ["| task | method | minutes | from |", "| --- | --- | --- | --- |"]
     seconds: dict[tuple[str, str], float] = {}

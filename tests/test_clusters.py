@@ -101,20 +101,23 @@ def ray_cluster(tmp_path, monkeypatch):
 
 @needs("hydra_plugins.hydra_ray_launcher")
 @pytest.mark.slow
-def test_a_lost_machine_of_ray_is_made_up_for(tmp_path, undisturbed, ray_cluster):
-    """Killed with its worker; the other one takes its run from the checkpoint, and all the rest."""
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_a_lost_machine_of_ray_is_made_up_for(tmp_path, undisturbed, ray_cluster, number):
+    """Killed with its worker, the other one does the rest; asked to end, the worker saves first."""
     address = f"hydra.launcher.ray.init.address={ray_cluster.address}"
     sweep = start(tmp_path, *SWEEP, "hydra/launcher=ray_cluster", address)
     run, process = begun_in_the_middle(tmp_path)
-    (lost,) = (
-        node
-        for node in ray_cluster.worker_nodes
-        if node.all_processes["raylet"][0].process.pid == parent(process)
-    )
-    os.kill(process, signal.SIGKILL)
-    ray_cluster.remove_node(lost, allow_graceful=False)
+    machines = {
+        node.all_processes["raylet"][0].process.pid: node for node in ray_cluster.worker_nodes
+    }
+    machine = machines[parent(process)]
+    os.kill(process, number)
+    if number == signal.SIGKILL:
+        ray_cluster.remove_node(machine, allow_graceful=False)
     assert sweep.wait(500) == 0, said(tmp_path)
-    assert "continuing after episode" in (run / "train.log").read_text()
+    log = (run / "train.log").read_text()
+    assert "continuing after episode" in log
+    assert ("SIGTERM ended the training" in log) == (number == signal.SIGTERM)
     assert_same(tmp_path, undisturbed)
 
 

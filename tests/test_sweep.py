@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from torchrl_l2c2.experiment.command import check_launcher
 from torchrl_l2c2.experiment.folder import list_checkpoints, load_checkpoint
 from torchrl_l2c2.experiment.sweep import Sweep, begin_sweep
 
@@ -148,13 +149,15 @@ def test_the_failed_jobs_of_a_sweep_are_named_at_its_end(tmp_path):
 
 
 def test_a_process_that_waits_for_a_job_ends_with_its_sweep(tmp_path):
-    """A launcher's worker that never got one, after the sweep was killed."""
+    """A launcher's worker that never got one, after the sweep was killed; not one of Slurm's."""
     begin = (
-        "import subprocess, sys, time\n"
+        "import os, subprocess, sys, time\n"
         "from torchrl_l2c2.experiment.sweep import begin_sweep\n"
         "with begin_sweep():\n"
-        "    subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(600)'])\n"
-        "    print('begun', flush=True)\n"
+        "    wait = [sys.executable, '-c', 'import time; time.sleep(600)']\n"
+        "    subprocess.Popen(wait)\n"
+        "    of_slurm = subprocess.Popen(wait, env={**os.environ, 'SLURM_JOB_ID': '7'})\n"
+        "    print(of_slurm.pid, flush=True)\n"
         "    time.sleep(600)\n"
     )
     process = subprocess.Popen(
@@ -163,11 +166,21 @@ def test_a_process_that_waits_for_a_job_ends_with_its_sweep(tmp_path):
         start_new_session=True,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
     )
-    assert process.stdout.readline() == b"begun\n"
-    assert len(alive(process.pid)) == 3  # with the guard
+    of_slurm = int(process.stdout.readline())
+    assert len(alive(process.pid)) == 4  # with the guard
     process.kill()
     process.wait()
-    wait_until(lambda: not alive(process.pid), 20)
+    wait_until(lambda: alive(process.pid) == [of_slurm], 20)
+    os.kill(of_slurm, signal.SIGKILL)
+
+
+@pytest.mark.parametrize("name", ["ray", "slurm"])
+def test_a_launcher_says_what_it_needs(name, monkeypatch):
+    """Where its plugin is not installed."""
+    monkeypatch.setattr("torchrl_l2c2.experiment.command.find_spec", lambda plugin: None)
+    with pytest.raises(SystemExit, match=rf"{name}_cluster needs the extra {name}: pip install"):
+        check_launcher(["train.py", "-m", f"hydra/launcher={name}_cluster"])
+    check_launcher(["train.py", "-m", "hydra/launcher=joblib"])
 
 
 def test_a_sweep_says_how_much_of_it_is_left():

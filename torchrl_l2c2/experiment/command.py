@@ -11,8 +11,9 @@ import signal
 import sys
 import traceback
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,6 +46,11 @@ CONF = next(folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if 
 EXPECTED = (ValueError, OSError, RuntimeError, FloatingPointError, ImportError)
 # How long a file server may hold the lock of a machine that was lost.
 LOST_SECONDS = 180.0
+# Of conf/hydra/launcher/: the plugin, and the extra that brings it.
+LAUNCHERS = {
+    "ray_cluster": ("hydra_plugins.hydra_ray_launcher", "ray"),
+    "slurm_cluster": ("hydra_plugins.hydra_submitit_launcher", "slurm"),
+}
 HINTS: dict[type[Exception], str] = {
     SettingError: "--help lists every setting.",
     OtherRunError: "In a shell: outputs=FOLDER, allow_other_versions=true, task.episodes=N.",
@@ -81,8 +87,17 @@ def _node(chosen: Any) -> dict[str, Any]:
     return {"defaults": [*usual, "_self_"], **values}
 
 
+def check_launcher(arguments: Sequence[str]) -> None:
+    """Says which extra a launcher needs, where Hydra would say that it cannot be loaded."""
+    for name, (plugin, extra) in LAUNCHERS.items():
+        if f"hydra/launcher={name}" in arguments and find_spec(plugin) is None:
+            needed = f"pip install 'torchrl-l2c2[{extra}]'"
+            sys.exit(f"error: hydra/launcher={name} needs the extra {extra}: {needed}.")
+
+
 def main() -> None:
     """Runs what the command line says."""
+    check_launcher(sys.argv)
     keep_ctrl_c_from_children()
     signal.signal(signal.SIGTERM, terminate)
     register()
