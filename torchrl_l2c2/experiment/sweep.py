@@ -181,8 +181,11 @@ class Sweep:
 
     def _all(self, kind: str) -> list[tuple[int, Any]]:
         """What the jobs told, by their numbers."""
-        paths = sorted(self._folder.glob(f"{kind}_*"))
-        return [(int(path.name.rpartition("_")[2]), json.loads(path.read_text())) for path in paths]
+        told = []
+        for path in sorted(self._folder.glob(f"{kind}_*")):
+            with contextlib.suppress(FileNotFoundError):  # A job that has just ended.
+                told.append((int(path.name.rpartition("_")[2]), json.loads(path.read_text())))
+        return told
 
     def _follow(self) -> None:
         """A stop reaches this process as SIGTERM, and it dies with the one that began the sweep.
