@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep, IntervalSweep, Override
 
@@ -100,7 +101,8 @@ class Search:
                     yield lost.number, lost.params
         while (done := len(self.study.get_trials(deepcopy=False))) < most:
             # What has been proposed before is of no matter: a continued search is the same.
-            self.study.sampler = TPESampler(seed=self._seed + done)
+            entropy = np.random.SeedSequence([self._seed, done])
+            self.study.sampler = TPESampler(seed=int(entropy.generate_state(1)[0]))
             trial = self.study.ask(self.space)
             with self._taken(trial.number) as ours:
                 if ours:
