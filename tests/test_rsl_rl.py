@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import copy
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -349,3 +354,58 @@ def test_what_cannot_be_regularized_is_refused(settings: dict[str, Any], said: s
     """With what was given and what to do."""
     with pytest.raises(TypeError, match=said):
         make(rsl.L2C2PPO, **settings)
+
+
+EXAMPLE = Path(__file__).parents[1] / "examples" / "rsl_rl_l2c2.py"
+
+
+def test_the_runner_builds_it_by_its_name(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """With its settings, from a configuration; its terms are logged, and its state is saved."""
+    monkeypatch.syspath_prepend(EXAMPLE.parent)
+    from rsl_rl.runners import OnPolicyRunner
+    from rsl_rl_points import NoisyPoints
+
+    network = {"class_name": "MLPModel", "hidden_dims": [8]}
+    cfg = {"sigma": 0.5, "lambda_max": 3.0, "beta": 0.25, "policy_distance": "kl"}
+    algorithm = {"class_name": "torchrl_l2c2.rsl_rl:L2C2PPO", "regularizer_cfg": cfg}
+    config = {
+        "algorithm": algorithm,
+        "actor": {**network, "distribution_cfg": NORMAL},
+        "critic": network,
+        "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
+        "num_steps_per_env": 4,
+        "save_interval": 1,
+    }
+    runner = OnPolicyRunner(NoisyPoints(8), config, log_dir=str(tmp_path))
+    loss = runner.alg.regularization.loss
+    assert isinstance(runner.alg, rsl.L2C2PPO)
+    assert (loss.l2c2_neighborhood, loss.l2c2_beta) == (Neighborhood(0.5, lambda_max=3.0), 0.25)
+    logged = []
+    monkeypatch.setattr(runner.logger, "log", lambda **told: logged.append(told["loss_dict"]))
+    runner.learn(2)
+    assert logged[1].keys() >= {"surrogate", "l2c2_actor", "l2c2_critic", "l2c2_kl", "l2c2_gain"}
+    assert logged[1]["l2c2_actor"] > 0
+
+    again = OnPolicyRunner(NoisyPoints(8), config)
+    again.load(str(tmp_path / "model_1.pt"))
+    assert again.alg.regularization.updates == 2
+
+
+def test_the_example_trains_and_compares(tmp_path: Path) -> None:
+    """It prints a table of numbers with their intervals, and can be read in one go."""
+    done = subprocess.run(
+        [sys.executable, str(EXAMPLE)],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(EXAMPLE.parents[1])},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    cell = r"(-?[0-9.]+) ± ([0-9.]+)"
+    rows = re.findall(rf"^\| (.+) \| {cell} \| {cell} \|$", done.stdout, re.M)
+    plain, regularized, difference = [[float(cell) for cell in row[1:]] for row in rows]
+    for column in (0, 2):
+        assert difference[column] == pytest.approx(regularized[column] - plain[column], abs=2e-3)
+    for script in (EXAMPLE, EXAMPLE.with_stem("rsl_rl_points")):
+        assert len(script.read_text().splitlines()) < 80
