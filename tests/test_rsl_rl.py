@@ -359,6 +359,19 @@ def test_what_cannot_be_regularized_is_refused(settings: dict[str, Any], said: s
 EXAMPLE = Path(__file__).parents[1] / "examples" / "rsl_rl_l2c2.py"
 
 
+def test_the_pages_configuration_builds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As it stands there, on any task."""
+    monkeypatch.syspath_prepend(EXAMPLE.parent)
+    from rsl_rl.runners import OnPolicyRunner
+    from rsl_rl_points import NoisyPoints
+
+    page = (EXAMPLE.parents[1] / "docs" / "rsl_rl.md").read_text()
+    told: dict[str, Any] = {}
+    exec(re.search(r"^```python\n(.*?)^```", page, re.M | re.S)[1], told)
+    loss = OnPolicyRunner(NoisyPoints(2), told["config"]).alg.regularization.loss
+    assert (loss.l2c2_policy_distance, loss.l2c2_neighborhood.lambda_min) == ("mean", 0.1)
+
+
 def test_the_runner_builds_it_by_its_name(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """With its settings, from a configuration; its terms are logged, and its state is saved."""
     monkeypatch.syspath_prepend(EXAMPLE.parent)

@@ -69,7 +69,8 @@ class RegularizedPPO(PPO):
     ) -> None:
         super().process_env_step(obs, rewards, dones, extras)
         if FINAL in extras:
-            self.storage.add_final(extras[FINAL].to(self.device), dones)
+            final = TensorDict({**extras[FINAL]}, [self.storage.num_envs], device=self.device)
+            self.storage.add_final(final, dones)
 
     def compute_returns(self, obs: TensorDict) -> None:
         super().compute_returns(obs)

@@ -27,7 +27,7 @@ class Regularization:
 
     Args:
         loss (RegularizedLoss): around an
-            :class:`~torchrl_l2c2.rsl_rl.networks.ActorCriticLoss`.
+            :class:`~torchrl_l2c2.rsl_rl.ActorCriticLoss`.
         neighbors (NeighborTransform, optional): writes into batches what the loss reads there.
         coefficient (str): the coefficient of the loss that the ramp is of.
         ramp_updates (int, optional): updates over which it rises from 0. ``None`` keeps it.
