@@ -114,12 +114,22 @@ def update(ppo: PPO) -> dict[str, float]:
     return ppo.update()
 
 
-def steps(ppo: PPO) -> list[Tensor]:
-    """Gradients of an update, as steps of plain gradient descent at a rate of 1."""
+def steps(ppo: PPO) -> tuple[list[Tensor], dict[str, float]]:
+    """Gradients of an update, as steps of plain descent at a rate of 1; and what it returned."""
     ppo.optimizer = torch.optim.SGD([*ppo.actor.parameters(), *ppo.critic.parameters()], lr=1.0)
     before = [parameter.detach().clone() for parameter in parameters(ppo)]
-    update(ppo)
-    return [a - b.detach() for a, b in zip(before, parameters(ppo), strict=True)]
+    losses = update(ppo)
+    return [a - b.detach() for a, b in zip(before, parameters(ppo), strict=True)], losses
+
+
+def check_added(plain: PPO, ppo: PPO, terms: TensorDictBase, base: ClipPPOLoss) -> None:
+    """The one's update differs from the other's by the gradients of the terms, and tells them."""
+    expected = gradients(terms, base)
+    (without, _), (with_terms, losses) = steps(plain), steps(ppo)
+    found = [a - b for a, b in zip(with_terms, without, strict=True)]
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-6)
+    told = {name: losses[name.removeprefix("loss_")] for name in terms.keys()}
+    assert told == pytest.approx({name: term.item() for name, term in terms.items()}, rel=1e-4)
 
 
 def parameters(ppo: PPO) -> list[Tensor]:
@@ -166,10 +176,7 @@ def test_terms_and_gradients_are_those_of_the_loss_for_torchrl(options: dict[str
     torch.manual_seed(5)
     batch = draw(transitions(torch.randperm(ENVS * STEPS)))
     terms = loss.policy_regularizer(batch).update(loss.value_regularizer(batch))
-    expected = gradients(terms, base)
-
-    found = [a - b for a, b in zip(steps(ppo), steps(plain), strict=True)]
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-6)
+    check_added(plain, ppo, terms, base)
 
 
 def test_it_reports_the_terms_that_it_added_and_what_they_are_made_of() -> None:
@@ -189,9 +196,7 @@ def test_the_term_of_cats_is_that_of_the_loss_for_torchrl() -> None:
     ppo = collected(make(rsl.CATSPPO, regularizer_cfg={"lambda_temporal": 0.3}, **FIXED))
     base = torchrl_loss(ppo)
     terms = CATSLoss(base, 0.3).policy_regularizer(transitions(torch.arange(ENVS * STEPS)))
-    expected = gradients(terms, base)
-    found = [a - b for a, b in zip(steps(ppo), steps(plain), strict=True)]
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-6)
+    check_added(plain, ppo, terms, base)
 
 
 @pytest.mark.parametrize("distribution", ["Gaussian", "HeteroscedasticGaussian"])
