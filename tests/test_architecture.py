@@ -25,6 +25,10 @@ objectives.l2c2 objectives.caps objectives.cats objectives.lcp objectives.sr2l
 objectives.grad_caps
 objectives.ppo_rpe
 objectives.__init__
+rsl_rl.networks rsl_rl.storage
+rsl_rl.regularization
+rsl_rl.ppo
+rsl_rl.__init__
 trainers __init__
 experiment.settings experiment.compilation experiment.spaces experiment.guard
 experiment.tracing experiment.priorities experiment.frames experiment.row_writer
