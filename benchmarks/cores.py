@@ -29,7 +29,7 @@ from torchrl_l2c2.experiment.tasks import TASKS
 
 RECORDS = Path(__file__).parents[1] / "results" / "runs.csv"
 CORES = (1, 2, 4, 16, 64, 128, 256, 512)
-PACE_SECONDS = 20.0
+WARM_UPDATES, PACE_SECONDS = 500, 20.0
 
 
 def makespan(seconds: Sequence[float], cores: int) -> float:
@@ -82,7 +82,9 @@ def paced(task: str, method: str) -> float:
     )
     begun = time.process_time()
     experiment = Experiment(config)
-    experiment.train(2)
+    # Some first episodes are too short to learn from, and the first updates are compiled.
+    while experiment.learner.updates < WARM_UPDATES:
+        experiment.train(len(experiment.metrics) + 1)
     start, frames = time.process_time(), experiment.player.frames
     while time.process_time() - start < PACE_SECONDS:
         experiment.train(len(experiment.metrics) + 1)
