@@ -53,6 +53,7 @@ experiment.reports.score
 experiment.reports.tables
 experiment.reports.comparison experiment.reports.measures
 experiment.reports.figures experiment.reports.field
+experiment.reports.choice
 experiment.reports.page experiment.reports.readme experiment.reports.results
 experiment.reports.__init__
 experiment.reports.__main__
