@@ -15,9 +15,9 @@ from torchrl_l2c2.experiment.reports.tables import Table, number_range
 
 LEGEND = (
     "Beside vanilla's runs of the same seeds and other settings, smoothest first; tests of the "
-    "last policy with its mean actions. Return: the difference of the means over seeds, in parts of "
-    "vanilla's size, mean over tasks. Sm: the ratio of the means over seeds, geometric mean over "
-    "tasks; 1 is no smoother."
+    "last policy with its mean actions. Return: the difference of the means over seeds, in parts "
+    "of vanilla's size, mean over tasks. Sm: the ratio of the means over seeds, geometric mean "
+    "over tasks; 1 is no smoother."
 )
 
 
