@@ -23,6 +23,7 @@ objectives.transitions objectives.relative_pearson
 objectives.regularized objectives.neighbors
 objectives.l2c2 objectives.caps objectives.cats objectives.lcp objectives.sr2l
 objectives.grad_caps
+objectives.asap
 objectives.ppo_rpe
 objectives.__init__
 trainers __init__
@@ -37,7 +38,7 @@ experiment.rollouts
 experiment.regularizers.base
 experiment.regularizers.none experiment.regularizers.caps experiment.regularizers.l2c2
 experiment.regularizers.cats experiment.regularizers.grad_caps experiment.regularizers.lcp
-experiment.regularizers.sr2l
+experiment.regularizers.sr2l experiment.regularizers.asap
 experiment.regularizers.__init__
 experiment.algorithms.normalization
 experiment.algorithms.agent experiment.algorithms.networks experiment.algorithms.base

@@ -104,7 +104,12 @@ class GainControl:
         if self._learner.updates == self._updates:
             return dict.fromkeys(self.gains, float("nan"))
         shares = gradient_shares(self._learner.agent.loss, self._learner.example())
-        return {name: max(shares[key] for key in keys) for name, keys in self._terms().items()}
+        # What the loss's own terms do not train, as a predictor beside the policy, has no share.
+        finite = {key: share for key, share in shares.items() if share < float("inf")}
+        return {
+            name: max((finite[key] for key in keys if key in finite), default=float("nan"))
+            for name, keys in self._terms().items()
+        }
 
     @staticmethod
     def _column(row: Mapping[str, float], name: str) -> float:
