@@ -23,7 +23,7 @@ objectives.transitions objectives.relative_pearson
 objectives.regularized objectives.neighbors
 objectives.l2c2 objectives.caps objectives.cats objectives.lcp objectives.sr2l
 objectives.grad_caps
-objectives.asap
+objectives.asap objectives.tchebycheff
 objectives.ppo_rpe
 objectives.__init__
 trainers __init__

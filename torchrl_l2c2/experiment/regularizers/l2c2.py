@@ -71,6 +71,18 @@ class L2C2Config(GainConfig):
         "their means before the squashing, or the KL divergence; they need other gains",
     )
 
+    tchebycheff_mu: float | None = Field(
+        default=None,
+        gt=0,
+        description="the policy descends the smooth maximum of its loss and its regularization, "
+        "smoother for larger values; null: their sum [paper]",
+    )
+    tchebycheff_ideal: float | None = Field(
+        default=None,
+        description="of tchebycheff_mu: the policy's loss that is hoped for, as minus the largest "
+        "value; null: 0",
+    )
+
     def __post_init__(self) -> None:
         GainConfig.__post_init__(self)
         if self.over_neighbors == "max" and self.num_samples == 1:
@@ -80,6 +92,11 @@ class L2C2Config(GainConfig):
                 "gain_target_value",
                 f"needs gain=gradient and a beta above 0, got gain={self.gain} and "
                 f"beta={self.beta}: set these, or leave it at null.",
+            )
+        if self.tchebycheff_ideal is not None and self.tchebycheff_mu is None:
+            raise SettingError(
+                "tchebycheff_ideal",
+                f"is of tchebycheff_mu, which is null, got {self.tchebycheff_ideal}: set both.",
             )
 
     @property
@@ -102,8 +119,9 @@ class L2C2Config(GainConfig):
 
     def wrap(self, loss: LossModule) -> LossModule:
         from torchrl_l2c2.objectives import L2C2Loss
+        from torchrl_l2c2.objectives.tchebycheff import TchebycheffLoss
 
-        return L2C2Loss(
+        loss = L2C2Loss(
             loss,
             neighborhood=self.neighborhood,
             beta=self.beta,
@@ -112,6 +130,9 @@ class L2C2Config(GainConfig):
             fraction=self.fraction,
             policy_distance=self.policy_distance,
         )
+        if self.tchebycheff_mu is None:
+            return loss
+        return TchebycheffLoss(loss, self.tchebycheff_mu, (self.tchebycheff_ideal or 0.0, 0.0))
 
     def transform(self, generator: torch.Generator) -> NeighborTransform:
         from torchrl_l2c2.transforms import NeighborTransform
