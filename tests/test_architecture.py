@@ -68,7 +68,7 @@ experiment.diagnosis.words experiment.diagnosis.pictures experiment.diagnosis.ru
 experiment.diagnosis.film
 experiment.diagnosis.page
 experiment.diagnosis.__init__
-experiment.diagnose
+experiment.diagnose experiment.noise
 experiment.learner
 experiment.gain
 experiment.continuation experiment.schedules
