@@ -141,7 +141,7 @@ def test_gains_are_compared_with_vanilla():
             continue
         share = choice.removeprefix("share_")
         assert config.regularizer.name == "l2c2_mean" and config.algorithm.num_envs == 4
-        assert config.regularizer.gain_target == float(share)
+        assert config.regularizer.gain_target == float(share) and not config.regularizer.beta
         assert f"/gain-gradient_gain_target-{float(share)}_" in run_name(config)
 
 
