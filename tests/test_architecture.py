@@ -26,6 +26,10 @@ objectives.grad_caps
 objectives.asap objectives.tchebycheff
 objectives.ppo_rpe
 objectives.__init__
+rsl_rl.networks rsl_rl.storage
+rsl_rl.regularization
+rsl_rl.ppo
+rsl_rl.__init__
 trainers __init__
 experiment.settings experiment.compilation experiment.spaces experiment.guard
 experiment.tracing experiment.priorities experiment.frames experiment.row_writer

@@ -1,4 +1,4 @@
-"""Compiled functions: for every run of a sweep, with the same random numbers."""
+"""Compiled functions: the same numbers, from one graph, for every run of a sweep."""
 
 import pytest
 import torch
@@ -9,52 +9,97 @@ from torchrl_l2c2.experiment.compilation import compiled, compiler_available
 pytestmark = pytest.mark.skipif(not compiler_available(), reason="no C++ compiler")
 
 
-def make(size):
-    network = torch.nn.Linear(2, size)
+def counted(function):
+    """The function, and how often it ran as Python."""
+    runs = []
 
-    def act(observation):
-        return network(observation)
+    def counting(*args):
+        runs.append(args)
+        return function(*args)
 
-    return compiled(act)
-
-
-def test_a_sweep_compiles_the_same_code_as_often_as_it_has_runs():
-    """Beyond the number of recompilations that one function is allowed."""
-    limit = torch._dynamo.config.recompile_limit
-    for size in range(1, limit + 3):
-        assert make(size)(torch.ones(2)).shape == (size,)
+    return counting, runs
 
 
 def test_random_numbers_and_gradients_are_those_of_the_plain_function():
-    """PyTorch's own generator, and one graph with the gradient in it."""
+    """PyTorch's own generator, and one graph with the gradient in it; tracing draws nothing."""
 
     def noisy_slope(x):
         y = (x * torch.rand_like(x)).square().sum()
         return torch.autograd.grad(y, [x])[0]
 
     x = torch.arange(4.0, requires_grad=True)
-    torch.manual_seed(0)
-    expected = noisy_slope(x)
-    torch.manual_seed(0)
-    torch.testing.assert_close(compiled(noisy_slope, takes_gradients=True)(x), expected)
+    ours = compiled(noisy_slope)
+    for seed in range(2):
+        torch.manual_seed(seed)
+        expected = noisy_slope(x)
+        torch.manual_seed(seed)
+        torch.testing.assert_close(ours(x), expected)
 
 
-def test_a_constant_closure_is_looked_at_once_and_arguments_always():
-    """Written into, its tensors are followed; other arguments are another graph."""
+def test_what_is_written_into_tensors_is_followed_and_nothing_else():
+    """The graph has the tensors, and the settings of its first call."""
     weight, setting = torch.ones(2), {"scale": 1.0}
-
-    def scaled(x, double):
-        return (2.0 if double else 1.0) * setting["scale"] * weight * x
-
-    ours = compiled(scaled, constant_closure=True)
-    assert ours(torch.ones(2), False).tolist() == [1.0, 1.0]
-    assert ours(torch.ones(2), True).tolist() == [2.0, 2.0]
+    ours = compiled(lambda x: setting["scale"] * weight * x)
+    assert ours(torch.ones(2)).tolist() == [1.0, 1.0]
     weight.fill_(3.0)
-    assert ours(torch.ones(2), False).tolist() == [3.0, 3.0]
-    assert ours(torch.ones(3, 2), True).shape == (3, 2)
+    assert ours(torch.ones(2)).tolist() == [3.0, 3.0]
     setting["scale"] = 10.0
-    assert ours(torch.ones(2), False).tolist() == [3.0, 3.0]
-    assert compiled(scaled)(torch.ones(2), False).tolist() == [30.0, 30.0]
+    assert ours(torch.ones(2)).tolist() == [3.0, 3.0]
+
+
+def test_tracing_writes_into_nothing_and_every_call_does():
+    """Also by another name for the same memory, as parameters and their ``data`` are."""
+    total = torch.nn.Parameter(torch.zeros(2))
+    half = total.data[:1]
+
+    def add(x):
+        total.data.add_(x)
+        half.add_(10.0)
+        return total * 1.0
+
+    ours = compiled(add)
+    assert ours(torch.ones(2)).tolist() == [11.0, 1.0]
+    assert ours(torch.ones(2)).tolist() == [22.0, 2.0]
+    assert total.tolist() == [22.0, 2.0]
+
+
+def test_other_arguments_have_graphs_of_their_own_and_known_ones_none_anew():
+    """By shape, strides, type, nesting, and by value where they are no tensors."""
+    scaled, runs = counted(lambda pair, double: pair[0] * (2.0 if double else 1.0))
+    ours = compiled(scaled)
+    x = torch.ones(2)
+    for arguments, expected in (
+        (((x, None), False), [1.0, 1.0]),
+        (((x, None), True), [2.0, 2.0]),
+        (((x.double(), None), True), [2.0, 2.0]),
+        (((x, x), True), [2.0, 2.0]),
+        (((torch.ones(3), None), False), [1.0, 1.0, 1.0]),
+        (((torch.tensor([[1.0, 9.0], [3.0, 9.0]])[:, 0], None), False), [1.0, 3.0]),
+    ):
+        for _ in range(2):
+            assert ours(*arguments).tolist() == expected
+    assert len(runs) == 6
+
+
+def test_one_graph_serves_all_sizes_that_may_vary():
+    """Sizes above one; one row is a graph of its own, as it is in broadcasting."""
+    table = torch.arange(12.0).reshape(6, 2)
+    rows_of, runs = counted(lambda stored, rows, scale: (stored[rows] * scale).sum(0))
+    ours = compiled(rows_of, varying=(1, 2))
+    for size in (5, 2, 3, 6, 1, 1):
+        rows, scale = torch.arange(size), torch.full((size, 1), 2.0)
+        torch.testing.assert_close(ours(table, rows, scale), 2.0 * table[:size].sum(0))
+    assert len(runs) == 2
+    # Sizes that differ where they did not, and other sizes of what does not vary.
+    assert ours(table, torch.arange(4), torch.full((1, 1), 1.0)).tolist() == [12.0, 16.0]
+    assert ours(table[:4], torch.arange(4), torch.full((4, 1), 1.0)).tolist() == [12.0, 16.0]
+    assert len(runs) == 4
+
+
+def test_contents_may_not_decide_what_is_done():
+    """It is told, instead of what the first call's contents decide being done ever after."""
+    with pytest.raises(torch.fx.experimental.symbolic_shapes.GuardOnDataDependentSymNode):
+        compiled(lambda x: x if x.sum() > 0 else -x)(torch.ones(2))
 
 
 def test_biases_are_added_where_the_product_is_used():
@@ -66,7 +111,7 @@ def test_biases_are_added_where_the_product_is_used():
         y = network(x)
         return y.detach(), *torch.autograd.grad(y.square().sum(), list(network.parameters()))
 
-    found, (code,) = run_and_get_code(compiled(slopes, takes_gradients=True), x)
+    found, (code,) = run_and_get_code(compiled(slopes), x)
     torch.testing.assert_close(found, slopes(x))
     assert "addmm(" not in code and "extern_kernels.mm(" in code
     with torch._dynamo.config.patch(trace_autograd_ops=True):

@@ -1,5 +1,9 @@
 """What is learned with the RL Zoo's settings: the equations of Stable-Baselines3, by hand."""
 
+import re
+import shlex
+from pathlib import Path
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -122,3 +126,49 @@ def test_first_weights_are_orthogonal_and_the_first_policy_near_zero():
     root = 2**0.5
     assert gains["actor"] == pytest.approx([root, root, 0.01], rel=1e-4)
     assert gains["critic"] == pytest.approx([root, root, 1.0], rel=1e-4)
+
+
+PAGE = Path(__file__).parents[1] / "docs" / "stable_baselines3.md"
+# What Stable-Baselines3 2.9 does by default, in this package's names.
+DEFAULTS = {
+    "ppo": {
+        "optimizer": {"lr": 3e-4, "eps": 1e-5, "linear": False},
+        "replay": {"batch_size": 64},
+        "algorithm": {
+            **{"frames": 2048, "epochs": 10, "gamma": 0.99, "gae_lambda": 0.95},
+            **{"clip_epsilon": 0.2, "entropy_coeff": 0.0, "critic_coeff": 0.5},
+            **{"max_grad_norm": 0.5, "hidden": (64, 64), "activation": "tanh", "log_scale": 0.0},
+            **{"orthogonal": True, "normalize_observations": False, "normalize_rewards": False},
+        },
+    },
+    "sac": {
+        "optimizer": {"lr": 3e-4, "eps": 1e-8, "linear": False},
+        "replay": {"batch_size": 256, "capacity": 1_000_000},
+        "algorithm": {
+            **{"gamma": 0.99, "tau": 0.005, "updates": 1, "random_frames": 100},
+            **{"hidden": (256, 256), "alpha_init": 1.0, "scale_mapping": "exp"},
+        },
+    },
+}
+
+
+@pytest.mark.parametrize("algorithm", DEFAULTS)
+def test_the_pages_commands_have_the_defaults_of_stable_baselines(algorithm):
+    """Those in place of PPO("MlpPolicy", env) and SAC("MlpPolicy", env)."""
+    commands = re.findall(r"train\.py (task=gymnasium (?:.*\\\n)*.*)", PAGE.read_text())
+    chosen = [shlex.split(command) for command in commands]
+    (overrides,) = [each for each in chosen if f"algorithm={algorithm}" in each]
+    config = ExperimentConfig.from_dict(composed(*(each for each in overrides if each.strip())))
+    for part, defaults in DEFAULTS[algorithm].items():
+        assert {name: getattr(getattr(config, part), name) for name in defaults} == defaults
+
+
+def test_the_pages_names_are_settings():
+    """Of PPO or of SAC, as its table has them."""
+    named = re.findall(r"`((?:task|algorithm|replay|optimizer)\.\w+)", PAGE.read_text())
+    sections = PAGE.with_stem("settings").read_text().split("\n## ")
+    chosen = ("task=", "algorithm=ppo\n", "algorithm=sac\n", "replay=", "optimizer=adam\n")
+    found = "\n".join(section for section in sections if section.startswith(chosen))
+    known = set(re.findall(r"^\| `([^`]+)`", found, re.M))
+    assert len(named) > 20
+    assert set(named) <= known

@@ -32,6 +32,7 @@ from torchrl_l2c2.experiment import (
     Experiment,
     ExperimentConfig,
     GradCAPSConfig,
+    L2C2Config,
     LCPConfig,
     PPOConfig,
     PPORPEConfig,
@@ -40,6 +41,7 @@ from torchrl_l2c2.experiment import (
     TaskConfig,
     UniformReplayConfig,
 )
+from torchrl_l2c2.experiment.compilation import compiler_available
 from torchrl_l2c2.objectives.cats import cats_term
 from torchrl_l2c2.objectives.grad_caps import grad_caps_term
 from torchrl_l2c2.objectives.lcp import lcp_term
@@ -486,29 +488,25 @@ def test_cats_compiles_into_one_graph():
         torch.testing.assert_close(compiled(batch)["loss_cats"], expected)
 
 
-@pytest.mark.parametrize(
-    ("regularizer", "compiled"),
-    [
-        (CATSConfig(), True),
-        (GradCAPSConfig(), True),
-        (ASAPConfig(), True),
-        (SR2LConfig(steps=2), False),
-        (LCPConfig(), False),
-    ],
-    ids=lambda value: getattr(value, "name", ""),
-)
-def test_they_run(regularizer, compiled):
-    """With their terms in the log; those that do not compile are not compiled."""
+RUNNING = [CATSConfig(), GradCAPSConfig(), ASAPConfig(), SR2LConfig(steps=2), LCPConfig()]
+
+
+def small_run(regularizer, compile=False):
     config = ExperimentConfig(
         task=TaskConfig("pendulum", "Pendulum-v1", episodes=2, max_steps=40),
         algorithm=PPORPEConfig(hidden=(8,)),
         regularizer=regularizer,
         replay=UniformReplayConfig(batch_size=8),
         optimizer=AdamConfig(),
-        compile=not compiled,  # What cannot compile is asked to; the other's graph is tested above.
+        compile=compile,
     )
-    run = Experiment(config)
-    assert config.regularizer.compilable == compiled and not run.learner.compiles
+    return Experiment(config)
+
+
+@pytest.mark.parametrize("regularizer", RUNNING, ids=lambda value: value.name)
+def test_they_run(regularizer):
+    """With their terms in the log."""
+    run = small_run(regularizer)
     first, second = run.train()
     term = {"asap": "loss_asap_spatial"}.get(regularizer.name, f"loss_{regularizer.name}")
     assert math.isfinite(second[term])
@@ -566,6 +564,25 @@ def test_asap_goes_around_every_loss_with_a_policy(case):
     found = run(ASAPLoss(plain(case), previous_key="before"), batch.copy())
     assert all(bool((value == found[key]).all()) for key, value in expected.items())
     assert found["loss_asap_spatial"].abs() < 1e-10 and found["loss_grad_caps"] > 0
+
+
+@pytest.mark.skipif(not compiler_available(), reason="no C++ compiler")
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "regularizer",
+    [LCPConfig(), SR2LConfig(steps=2), ASAPConfig(), L2C2Config(tchebycheff_mu=0.1)],
+    ids=lambda v: v.name,
+)
+def test_with_gradients_of_their_own_their_update_is_one_graph_too(regularizer):
+    """With the numbers of the one that is not compiled; or with other networks, or weights."""
+    found = []
+    for compile in (True, False):
+        run = small_run(regularizer, compile)
+        torch.manual_seed(0)
+        run.learner.remember(run.player.collector.rollout())
+        draw = run.learner.update.draw()
+        found.append([run.learner.update.update(True, *draw)[0] for _ in range(2)])
+    torch.testing.assert_close(*found, rtol=1e-4, atol=1e-5)
 
 
 def test_on_policy_actions_are_scored():

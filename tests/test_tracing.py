@@ -26,7 +26,7 @@ def walked(make, compile):
         for parameter in parameters:
             parameter.grad = None
 
-    follow = compiled(follow, constant_closure=True) if compile else follow
+    follow = compiled(follow) if compile else follow
     for number, gradient in enumerate(GRADIENTS):
         follow(number == 0, gradient)
         scheduler.step()

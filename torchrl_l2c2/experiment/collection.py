@@ -332,5 +332,5 @@ def on_tensors(
         written = policy(TensorDict({"observation": observation}))
         return tuple(written.get(key) for key in keys)
 
-    # It is always called in the same exploration type, which is not checked then.
-    return compiled(act, constant_closure=True) if compile_policy else act
+    # It is always called in the same exploration type.
+    return compiled(act) if compile_policy else act

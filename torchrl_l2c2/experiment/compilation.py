@@ -1,71 +1,241 @@
-"""Compiling the experiment's hot functions, where a compiler is at hand."""
+"""Compiling the experiment's hot functions, where a compiler is at hand.
+
+A function runs once with tensors that have no contents, and what it does to them is a graph;
+tensors that it reached by itself become inputs of that; torch's compiler makes a program of it.
+``torch.compile`` would read the Python instead, instruction by instruction, which takes several
+times as long at the start of every run, and it checks more at every call.
+"""
 
 from __future__ import annotations
 
-import inspect
-import re
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import torch
+from torch import Tensor
+from torch._guards import TracingContext, tracing
+from torch._inductor import config as inductor_config
+from torch._inductor.compile_fx import compile_fx
 from torch._inductor.custom_graph_pass import CustomGraphPass, get_hash_for_files
-from torch.fx import Graph
+from torch._subclasses import FakeTensor, FakeTensorMode
+from torch.fx import Graph, GraphModule
+from torch.fx.experimental.proxy_tensor import get_proxy_mode, make_fx, track_tensor_tree
+from torch.fx.experimental.symbolic_shapes import DimDynamic, ShapeEnv, StatelessSymbolicContext
+from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
+from torch.utils._pytree import tree_flatten, tree_leaves, tree_map_only, tree_unflatten
 
 
-def compiled(
-    function: Callable[..., Any], *, takes_gradients: bool = False, constant_closure: bool = False
-) -> Callable[..., Any]:
-    """Compiles a function into one graph.
+def compiled(function: Callable[..., Any], *, varying: Collection[int] = ()) -> Callable[..., Any]:
+    """Compiles a function into one graph, with the gradients that it takes.
 
-    Random numbers are drawn as without compilation.
+    Random numbers are drawn as without compilation. What comes out has no gradient.
+
+    Whatever the function reaches other than by its arguments has to stay as it is at the first
+    call, but for what is written *into* tensors: a setting changed or a tensor replaced later is
+    overlooked. Arguments of other shapes, and other values of those that are no tensors, have
+    graphs of their own.
 
     Args:
-        function (Callable): what is compiled, at its first call.
+        function (Callable): what is compiled, at its first call. What it does may not depend on
+            what its tensors hold, and it may keep none of them.
 
     Keyword Args:
-        takes_gradients (bool): whether the function calls ``torch.autograd.grad``. Default
-            ``False``.
-        constant_closure (bool): whether all that the function reaches other than by its arguments
-            stays as it is at the first call, but for what is written *into* its tensors. It is
-            then not checked at every call, which for an agent's hundreds of tensors takes longer
-            than the smallest networks; a setting changed or a tensor replaced later would be
-            overlooked. Default ``False``.
+        varying (Collection): positions of the arguments whose tensors may have any first size: one
+            graph serves them all. Default none.
 
     Returns:
         Callable: the compiled function.
     """
-    # The sizes of the inputs are checked before the graph is chosen: once is enough.
-    options: dict[str, Any] = {"fallback_random": True, "size_asserts": False}
-    options["post_grad_custom_post_pass"] = _BiasesApart()
-    if constant_closure:
-        options["guard_filter_fn"] = _only_arguments_of(function)
-    # Every run of a sweep compiles the same code for objects of its own: counted together, they
-    # would soon meet the limit of recompilations.
-    graph = torch.compile(  # type: ignore[call-overload]  # The stubs lack isolate_recompiles.
-        function, fullgraph=True, isolate_recompiles=True, options=options
-    )
-    # Not for all: setting and resetting takes as long as a smaller network's layer.
-    return _tracing_gradients(graph) if takes_gradients else graph
-
-
-def _tracing_gradients(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Lets Dynamo trace gradients while the function runs, which may be when it is compiled.
-
-    Without it the graph ends at the gradient, and the step is several small ones. The setting is
-    of the whole process: others find it as they left it.
-    """
-    config = torch._dynamo.config
+    programs: dict[tuple[Any, ...], _Program] = {}
 
     def call(*args: Any) -> Any:
-        before = config.trace_autograd_ops
-        config.trace_autograd_ops = True
-        try:
-            return function(*args)
-        finally:
-            config.trace_autograd_ops = before
+        tensors, rest, spec = _split(args)
+        key = (*rest, *((t.shape, t.stride(), t.dtype, t.device) for t in tensors))
+        program = programs.get(key)
+        if program is None or program.spec != spec:
+            alike = (other for other in programs.values() if other.serves(tensors, rest, spec))
+            program = next(alike, None) or _Program(function, args, varying)
+            programs[key] = program
+        return program(tensors)
 
     return call
+
+
+class _Program:
+    """A function compiled for arguments like these.
+
+    Args:
+        function (Callable): what is compiled.
+        args (tuple): the arguments.
+        varying (Collection): as for :func:`compiled`.
+
+    Attributes:
+        spec: how the arguments are nested.
+    """
+
+    def __init__(
+        self, function: Callable[..., Any], args: tuple[Any, ...], varying: Collection[int]
+    ) -> None:
+        tensors, self._rest, self.spec = _split(args)
+        varies = [
+            position in varying
+            for position, arg in enumerate(args)
+            for leaf in tree_leaves(arg)
+            if isinstance(leaf, Tensor)
+        ]
+        self._shapes = ShapeEnv()
+        mode = FakeTensorMode(allow_non_fake_inputs=True, shape_env=self._shapes)
+        self._inputs = list(map(partial(_without_contents, mode), tensors, varies))
+        # One row, or none, is never more: such tensors are of another graph.
+        self._vary = [
+            n for n, t in enumerate(self._inputs) if t.ndim and isinstance(t.shape[0], torch.SymInt)
+        ]
+        reached = _Reached(mode)
+
+        def on_tensors(*sizes_and_tensors: Tensor) -> list[Tensor]:
+            tensors = sizes_and_tensors[len(self._vary) :]
+            with reached:
+                returned = function(*_join(tensors, self._rest, self.spec))
+            written, *self._returned = _split(returned)
+            return written
+
+        inputs = self._with_sizes(self._inputs)
+        with _compiling(), mode:
+            module = make_fx(on_tensors)(*inputs)
+        self._reached = reached.tensors
+        self._run = _compile(module, [*inputs, *reached.inputs], mode)
+
+    def __call__(self, tensors: list[Tensor]) -> Any:
+        with torch.no_grad():
+            written = self._run(*self._with_sizes(tensors), *self._reached)
+        return _join(written, *self._returned)
+
+    def serves(self, tensors: list[Tensor], rest: list[Any], spec: Any) -> bool:
+        """Whether such arguments differ in sizes alone that may vary."""
+        if not self._vary or (rest, spec) != (self._rest, self.spec):
+            return False
+        for n, (tensor, ours) in enumerate(zip(tensors, self._inputs, strict=True)):
+            fixed = slice(n in self._vary, None)
+            if (tensor.dtype, tensor.device) != (ours.dtype, ours.device):
+                return False
+            if (tensor.shape[fixed], tensor.stride()) != (ours.shape[fixed], ours.stride()):
+                return False
+        # What the graph takes for granted: that the sizes are the same, for one thing.
+        stand_ins: list[Any] = self._inputs
+        return self._shapes.evaluate_guards_for_args(stand_ins, tensors)
+
+    def _with_sizes(self, tensors: list[Tensor]) -> list[Any]:
+        """The graph's inputs: the compiler wants the sizes that vary by themselves."""
+        return [*(tensors[n].shape[0] for n in self._vary), *tensors]
+
+
+def _split(tree: Any) -> tuple[list[Tensor], list[Any], Any]:
+    """The tensors of nested values, the others with marks in their places, and the nesting."""
+    leaves, spec = tree_flatten(tree)
+    tensors = [leaf for leaf in leaves if isinstance(leaf, Tensor)]
+    return tensors, [Tensor if isinstance(leaf, Tensor) else leaf for leaf in leaves], spec
+
+
+def _join(tensors: Iterable[Tensor], rest: list[Any], spec: Any) -> Any:
+    """What :func:`_split` took apart."""
+    given = iter(tensors)
+    return tree_unflatten([next(given) if leaf is Tensor else leaf for leaf in rest], spec)
+
+
+def _without_contents(mode: FakeTensorMode, tensor: Tensor, varies: bool = False) -> Tensor:
+    if not (varies and tensor.ndim):
+        return mode.from_tensor(tensor, static_shapes=True)
+    # Tensors of one size have one unknown size.
+    sizes = [DimDynamic.DUCK, *[DimDynamic.STATIC] * (tensor.ndim - 1)]
+    return mode.from_tensor(tensor, symbolic_context=StatelessSymbolicContext(sizes))
+
+
+@contextmanager
+def _compiling() -> Iterator[None]:
+    """Tells losses and distributions that they are traced: they then ask nothing of contents."""
+    before = torch.compiler._is_compiling_flag
+    torch.compiler._is_compiling_flag = True
+    try:
+        yield
+    finally:
+        torch.compiler._is_compiling_flag = before
+
+
+class _Reached(TorchDispatchMode):
+    """Makes inputs of a graph of the tensors that the traced function reaches by itself.
+
+    Args:
+        mode (FakeTensorMode): which gives them stand-ins without contents.
+
+    Attributes:
+        tensors: that were reached, each piece of memory once for every form: a parameter and its
+            ``data`` are one.
+        inputs: their stand-ins, in that order.
+    """
+
+    def __init__(self, mode: FakeTensorMode) -> None:
+        super().__init__()
+        self.tensors: list[Tensor] = []
+        self.inputs: list[Tensor] = []
+        self._mode = mode
+        self._known: dict[tuple[Any, ...], Tensor] = {}
+
+    def __torch_dispatch__(
+        self,
+        func: Any,
+        types: Any,
+        args: tuple[Any, ...] = (),
+        kwargs: dict[str, Any] | None = None,
+    ) -> Any:
+        # Numbers that become tensors are a part of the graph.
+        if func is not torch.ops.aten.lift_fresh.default:
+            args, kwargs = tree_map_only(Tensor, self._input, (args, kwargs))
+        return func(*args, **(kwargs or {}))
+
+    def _input(self, tensor: Tensor) -> Tensor:
+        if isinstance(tensor, FakeTensor):
+            return tensor
+        where = (tensor.data_ptr() or id(tensor), tensor.shape, tensor.stride(), tensor.dtype)
+        if where not in self._known:
+            self._known[where] = self._new_input(tensor)
+        return self._known[where]
+
+    def _new_input(self, tensor: Tensor) -> Tensor:
+        proxies = get_proxy_mode()
+        assert proxies is not None
+        with _disable_current_modes():
+            self.tensors.append(tensor.detach())
+            self.inputs.append(_without_contents(self._mode, self.tensors[-1]))
+        proxy = proxies.tracer.create_proxy("placeholder", f"reached_{len(self.inputs)}", (), {})
+        track_tensor_tree(self.inputs[-1], proxy, constant=None, tracer=proxies.tracer)
+        return self.inputs[-1]
+
+
+def _compile(
+    module: GraphModule, inputs: list[Any], mode: FakeTensorMode
+) -> Callable[..., Sequence[Tensor]]:
+    graph = module.graph
+    first, *others = graph.find_nodes(op="placeholder")
+    for placeholder in reversed(others):  # Some were reached in the midst of it.
+        first.append(placeholder)
+    for node in reversed(graph.nodes):
+        # Marks for the profiler, which torch's optimizers set.
+        if getattr(node.target, "namespace", None) == "profiler":
+            graph.erase_node(node)
+    module.recompile()
+    options = {
+        "fallback_random": True,
+        # The sizes of the inputs are checked before the program is chosen: once is enough.
+        "size_asserts": False,
+        "post_grad_custom_post_pass": _BiasesApart(),
+    }
+    # The compiler's cache wants to know where the sizes come from.
+    with torch.no_grad(), tracing(TracingContext(mode)), inductor_config.patch(options):
+        program: Any = compile_fx(module, inputs)
+    return program
 
 
 class _BiasesApart(CustomGraphPass):
@@ -93,15 +263,6 @@ class _BiasesApart(CustomGraphPass):
     def uuid(self) -> bytes:
         """What the compiler's cache knows the pass by: the contents of this file."""
         return get_hash_for_files((__file__,))
-
-
-def _only_arguments_of(function: Callable[..., Any]) -> Callable[[Sequence[Any]], list[bool]]:
-    """Keeps the checks of a function's arguments and of torch's global state."""
-    code = function.__code__
-    # A check of torch's own state, such as the gradient mode, has no name.
-    arguments = code.co_argcount + bool(code.co_flags & inspect.CO_VARARGS)
-    kept = {"", *code.co_varnames[:arguments]}
-    return lambda guards: [re.split(r"[.\[]", guard.name)[0] in kept for guard in guards]
 
 
 def compiler_available() -> bool:

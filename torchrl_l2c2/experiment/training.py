@@ -107,7 +107,7 @@ class Experiment:
                 self.agent,
                 config.make_replay(),
                 reward_factor=config.algorithm.reward_factor,
-                compile=self._compile and config.regularizer.compilable,
+                compile=self._compile,
                 skip_nonfinite=config.on_nonfinite == "skip",
             )
             collector = make_collector(config, env, self.agent, compile=self._compile)

@@ -6,7 +6,7 @@ step that learns from them, and the rows get their new priorities.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 
 import torch
@@ -39,6 +39,7 @@ def make_update(
     compile: bool,
     skip_nonfinite: bool = False,
     read: Callable[..., TensorDictBase] | None = None,
+    varying: Collection[int] = (),
 ) -> Step:
     """One gradient step as a function of a batch: loss, gradients, optimizer, target networks.
 
@@ -51,6 +52,8 @@ def make_update(
         skip_nonfinite (bool): whether a batch with a loss or gradient that is NaN or infinite
             changes nothing and gives ``None``. The step is two graphs then.
         read (Callable, optional): makes the batch of other things, as the first part of the graph.
+        varying (Collection): positions of the step's arguments whose tensors' first sizes differ
+            from batch to batch, for a compiled step. Default none.
 
     Returns:
         Callable: takes whether the policy is updated too, then the batch or what ``read`` makes it
@@ -99,10 +102,10 @@ def make_update(
         return values, priority
 
     if compile and whole and not skip_nonfinite:
-        return compiled(update, takes_gradients=True, constant_closure=True)
+        return compiled(update, varying=varying)
     if compile:
-        differentiate = compiled(differentiate, takes_gradients=True, constant_closure=True)
-        apply = compiled(apply, constant_closure=True) if whole else apply
+        differentiate = compiled(differentiate, varying=varying)
+        apply = compiled(apply) if whole else apply
     if not skip_nonfinite:
         return update
 
@@ -167,13 +170,17 @@ class ReplayUpdate:
         transforms = list(replay.transform.transforms)
         self._neighbors: NeighborTransform | None = transforms[0] if transforms else None
         self._device = agent.device
-        # The last of a rollout's batches is smaller: one graph is to serve all sizes.
-        self._sizes_vary = isinstance(self._sampler, SamplerWithoutReplacement)
         self._source: TensorDictBase | None = None
         self._names: tuple[NestedKey, ...] = ()
         self._stored: tuple[Tensor, ...] = ()
+        # The last of a rollout's batches is smaller.
+        sizes_vary = isinstance(self._sampler, SamplerWithoutReplacement)
         self.update = make_update(
-            agent, compile=compile, skip_nonfinite=skip_nonfinite, read=self.read
+            agent,
+            compile=compile,
+            skip_nonfinite=skip_nonfinite,
+            read=self.read,
+            varying=(2, 3, 4) if sizes_vary else (),  # rows, weight and uniform of a draw
         )
 
     def __call__(self, with_policy: bool) -> tuple[Tensor, Tensor | None] | None:
@@ -201,10 +208,6 @@ class ReplayUpdate:
         weight = None if weight is None else weight.to(self._device)
         generator = None if self._neighbors is None else self._neighbors.generator
         uniform = self._uniform(len(rows), generator)
-        if self._sizes_vary:
-            for tensor in (rows, uniform):
-                if tensor is not None:
-                    torch._dynamo.maybe_mark_dynamic(tensor, 0)
         return Draw(self._stored, rows, weight, uniform)
 
     def _rows(self) -> tuple[Tensor, Tensor | None]:

@@ -25,8 +25,9 @@ class LCPLoss(RegularizedLoss):
     Lipschitz-Constrained Policies", arXiv 2410.11825). Nothing is drawn, and no next state is
     needed. Gradients flow into the policy alone.
 
-    .. note:: It does not compile, as it differentiates twice. A narrow policy has a steep
-        likelihood: as the policy's scale falls, the same slope of its mean costs more.
+    .. note:: ``torch.compile`` does not take it, as it differentiates twice (the experiment's
+        updates are compiled otherwise, and are). A narrow policy has a steep likelihood: as the
+        policy's scale falls, the same slope of its mean costs more.
 
     Args:
         base_loss (LossModule): the loss; see :class:`RegularizedLoss` for how it is wrapped.

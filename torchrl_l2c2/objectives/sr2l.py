@@ -38,8 +38,9 @@ class SR2LLoss(RegularizedLoss):
     :math:`2.5\,\epsilon` over their number [inferred]. Gradients flow into the policy alone,
     through both states and not through the search.
 
-    .. note:: It does not compile: the search takes gradients of its own. It costs a forward and a
-        backward pass of the policy for each of its ``steps``.
+    .. note:: ``torch.compile`` does not take it, as the search takes gradients of its own (the
+        experiment's updates are compiled otherwise, and are). It costs a forward and a backward
+        pass of the policy for each of its ``steps``.
 
     Args:
         base_loss (LossModule): the loss; see :class:`RegularizedLoss` for how it is wrapped.

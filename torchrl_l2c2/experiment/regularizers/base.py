@@ -18,11 +18,9 @@ class RegularizerConfig:
     """Makes a regularized loss and, where batches are to hold more for it, a transform.
 
     Attributes:
-        compilable: whether the regularized loss compiles into one graph where the plain one does.
         reads_previous: whether its batches are to have the observation before each state.
     """
 
-    compilable: ClassVar[bool] = True
     reads_previous: ClassVar[bool] = False
 
     name: str

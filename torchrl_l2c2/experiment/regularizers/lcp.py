@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 from pydantic import Field
 
@@ -15,9 +15,7 @@ if TYPE_CHECKING:
 
 @settings
 class LCPConfig(GainConfig):
-    """A rival, :class:`~torchrl_l2c2.LCPLoss`; its update is not compiled."""
-
-    compilable: ClassVar[bool] = False
+    """A rival, :class:`~torchrl_l2c2.LCPLoss`."""
 
     name: str = "lcp"
     coeff: float = Field(default=0.002, ge=0, description="gain of the squared gradient")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
@@ -15,9 +15,7 @@ if TYPE_CHECKING:
 
 @settings
 class SR2LConfig(GainConfig):
-    """A rival, :class:`~torchrl_l2c2.SR2LLoss`; its update is not compiled."""
-
-    compilable: ClassVar[bool] = False
+    """A rival, :class:`~torchrl_l2c2.SR2LLoss`; its update costs several others."""
 
     name: str = "sr2l"
     epsilon: float = Field(

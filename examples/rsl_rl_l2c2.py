@@ -1,0 +1,72 @@
+"""rsl_rl's PPO with and without L2C2, on points seen through noise (needs the extra rsl-rl).
+
+``python examples/rsl_rl_l2c2.py`` shows in seconds that it runs;
+``python examples/rsl_rl_l2c2.py 40`` trains for some minutes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+
+import torch
+from rsl_rl.runners import OnPolicyRunner
+from rsl_rl_points import NoisyPoints
+
+from torchrl_l2c2 import action_variation
+
+SEEDS = range(5)
+STUDENT = 2.776  # of five: half of a 95 % interval, in standard errors
+GAINS = {"lambda_min": 1.0, "lambda_max": 100.0}
+METHODS = {
+    "PPO": {"class_name": "PPO"},
+    "with L2C2": {"class_name": "torchrl_l2c2.rsl_rl:L2C2PPO", "regularizer_cfg": GAINS},
+}
+
+
+def train(algorithm: dict, seed: int, iterations: int) -> tuple[float, float]:
+    torch.manual_seed(seed)
+    network = {"class_name": "MLPModel", "hidden_dims": [64, 64], "activation": "tanh"}
+    config = {
+        "algorithm": {**algorithm, "gamma": 0.97, "entropy_coef": 0.0},
+        "actor": {**network, "distribution_cfg": {"class_name": "GaussianDistribution"}},
+        "critic": network,
+        "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
+        "num_steps_per_env": 25,
+        "save_interval": iterations,
+    }
+    with contextlib.redirect_stdout(None):
+        runner = OnPolicyRunner(NoisyPoints(64), config)
+        runner.learn(iterations)
+    torch.manual_seed(1000 + seed)
+    return test(runner.get_inference_policy(), NoisyPoints(100))
+
+
+@torch.no_grad()
+def test(policy, env: NoisyPoints) -> tuple[float, float]:
+    """Return and variation of the mean actions, over each point's first episode."""
+    plays, rewards, actions, mask = torch.ones(env.num_envs, dtype=torch.bool), 0.0, [], []
+    for _ in range(env.max_episode_length):
+        actions.append(policy(env.get_observations()).clamp(-1, 1))
+        mask.append(plays)
+        _, reward, ended, _ = env.step(actions[-1])
+        rewards, plays = rewards + reward * plays, plays & ~ended.bool()
+    variation = action_variation(torch.stack(actions, 1), torch.stack(mask, 1))
+    return rewards.mean().item(), variation.mean().item()
+
+
+def main(iterations: int) -> None:
+    found = {
+        name: torch.tensor([train(algorithm, seed, iterations) for seed in SEEDS])
+        for name, algorithm in METHODS.items()
+    }
+    found["difference"] = found["with L2C2"] - found["PPO"]
+    print("| | return | action variation |\n| --- | --- | --- |")
+    for name, numbers in found.items():
+        mean, half = numbers.mean(0), STUDENT * numbers.std(0) / len(SEEDS) ** 0.5
+        cells = (f"{m:.3f} ± {h:.3f}" for m, h in zip(mean, half, strict=True))
+        print(f"| {name} |", " | ".join(cells), "|")
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 1)

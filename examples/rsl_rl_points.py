@@ -1,0 +1,46 @@
+"""A vectorized task for rsl_rl: points that are seen through noise, and shake for it."""
+
+from __future__ import annotations
+
+import torch
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+from torch import Tensor
+
+
+class NoisyPoints(VecEnv):
+    """Points on a line, to be pushed to the origin and kept there; beyond [-2, 2] they are lost.
+
+    A step is a tenth of a second. What is seen is position and velocity, each with white noise of
+    a standard deviation of 0.1; the action is the acceleration, in [-1, 1].
+    """
+
+    num_actions, max_episode_length, cfg = 1, 100, {}
+
+    def __init__(self, num_envs: int) -> None:
+        self.num_envs, self.device = num_envs, "cpu"
+        self.episode_length_buf = torch.zeros(num_envs, dtype=torch.long)
+        self.motion = torch.zeros(num_envs, 2)
+        self._look(torch.ones(num_envs, dtype=torch.bool))
+
+    def get_observations(self) -> TensorDict:
+        return self.seen
+
+    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Tensor]]:
+        position, velocity = self.motion.unbind(-1)
+        velocity = velocity + 0.1 * actions.squeeze(-1).clamp(-1, 1)
+        position = position + 0.1 * velocity
+        self.motion = torch.stack((position, velocity), -1)
+        self.episode_length_buf += 1
+        late = self.episode_length_buf >= self.max_episode_length
+        self._look(late | (position.abs() > 2))
+        reward = 1 - position.square() - 0.1 * velocity.square()
+        return self.seen, reward, self.starts.long(), {"time_outs": late}
+
+    def _look(self, starts: Tensor) -> None:
+        self.starts = starts
+        self.episode_length_buf[starts] = 0
+        anywhere = 2 * torch.rand(self.num_envs, 2) - 1
+        self.motion = torch.where(starts[:, None], anywhere, self.motion)
+        noisy = self.motion + 0.1 * torch.randn(self.num_envs, 2)
+        self.seen = TensorDict({"policy": noisy}, [self.num_envs])

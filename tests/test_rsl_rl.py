@@ -1,0 +1,429 @@
+"""L2C2 and CATS in rsl_rl's PPO, beside the same terms made of TorchRL's modules."""
+
+from __future__ import annotations
+
+import copy
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.modules import IndependentNormal, ProbabilisticActor
+from torchrl.objectives import ClipPPOLoss
+
+from torchrl_l2c2 import CATSLoss, L2C2Loss, Neighborhood, NeighborTransform
+
+rsl = pytest.importorskip("torchrl_l2c2.rsl_rl", reason="needs the extra rsl-rl")
+
+from rsl_rl.algorithms import PPO  # noqa: E402
+from rsl_rl.models import MLPModel, RNNModel  # noqa: E402
+from rsl_rl.storage import RolloutStorage  # noqa: E402
+
+ENVS, STEPS, ACTIONS = 6, 5, 2
+GROUPS = {"actor": ["policy"], "critic": ["policy", "privileged"]}
+NORMAL = {"class_name": "GaussianDistribution", "init_std": 0.5}
+
+
+def observations(seed: int) -> TensorDict:
+    """Of every environment, in two groups."""
+    generator = torch.Generator().manual_seed(seed)
+    draw = {"policy": 3, "privileged": 2}
+    groups = {name: torch.randn(ENVS, size, generator=generator) for name, size in draw.items()}
+    return TensorDict(groups, [ENVS])
+
+
+def make(
+    algorithm: type[PPO], model: type[MLPModel] = MLPModel, normal: Any = NORMAL, **settings: Any
+) -> PPO:
+    """An algorithm with the same networks each time; one batch a rollout unless told otherwise."""
+    torch.manual_seed(0)
+    obs = observations(0)
+    small: dict[str, Any] = {"hidden_dims": [8], "activation": "tanh"}
+    if model is MLPModel:
+        small["obs_normalization"] = True
+    actor = model(obs, GROUPS, "actor", ACTIONS, distribution_cfg=normal, **small)
+    critic = MLPModel(obs, GROUPS, "critic", 1, **small | {"obs_normalization": True})
+    storage = RolloutStorage("rl", ENVS, STEPS, obs, [ACTIONS])
+    settings = {"num_learning_epochs": 1, "num_mini_batches": 1} | settings
+    return algorithm(actor, critic, storage, **settings)
+
+
+def collected(ppo: PPO, dones: dict[int, list[int]] | None = None, **extras: Any) -> PPO:
+    """A rollout in which steps end the episodes of some environments."""
+    torch.manual_seed(1)
+    normalize(ppo)
+    with torch.inference_mode():
+        for step in range(STEPS):
+            ppo.act(observations(step))
+            done = torch.zeros(ENVS)
+            done[(dones or {}).get(step, [])] = 1
+            reward = observations(step)["policy"][:, 0]
+            ppo.process_env_step(observations(step + 1), reward, done, extras)
+        ppo.compute_returns(observations(STEPS))
+    return ppo
+
+
+def transitions(order: Tensor) -> TensorDict:
+    """What `collect` has made, in the order of a batch."""
+    here = torch.stack([observations(step) for step in range(STEPS)]).flatten(0, 1)
+    there = torch.stack([observations(step + 1) for step in range(STEPS)]).flatten(0, 1)
+    return here.set("next", there)[order]
+
+
+class Joined(nn.Module):
+    """A network of rsl_rl's, in parts: the normalization, the layers, and the scale beside it."""
+
+    def __init__(self, model: MLPModel) -> None:
+        super().__init__()
+        model = copy.deepcopy(model)
+        self.normalizer, self.layers = model.obs_normalizer, model.mlp
+        if model.distribution is not None:
+            self.scale = model.distribution.std_param
+
+    def forward(self, *groups: Tensor) -> Any:
+        out = self.layers(self.normalizer(torch.cat(groups, -1)))
+        return (out, self.scale.expand_as(out)) if hasattr(self, "scale") else out
+
+
+def torchrl_loss(ppo: PPO) -> ClipPPOLoss:
+    """TorchRL's PPO with copies of an algorithm's networks."""
+    policy = TensorDictModule(Joined(ppo.actor), GROUPS["actor"], ["loc", "scale"])
+    actor = ProbabilisticActor(
+        policy, in_keys=["loc", "scale"], distribution_class=IndependentNormal
+    )
+    critic = TensorDictModule(Joined(ppo.critic), GROUPS["critic"], ["state_value"])
+    return ClipPPOLoss(actor, critic, functional=False)
+
+
+def normalize(ppo: PPO) -> None:
+    """Gives the normalizations something to do."""
+    obs = torch.stack([observations(seed).apply(lambda x: 3 * x + 1) for seed in range(9)])
+    for model in (ppo.actor, ppo.critic):
+        model.update_normalization(obs.flatten(0, 1))
+
+
+def update(ppo: PPO) -> dict[str, float]:
+    torch.manual_seed(5)
+    return ppo.update()
+
+
+def steps(ppo: PPO) -> tuple[list[Tensor], dict[str, float]]:
+    """Gradients of an update, as steps of plain descent at a rate of 1; and what it returned."""
+    ppo.optimizer = torch.optim.SGD([*ppo.actor.parameters(), *ppo.critic.parameters()], lr=1.0)
+    before = [parameter.detach().clone() for parameter in parameters(ppo)]
+    losses = update(ppo)
+    return [a - b.detach() for a, b in zip(before, parameters(ppo), strict=True)], losses
+
+
+def check_added(plain: PPO, ppo: PPO, terms: TensorDictBase, base: ClipPPOLoss) -> None:
+    """The one's update differs from the other's by the gradients of the terms, and tells them."""
+    expected = gradients(terms, base)
+    (without, _), (with_terms, losses) = steps(plain), steps(ppo)
+    found = [a - b for a, b in zip(with_terms, without, strict=True)]
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-6)
+    told = {name: losses[name.removeprefix("loss_")] for name in terms.keys()}
+    assert told == pytest.approx({name: term.item() for name, term in terms.items()}, rel=1e-4)
+
+
+def parameters(ppo: PPO) -> list[Tensor]:
+    return [
+        *(p for net in (ppo.actor, ppo.critic) for p in net.mlp.parameters()),
+        ppo.actor.distribution.std_param,
+    ]
+
+
+def gradients(terms: TensorDictBase, loss: ClipPPOLoss) -> list[Tensor]:
+    """Of the terms of a loss that `torchrl_loss` has made, in the order of `parameters`."""
+    sum(term for name, term in terms.items() if name.startswith("loss_")).backward()
+    nets = [*loss.actor_network.modules(), *loss.critic_network.modules()]
+    joined = [net for net in nets if isinstance(net, Joined)]
+    weights = [weight for net in joined for weight in net.layers.parameters()]
+    return [torch.zeros_like(p) if p.grad is None else p.grad for p in [*weights, joined[0].scale]]
+
+
+FIXED = {"schedule": "fixed", "max_grad_norm": 1e9}
+NEAR = {"sigma": 1.5, "lambda_min": 0.2, "lambda_max": 2.0}
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"policy_distance": "mean", "coeff": 0.5},
+        {"policy_distance": "kl", "num_samples": 3},
+        {"beta": 0.0},
+    ],
+    ids=["hellinger", "mean", "kl", "no_value_term"],
+)
+def test_terms_and_gradients_are_those_of_the_loss_for_torchrl(options: dict[str, Any]) -> None:
+    """On the same states and draws, with normalizations and a critic that sees more."""
+    plain = collected(make(PPO, **FIXED))
+    ppo = collected(make(rsl.L2C2PPO, regularizer_cfg={**NEAR, **options}, **FIXED))
+
+    near = Neighborhood(**NEAR)
+    base = torchrl_loss(ppo)
+    loss = L2C2Loss(base, near, **options)
+    groups = GROUPS["critic"] if options.get("beta") != 0.0 else GROUPS["actor"]
+    generator = torch.Generator().manual_seed(0)  # that of make's torch.manual_seed(0)
+    draw = NeighborTransform(near, groups, num_samples=loss.l2c2_num_samples, generator=generator)
+    torch.manual_seed(5)
+    batch = draw(transitions(torch.randperm(ENVS * STEPS)))
+    terms = loss.policy_regularizer(batch).update(loss.value_regularizer(batch))
+    check_added(plain, ppo, terms, base)
+
+
+def test_it_reports_the_terms_that_it_added_and_what_they_are_made_of() -> None:
+    """At constant gains of the neighborhood's edge the terms are multiples of the distances."""
+    near = {"lambda_min": 0.1, "lambda_max": 0.1000001}
+    ppo = collected(make(rsl.L2C2PPO, regularizer_cfg={**near, "beta": 0.5, "coeff": 2.0}))
+    losses = update(ppo)
+    assert losses["l2c2_gain"] == pytest.approx(0.2, rel=1e-4)
+    assert losses["l2c2_actor"] == pytest.approx(0.2 * losses["l2c2_hellinger"], rel=1e-4)
+    assert losses["l2c2_critic"] == pytest.approx(0.1 * losses["l2c2_value_distance"], rel=1e-4)
+    assert "symmetry" not in losses
+
+
+def test_the_term_of_cats_is_that_of_the_loss_for_torchrl() -> None:
+    """Its value and its gradients, which the critic has none of."""
+    plain = collected(make(PPO, **FIXED))
+    ppo = collected(make(rsl.CATSPPO, regularizer_cfg={"lambda_temporal": 0.3}, **FIXED))
+    base = torchrl_loss(ppo)
+    terms = CATSLoss(base, 0.3).policy_regularizer(transitions(torch.arange(ENVS * STEPS)))
+    check_added(plain, ppo, terms, base)
+
+
+@pytest.mark.parametrize("distribution", ["Gaussian", "HeteroscedasticGaussian"])
+@pytest.mark.parametrize(
+    "algorithm, off", [(rsl.L2C2PPO, {"coeff": 0.0}), (rsl.CATSPPO, {"lambda_temporal": 0.0})]
+)
+def test_a_gain_of_zero_leaves_every_number_of_training(
+    algorithm: type[PPO], off: dict[str, float], distribution: str
+) -> None:
+    """Networks, their normalizations, rates of learning and actions, over several rollouts."""
+    ended = []
+    normal = {"class_name": f"{distribution}Distribution"}
+    for cls, extra in ((PPO, {}), (algorithm, {"regularizer_cfg": off})):
+        ppo = make(cls, normal=normal, num_learning_epochs=2, num_mini_batches=3, **extra)
+        for _ in range(3):
+            collected(ppo, dones={1: [0, 3]})
+            ppo.update()
+        networks = [*ppo.actor.state_dict().values(), *ppo.critic.state_dict().values()]
+        rest = [torch.tensor(ppo.learning_rate), torch.rand(1), ppo.actor.output_std]
+        ended.append([*networks, *rest])
+    for plain, regularized in zip(*ended, strict=True):
+        assert torch.equal(plain, regularized)
+
+
+def small_storage() -> Any:
+    """Of two environments and three steps, which see 10 times the step plus the environment."""
+    first = TensorDict({"policy": torch.tensor([[0.0], [1.0]])}, [2])
+    storage = rsl.SuccessorStorage(RolloutStorage("rl", 2, 3, first, [1]))
+    storage.distribution_params = (torch.zeros(3, 2, 1),)
+    storage.observations["policy"].copy_(10.0 * torch.arange(3).reshape(3, 1, 1) + first["policy"])
+    storage.add_last(first + 30.0)
+    return storage
+
+
+def known_successors(storage: Any) -> dict[float, float]:
+    """By the observations of all batches, what came next."""
+    batches = list(storage.mini_batch_generator(2, num_epochs=1))
+    here = torch.cat([batch.observations["policy"][batch.has_next] for batch in batches])
+    there = torch.cat([batch.next_observations["policy"][batch.has_next] for batch in batches])
+    assert not any("_row" in batch.observations.keys() for batch in batches)
+    return dict(zip(here.flatten().tolist(), there.flatten().tolist(), strict=True))
+
+
+def test_next_observations_are_found_by_their_time() -> None:
+    """In every environment's own rollout, the last step's among them, but not past an end."""
+    storage = small_storage()
+    assert known_successors(storage) == {0: 10, 10: 20, 20: 30, 1: 11, 11: 21, 21: 31}
+    storage.dones[1, 0] = 1
+    storage.dones[2, 1] = 1
+    assert known_successors(storage) == {0: 10, 20: 30, 1: 11, 11: 21}
+
+
+def test_final_observations_take_the_place_of_those_after_the_reset() -> None:
+    """Of the environments whose episodes the step has ended, until the storage is cleared."""
+    storage = small_storage()
+    storage.dones[1, 0] = 1
+    storage.step = 2  # steps 0 and 1 are stored
+    given = TensorDict({"policy": torch.tensor([[-5.0], [-6.0]])}, [2])
+    storage.add_final(given, torch.tensor([True, False]))
+    assert known_successors(storage) == {0: 10, 10: -5, 20: 30, 1: 11, 11: 21, 21: 31}
+    storage.clear()
+    assert 10 not in known_successors(storage)
+
+
+def test_observations_are_stored_once() -> None:
+    """Besides the last step's, there is one row of them for each step."""
+    storage = small_storage()
+    own = storage.observations["policy"].untyped_storage()
+    assert own.nbytes() == (3 + 1) * 2 * 4
+    holders = [part for part in vars(storage).values() if isinstance(part, TensorDict)]
+    assert {part["policy"].untyped_storage().data_ptr() for part in holders} == {own.data_ptr()}
+
+
+def test_terms_are_means_over_the_transitions_without_resets() -> None:
+    """The reset's observations do not matter, and ended rows do not dilute the mean."""
+    ends = {STEPS - 1: [0, 2], 1: [4]}
+    ppo = collected(make(rsl.CATSPPO), dones=ends)
+    after = observations(STEPS)
+    after[ends[STEPS - 1]] = after[ends[STEPS - 1]] * 1e6
+    ppo.storage.add_last(after)
+    known = torch.ones(STEPS, ENVS, dtype=torch.bool)
+    for step, environments in ends.items():
+        known[step, environments] = False
+    batch = transitions(known.flatten().nonzero().flatten())
+    term = CATSLoss(torchrl_loss(ppo)).policy_regularizer(batch)["loss_cats"]
+    assert update(ppo)["cats"] == pytest.approx(term.item(), rel=1e-5)
+
+
+def test_the_environments_final_observations_are_used() -> None:
+    """Where its extras have them, no transition is left out."""
+    ppo = collected(make(rsl.CATSPPO), dones={2: [1]}, final_obs=observations(77))
+    batch = transitions(torch.arange(ENVS * STEPS))
+    batch["next"][2 * ENVS + 1] = observations(77)[1]
+    term = CATSLoss(torchrl_loss(ppo)).policy_regularizer(batch)["loss_cats"]
+    assert update(ppo)["cats"] == pytest.approx(term.item(), rel=1e-5)
+
+
+def mirror(env: Any, obs: TensorDict | None, actions: Tensor | None) -> tuple[Any, Any]:
+    """Left for right, as rsl_rl's extension asks for it."""
+    both_obs = None if obs is None else torch.cat((obs, obs.apply(torch.neg)))
+    return both_obs, None if actions is None else torch.cat((actions, -actions))
+
+
+@pytest.mark.parametrize("augment", [True, False])
+def test_a_symmetry_extension_works_as_before(augment: bool) -> None:
+    """At no gain it trains as with plain PPO, and at one it leaves the regularizer's term alone."""
+    symmetry = {
+        "env": None,
+        "data_augmentation_func": mirror,
+        "use_data_augmentation": augment,
+        "use_mirror_loss": True,
+        "mirror_loss_coeff": 0.7,
+    }
+    plain = collected(make(PPO, symmetry_cfg=dict(symmetry)))
+    off = {"coeff": 0.0}
+    ppo = collected(make(rsl.L2C2PPO, symmetry_cfg=dict(symmetry), regularizer_cfg=off))
+    assert update(plain)["symmetry"] == update(ppo)["symmetry"] > 0
+    for expected, found in zip(parameters(plain), parameters(ppo), strict=True):
+        assert torch.equal(expected, found)
+
+    alone = update(collected(make(rsl.L2C2PPO)))
+    beside = update(collected(make(rsl.L2C2PPO, symmetry_cfg=symmetry)))
+    assert alone["l2c2_actor"] == beside["l2c2_actor"] > 0
+
+
+def test_the_gain_rises_with_the_updates_and_is_resumed() -> None:
+    """In a line to its end, from where a checkpoint left off, with the same draws of neighbors."""
+    cfg = {"coeff": 0.8, "ramp_updates": 4}
+    gains, ppo = [], make(rsl.L2C2PPO, regularizer_cfg=cfg)
+    for _ in range(6):
+        saved = copy.deepcopy(ppo.save())
+        losses = update(collected(ppo))
+        gains.append(losses["l2c2_gain"] / 0.8 if losses["l2c2_gain"] else 0.0)
+    full = gains[-1]
+    steepness = [gain / full for gain in gains]
+    assert steepness == pytest.approx([0, 0.25, 0.5, 0.75, 1, 1], rel=0.2)
+
+    resumed = make(rsl.L2C2PPO, regularizer_cfg=cfg)
+    resumed.load(saved, None, strict=True)
+    assert update(collected(resumed)) == losses
+
+
+def test_a_checkpoint_of_plain_ppo_is_a_beginning() -> None:
+    """Its networks are taken, and the ramp begins."""
+    ppo = make(rsl.L2C2PPO, regularizer_cfg={"ramp_updates": 4})
+    ppo.load(make(PPO).save(), None, strict=True)
+    assert update(collected(ppo))["l2c2_actor"] == 0
+
+
+@pytest.mark.parametrize(
+    "settings, said",
+    [
+        ({"model": RNNModel}, "the actor is recurrent .RNNModel.*Take a feed-forward model"),
+        ({"normal": {"class_name": "BetaDistribution"}}, "BetaDistribution, and normal ones alone"),
+        ({"normal": None}, "NoneType, and normal ones alone"),
+        ({"regularizer_cfg": {"sigmaa": 1.0}}, "sigmaa"),
+    ],
+)
+def test_what_cannot_be_regularized_is_refused(settings: dict[str, Any], said: str) -> None:
+    """With what was given and what to do."""
+    with pytest.raises(TypeError, match=said):
+        make(rsl.L2C2PPO, **settings)
+
+
+EXAMPLE = Path(__file__).parents[1] / "examples" / "rsl_rl_l2c2.py"
+
+
+def test_the_pages_configuration_builds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As it stands there, on any task."""
+    monkeypatch.syspath_prepend(EXAMPLE.parent)
+    from rsl_rl.runners import OnPolicyRunner
+    from rsl_rl_points import NoisyPoints
+
+    page = (EXAMPLE.parents[1] / "docs" / "rsl_rl.md").read_text()
+    told: dict[str, Any] = {}
+    exec(re.search(r"^```python\n(.*?)^```", page, re.M | re.S)[1], told)
+    loss = OnPolicyRunner(NoisyPoints(2), told["config"]).alg.regularization.loss
+    assert (loss.l2c2_policy_distance, loss.l2c2_neighborhood.lambda_min) == ("mean", 0.1)
+
+
+def test_the_runner_builds_it_by_its_name(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """With its settings, from a configuration; its terms are logged, and its state is saved."""
+    monkeypatch.syspath_prepend(EXAMPLE.parent)
+    from rsl_rl.runners import OnPolicyRunner
+    from rsl_rl_points import NoisyPoints
+
+    network = {"class_name": "MLPModel", "hidden_dims": [8]}
+    cfg = {"sigma": 0.5, "lambda_max": 3.0, "beta": 0.25, "policy_distance": "kl"}
+    algorithm = {"class_name": "torchrl_l2c2.rsl_rl:L2C2PPO", "regularizer_cfg": cfg}
+    config = {
+        "algorithm": algorithm,
+        "actor": {**network, "distribution_cfg": NORMAL},
+        "critic": network,
+        "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
+        "num_steps_per_env": 4,
+        "save_interval": 1,
+    }
+    runner = OnPolicyRunner(NoisyPoints(8), config, log_dir=str(tmp_path))
+    loss = runner.alg.regularization.loss
+    assert isinstance(runner.alg, rsl.L2C2PPO)
+    assert (loss.l2c2_neighborhood, loss.l2c2_beta) == (Neighborhood(0.5, lambda_max=3.0), 0.25)
+    logged = []
+    monkeypatch.setattr(runner.logger, "log", lambda **told: logged.append(told["loss_dict"]))
+    runner.learn(2)
+    assert logged[1].keys() >= {"surrogate", "l2c2_actor", "l2c2_critic", "l2c2_kl", "l2c2_gain"}
+    assert logged[1]["l2c2_actor"] > 0
+
+    again = OnPolicyRunner(NoisyPoints(8), config)
+    again.load(str(tmp_path / "model_1.pt"))
+    assert again.alg.regularization.updates == 2
+
+
+def test_the_example_trains_and_compares(tmp_path: Path) -> None:
+    """It prints a table of numbers with their intervals, and can be read in one go."""
+    done = subprocess.run(
+        [sys.executable, str(EXAMPLE)],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(EXAMPLE.parents[1])},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    cell = r"(-?[0-9.]+) ± ([0-9.]+)"
+    rows = re.findall(rf"^\| (.+) \| {cell} \| {cell} \|$", done.stdout, re.M)
+    plain, regularized, difference = [[float(cell) for cell in row[1:]] for row in rows]
+    for column in (0, 2):
+        assert difference[column] == pytest.approx(regularized[column] - plain[column], abs=2e-3)
+    for script in (EXAMPLE, EXAMPLE.with_stem("rsl_rl_points")):
+        assert len(script.read_text().splitlines()) < 80

@@ -1,0 +1,126 @@
+"""A regularized loss in the place of rsl_rl's symmetry extension."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from rsl_rl.extensions import Symmetry
+from rsl_rl.models import MLPModel
+from rsl_rl.storage import RolloutStorage
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_l2c2._checks import check_positive_int
+from torchrl_l2c2.gains import ConstantGain, RampGain
+from torchrl_l2c2.objectives import RegularizedLoss
+from torchrl_l2c2.rsl_rl.networks import VALID, write_parameters
+from torchrl_l2c2.transforms import NeighborTransform
+
+
+class Regularization:
+    """What rsl_rl's PPO asks a symmetry extension for, answered by a regularized loss.
+
+    The update of PPO has one place for a term of others: that of the mirror loss. This object
+    stands there, passes on to the real extension what is its, and adds the regularizer's terms to
+    its loss. The regularizer is computed at the batch's own rows, not at mirrored ones.
+
+    Args:
+        loss (RegularizedLoss): around an
+            :class:`~torchrl_l2c2.rsl_rl.ActorCriticLoss`.
+        neighbors (NeighborTransform, optional): writes into batches what the loss reads there.
+        coefficient (str): the coefficient of the loss that the ramp is of.
+        ramp_updates (int, optional): updates over which it rises from 0. ``None`` keeps it.
+        symmetry (Symmetry, optional): the real extension.
+    """
+
+    use_mirror_loss = True
+    mirror_loss_coeff = 1.0
+
+    def __init__(
+        self,
+        loss: RegularizedLoss,
+        neighbors: NeighborTransform | None,
+        coefficient: str,
+        ramp_updates: int | None,
+        symmetry: Symmetry | None,
+    ) -> None:
+        self.loss, self.neighbors, self.symmetry = loss, neighbors, symmetry
+        self.coefficient, self.ramp_updates, self.updates = coefficient, ramp_updates, 0
+        end = float(getattr(loss, coefficient))
+        self._gain: ConstantGain = ConstantGain(end)
+        if ramp_updates is not None:
+            check_positive_int("ramp_updates", ramp_updates)
+            self._gain = RampGain(end)
+        self._sums: dict[str, Tensor] = {}
+        self._batches = 0
+        self._set_gain()
+
+    def augment_batch(self, batch: RolloutStorage.Batch, original_batch_size: int) -> None:
+        """Adds mirrored rows where there is a symmetry that does."""
+        if self.symmetry is not None:
+            self.symmetry.augment_batch(batch, original_batch_size)
+
+    def compute_loss(
+        self, actor: MLPModel, batch: RolloutStorage.Batch, original_batch_size: int
+    ) -> Tensor:
+        """The regularizer's terms and, weighted, the mirror loss; called after the surrogate's.
+
+        Args:
+            actor: has just been evaluated at ``batch.observations``.
+            batch: of :class:`~torchrl_l2c2.rsl_rl.SuccessorStorage`.
+            original_batch_size: how many of its rows are not mirrored ones; they come first.
+        """
+        batch_of_loss = self._transitions(actor, batch, original_batch_size)
+        terms = dict(self.loss(batch_of_loss).items())
+        total = sum(term for name, term in terms.items() if name.startswith("loss_"))
+        if self.symmetry is not None:
+            mirror = self.symmetry.compute_loss(actor, batch, original_batch_size)
+            terms["symmetry"] = mirror
+            if self.symmetry.use_mirror_loss:
+                total = total + self.symmetry.mirror_loss_coeff * mirror
+        self._record(terms)
+        return total
+
+    def report(self) -> dict[str, float]:
+        """Means over the batches since the last call, by the names of the terms."""
+        names, sums = list(self._sums), list(self._sums.values())
+        means = (torch.stack(sums) / self._batches).tolist() if sums else []
+        self._sums, self._batches = {}, 0
+        return {name.removeprefix("loss_"): mean for name, mean in zip(names, means, strict=True)}
+
+    def step(self) -> None:
+        """Counts an update; the gain follows where it is on a ramp."""
+        self.updates += 1
+        self._set_gain()
+
+    def state_dict(self) -> dict[str, Any]:
+        """What the next updates depend on."""
+        generator = None if self.neighbors is None else self.neighbors.generator
+        drawn = {} if generator is None else {"generator": generator.get_state()}
+        return {"updates": self.updates, **drawn}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`state_dict` gave."""
+        self.updates = state["updates"]
+        self._set_gain()
+        if self.neighbors is not None and self.neighbors.generator is not None:
+            self.neighbors.generator.set_state(state["generator"].cpu())
+
+    def _set_gain(self) -> None:
+        progress = self.updates / self.ramp_updates if self.ramp_updates else 1.0
+        setattr(self.loss, self.coefficient, self._gain.step(progress))
+
+    def _transitions(
+        self, actor: MLPModel, batch: RolloutStorage.Batch, count: int
+    ) -> TensorDictBase:
+        transitions = batch.observations[:count]
+        parameters = tuple(part[:count] for part in actor.output_distribution_params)
+        transitions = write_parameters(transitions, parameters)
+        transitions.set("next", batch.next_observations).set(VALID, batch.has_next)
+        return transitions if self.neighbors is None else self.neighbors(transitions)
+
+    def _record(self, terms: dict[str, Tensor]) -> None:
+        self._batches += 1
+        for name, term in terms.items():
+            self._sums[name] = self._sums.get(name, 0.0) + term.detach()
