@@ -57,12 +57,13 @@ experiment.reports.runs experiment.reports.groups
 experiment.reports.score
 experiment.reports.tables
 experiment.reports.comparison experiment.reports.measures
+experiment.reports.front
 experiment.reports.figures experiment.reports.field
 experiment.reports.choice
 experiment.reports.page experiment.reports.readme experiment.reports.results
 experiment.reports.__init__
 experiment.reports.__main__
-experiment.trained
+experiment.trained experiment.search
 experiment.video
 experiment.workers
 experiment.evaluate experiment.update experiment.player experiment.manual

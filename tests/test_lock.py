@@ -3,10 +3,12 @@
 import re
 import subprocess
 import sys
+import threading
+import time
 
 import pytest
 
-from torchrl_l2c2.experiment.lock import FolderInUseError, lock_folder
+from torchrl_l2c2.experiment.lock import FolderInUseError, lock_folder, wait_for_folder
 
 CONTENDER = """
 import sys
@@ -78,3 +80,22 @@ def test_a_folder_is_given_back_with_its_holder(tmp_path):
     with pytest.raises(FolderInUseError, match=f"process {other.pid} "):
         lock_folder(tmp_path, first)
     other.communicate("\n")
+
+
+def test_a_folder_is_waited_for_till_its_process_ends(tmp_path):
+    """And no longer than asked."""
+    wait_for_folder(tmp_path / "none yet", 60)
+    process = contender(tmp_path)
+    go(process)
+    assert process.stdout.readline() == "taken\n"
+    begun = time.monotonic()
+    wait_for_folder(tmp_path, 0.3)
+    assert 0.3 <= time.monotonic() - begun < 10
+    with pytest.raises(FolderInUseError):
+        lock_folder(tmp_path, Run())
+    threading.Timer(0.3, process.kill).start()
+    wait_for_folder(tmp_path, 60)
+    assert time.monotonic() - begun < 30
+    run = Run()
+    lock_folder(tmp_path, run)
+    process.communicate()

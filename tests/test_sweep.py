@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from torchrl_l2c2.experiment.command import check_launcher
 from torchrl_l2c2.experiment.folder import list_checkpoints, load_checkpoint
 from torchrl_l2c2.experiment.sweep import Sweep, begin_sweep
 
@@ -21,11 +22,11 @@ SETTINGS = (
 LAUNCHERS = {"basic": [], "joblib": ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]}
 
 
-def start(folder, *overrides):
+def start(folder, *overrides, log="said"):
     """The command in a session of its own, as a terminal has one."""
     folder.mkdir(exist_ok=True)
     # Into a file: a pipe that nobody reads is full after some hundred lines of progress.
-    with open(folder / "said", "w") as output:
+    with open(folder / log, "w") as output:
         return subprocess.Popen(
             [sys.executable, ROOT / "train.py", *overrides, *SETTINGS, f"outputs={folder / 'o'}"],
             stdout=output,
@@ -35,8 +36,8 @@ def start(folder, *overrides):
         )
 
 
-def said(folder):
-    return (folder / "said").read_text()
+def said(folder, log="said"):
+    return (folder / log).read_text()
 
 
 def wait_until(condition, seconds=120.0):
@@ -148,13 +149,15 @@ def test_the_failed_jobs_of_a_sweep_are_named_at_its_end(tmp_path):
 
 
 def test_a_process_that_waits_for_a_job_ends_with_its_sweep(tmp_path):
-    """A launcher's worker that never got one, after the sweep was killed."""
+    """A launcher's worker that never got one, after the sweep was killed; not one of Slurm's."""
     begin = (
-        "import subprocess, sys, time\n"
+        "import os, subprocess, sys, time\n"
         "from torchrl_l2c2.experiment.sweep import begin_sweep\n"
         "with begin_sweep():\n"
-        "    subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(600)'])\n"
-        "    print('begun', flush=True)\n"
+        "    wait = [sys.executable, '-c', 'import time; time.sleep(600)']\n"
+        "    subprocess.Popen(wait)\n"
+        "    of_slurm = subprocess.Popen(wait, env={**os.environ, 'SLURM_JOB_ID': '7'})\n"
+        "    print(of_slurm.pid, flush=True)\n"
         "    time.sleep(600)\n"
     )
     process = subprocess.Popen(
@@ -163,23 +166,89 @@ def test_a_process_that_waits_for_a_job_ends_with_its_sweep(tmp_path):
         start_new_session=True,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
     )
-    assert process.stdout.readline() == b"begun\n"
-    assert len(alive(process.pid)) == 3  # with the guard
+    of_slurm = int(process.stdout.readline())
+    assert len(alive(process.pid)) == 4  # with the guard
     process.kill()
     process.wait()
-    wait_until(lambda: not alive(process.pid), 20)
+    wait_until(lambda: alive(process.pid) == [of_slurm], 20)
+    os.kill(of_slurm, signal.SIGKILL)
+
+
+@pytest.mark.parametrize("name", ["ray", "slurm"])
+def test_a_launcher_says_what_it_needs(name, monkeypatch):
+    """Where its plugin is not installed."""
+    monkeypatch.setattr("torchrl_l2c2.experiment.command.find_spec", lambda plugin: None)
+    with pytest.raises(SystemExit, match=rf"{name}_cluster needs the extra {name}: pip install"):
+        check_launcher(["train.py", "-m", f"hydra/launcher={name}_cluster"])
+    check_launcher(["train.py", "-m", "hydra/launcher=joblib"])
 
 
 def test_a_sweep_says_how_much_of_it_is_left():
     """By the mean of what is finished: 15 of 18 runs at 40 minutes, two at once."""
     with begin_sweep(["-m", "seed=0,1,2", "~logger"]) as begun:
         params = {"seed": "range(0,18)", "task": "a,b", "regularizer": "none,caps,l2c2"}
-        assert begun.standing(1, params, 1) == "run 1 of 18"
-        for seconds in (1800.0, 3000.0, float("nan")):
-            begun.add_finished(Path("run"), seconds)
+        assert begun.standing(1, params) == "run 1 of 18"
+        for number, seconds in enumerate((1800.0, 3000.0, float("nan"))):
+            begun.add_finished(number, Path("run"), seconds)
         # As a job sees it, in whatever process.
-        assert Sweep.of_this_job().standing(4, params, 2) == "run 4 of 18, about 5.3 h left"
-        assert begun.standing(18, params, 1) == "run 18 of 18, about 40 min left"
+        with begun.job(3, "seed=1"), begun.job(4, "seed=2"):
+            standing = Sweep.of_this_job().standing(4, params)
+            assert standing == "run 4 of 18, about 5.3 h left"
+        assert begun.standing(18, params) == "run 18 of 18, about 40 min left"
+
+
+def test_a_job_that_did_not_end_is_named_and_known_when_it_begins_again(tmp_path):
+    """Unless it was stopped; one that failed or ended is not."""
+    with begin_sweep() as begun:
+        begun.share(tmp_path)
+        with pytest.raises(KeyboardInterrupt), begun.job(0, "seed=0") as before:
+            assert not before
+            raise KeyboardInterrupt
+        with begun.job(1, "seed=1"):
+            Sweep.of_this_job().add_failure(1, "seed=1", "no room")
+        ((lost, why), failed) = begun.failures
+        assert lost == "seed=0" and why.startswith("lost with its process or machine")
+        assert failed == ("seed=1", "no room")
+        with begun.job(0, "seed=0") as before:
+            assert before
+        assert begun.failures == [("seed=1", "no room")]
+
+
+def test_a_job_of_a_sweep_that_ended_does_not_begin(tmp_path):
+    """One that waited in a cluster's queue; and the folder that they shared is gone."""
+    with begin_sweep() as begun:
+        begun.share(tmp_path)
+        job = Sweep.of_this_job()
+        assert job.stopped_by is None
+    assert job.stopped_by == signal.SIGTERM
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_machine_without_the_outputs_is_named(tmp_path):
+    """It would write where nobody looks."""
+    with begin_sweep() as begun:
+        begun.share(tmp_path / "outputs")
+        (tmp_path / "outputs").rename(tmp_path / "moved")
+        with pytest.raises(RuntimeError, match=r"outputs' is not on .* all machines share"):
+            Sweep.of_this_job()
+
+
+@pytest.mark.slow
+def test_two_sweeps_share_a_folder(tmp_path):
+    """At the same time: every run is made by one of them, and the same command finds all done."""
+    command = ("-m", "seed=0,1,2,3", "task.episodes=40", "compile=false")
+    alone, both = tmp_path / "alone", tmp_path / "both"
+    assert start(alone, *command).wait(500) == 0, said(alone)
+    pair = [start(both, *command, log=log) for log in ("one", "other")]
+    ended = [process.wait(500) for process in pair]
+    told = said(both, "one") + said(both, "other")
+    assert 1 in ended and "in use by process" in told and "Traceback" not in told, told
+    assert start(both, *command).wait(500) == 0, said(both)
+    assert "episode 1 of" not in said(both)
+    ours, theirs = runs(both), runs(alone)
+    assert ours.keys() == theirs.keys() and len(ours) == 4
+    for seed in ours:
+        assert numbers(ours[seed]) == numbers(theirs[seed])
 
 
 def numbers(folder):

@@ -11,8 +11,9 @@ import signal
 import sys
 import traceback
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,6 +44,13 @@ PACKAGE = Path(__file__).parents[1]
 CONF = next(folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if folder.is_dir())
 # What tells by itself what was wrong; anything else is a fault of the program.
 EXPECTED = (ValueError, OSError, RuntimeError, FloatingPointError, ImportError)
+# How long a file server may hold the lock of a machine that was lost.
+LOST_SECONDS = 180.0
+# Of conf/hydra/launcher/: the plugin, and the extra that brings it.
+LAUNCHERS = {
+    "ray_cluster": ("hydra_plugins.hydra_ray_launcher", "ray"),
+    "slurm_cluster": ("hydra_plugins.hydra_submitit_launcher", "slurm"),
+}
 HINTS: dict[type[Exception], str] = {
     SettingError: "--help lists every setting.",
     OtherRunError: "In a shell: outputs=FOLDER, allow_other_versions=true, task.episodes=N.",
@@ -79,8 +87,17 @@ def _node(chosen: Any) -> dict[str, Any]:
     return {"defaults": [*usual, "_self_"], **values}
 
 
+def check_launcher(arguments: Sequence[str]) -> None:
+    """Says which extra a launcher needs, where Hydra would say that it cannot be loaded."""
+    for name, (plugin, extra) in LAUNCHERS.items():
+        if f"hydra/launcher={name}" in arguments and find_spec(plugin) is None:
+            needed = f"pip install 'torchrl-l2c2[{extra}]'"
+            sys.exit(f"error: hydra/launcher={name} needs the extra {extra}: {needed}.")
+
+
 def main() -> None:
     """Runs what the command line says."""
+    check_launcher(sys.argv)
     keep_ctrl_c_from_children()
     signal.signal(signal.SIGTERM, terminate)
     register()
@@ -94,9 +111,8 @@ def main() -> None:
             sweep.stop(signal.SIGINT)
         finally:
             tell_end(sweep)
-        if sweep.stopped_by is not None:
-            sys.exit(128 + sweep.stopped_by)
-        sys.exit(bool(sweep.failures))
+        stopped_by, failures = sweep.stopped_by, sweep.failures
+    sys.exit(bool(failures) if stopped_by is None else 128 + stopped_by)
 
 
 def tell_end(sweep: Sweep) -> None:
@@ -135,26 +151,29 @@ def _run_job(values: dict[str, Any], sweep: Sweep) -> None:
     """A run that lets the sweep's other jobs go on when it fails."""
     if sweep.stopped_by is not None:
         return
+    number, job = HydraConfig.get().job.num, " ".join(HydraConfig.get().overrides.task)
     try:
-        with sweep.job():
-            if (finished := run(values, _standing(sweep))) is not None:
-                sweep.add_finished(finished.folder, finished.record.seconds)
-    except Interrupted as interruption:
-        print(interruption, file=sys.stderr)
-        sweep.stop(interruption.signal_number)
-    except KeyboardInterrupt:
-        sweep.stop(signal.SIGTERM)
+        with sweep.job(number, job) as begun_before:
+            patience = LOST_SECONDS if begun_before else 0.0
+            if (finished := run(values, _standing(sweep), patience)) is not None:
+                sweep.add_finished(number, finished.folder, finished.record.seconds)
+    except (Interrupted, KeyboardInterrupt) as interruption:
+        stopped_by = getattr(interruption, "signal_number", signal.SIGTERM)
+        if isinstance(interruption, Interrupted):
+            print(interruption, file=sys.stderr)
+        if sweep.is_remote and sweep.stopped_by is None:
+            # Its machine is wanted back. Ended so, the program that started it begins it again.
+            sys.exit(128 + stopped_by)
+        sweep.stop(stopped_by)
     except Exception as error:
         if not isinstance(error, EXPECTED):
             traceback.print_exc()
-        job = " ".join(HydraConfig.get().overrides.task)
-        sweep.add_failure(job, _tell(error).splitlines()[0])
+        sweep.add_failure(number, job, _tell(error).splitlines()[0])
 
 
 def _standing(sweep: Sweep) -> str:
     chosen = HydraConfig.get()
-    at_once = max(1, chosen.launcher.get("n_jobs", 1))
-    return sweep.standing(chosen.job.num + 1, chosen.sweeper.params or {}, at_once)
+    return sweep.standing(chosen.job.num + 1, chosen.sweeper.params or {})
 
 
 def _tell(error: Exception) -> str:
@@ -176,17 +195,19 @@ def run_folder(config: ExperimentConfig, outputs: str) -> Path:
     return Path(chosen.runtime.output_dir)
 
 
-def run(values: dict[str, Any], standing: str = "") -> FinishedRun | None:
+def run(values: dict[str, Any], standing: str = "", patience: float = 0.0) -> FinishedRun | None:
     """One run in its folder, its progress and its result, if it tests its policy.
 
     Args:
         values (dict): the configuration.
         standing (str): of the sweep that it belongs to; shown before its name and its progress.
+        patience (float): seconds to wait for a process that has its folder.
     """
     check_preset(values, HydraConfig.get().runtime.choices.get("preset"))
     config = ExperimentConfig.from_dict(values)
     # Here, as settings are checked before anything waits for torch.
     from torchrl_l2c2.experiment.folder import save_policy
+    from torchrl_l2c2.experiment.lock import wait_for_folder
     from torchrl_l2c2.experiment.process import keep_freed_memory
     from torchrl_l2c2.experiment.reports import compare_with_paper, finished_run
     from torchrl_l2c2.experiment.training import Experiment
@@ -203,6 +224,7 @@ def run(values: dict[str, Any], standing: str = "") -> FinishedRun | None:
     chosen = (config.task, config.algorithm, config.regularizer)
     named = f"{', '.join(group.name for group in chosen)}, seed {config.seed}: {folder}"
     print(f"{standing}: {named}" if standing else named, flush=True)
+    wait_for_folder(folder, patience)
     finished = finished_run(folder, config.to_dict())
     if finished is None:
         going_on = {name: values[name] for name in ("resume", "allow_other_versions")}

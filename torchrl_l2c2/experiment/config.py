@@ -89,6 +89,11 @@ class ExperimentConfig:
         description="processes that play episodes, one each in a round with one policy; more than "
         "1 needs algorithm.schedule other than step",
     )
+    workers: Literal["processes", "ray"] = Field(
+        default="processes",
+        description="what num_workers are: processes of this machine, or Ray's, on all machines of "
+        "its cluster (extra ray); the same seed gives the same episodes",
+    )
     compile: bool = Field(
         default=True,
         description="torch.compile the update where a C++ compiler is found; false: eager",
@@ -209,6 +214,11 @@ class ExperimentConfig:
     def _check_rounds(self) -> None:
         """Several workers play whole episodes, and all of them as many."""
         workers, episodes = self.num_workers, self.task.episodes
+        if workers == 1 and self.workers != "processes":
+            raise SettingError(
+                "num_workers",
+                f"must be more than 1 with workers={self.workers}, got 1: one process plays here.",
+            )
         if workers > 1 and getattr(self.algorithm, "num_envs", None) is not None:
             raise SettingError(
                 "num_workers",
@@ -251,6 +261,7 @@ FREE_SETTINGS = {
     "evaluate_every",
     "record",
     "threads",
+    "workers",
     "checkpoint_interval",
     "checkpoint_keep",
 }

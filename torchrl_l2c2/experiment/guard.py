@@ -18,17 +18,23 @@ GRACE_SECONDS = 1.0
 
 
 def marked(mark: str) -> list[int]:
-    """Other processes with this text in their environment."""
+    """Other processes with this text in their environment; Slurm's other jobs are Slurm's own."""
     found = []
+    own_job = _slurm_job(Path("/proc/self/environ").read_bytes())
     for path in Path("/proc").glob("[0-9]*/environ"):
         try:
-            belongs = mark.encode() in path.read_bytes()
+            environment = path.read_bytes()
         except OSError:  # ended, or another user's
             continue
         number = int(path.parent.name)
+        belongs = mark.encode() in environment and _slurm_job(environment) == own_job
         if belongs and number != os.getpid():
             found.append(number)
     return found
+
+
+def _slurm_job(environment: bytes) -> list[bytes]:
+    return [entry for entry in environment.split(b"\0") if entry.startswith(b"SLURM_JOB_ID=")]
 
 
 def main() -> None:

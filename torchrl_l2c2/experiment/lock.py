@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import socket
@@ -20,8 +21,9 @@ class FolderInUseError(RuntimeError):
 def lock_folder(folder: Path, holder: Any) -> weakref.finalize[..., Any]:
     """Takes a folder for this process until the holder is gone, or the process is.
 
-    The operating system holds the lock and frees it when the process ends, however it ends. Within
-    one process a folder can be taken several times.
+    The operating system holds the lock (``flock``) and frees it when the process ends, however it
+    ends; on a shared file system that passes such locks on it holds for all machines. Within one
+    process a folder can be taken several times.
 
     Args:
         folder (Path): exists; gets the files ``.lock`` and, for the time being, ``.lock_owner``.
@@ -55,6 +57,18 @@ def lock_folder(folder: Path, holder: Any) -> weakref.finalize[..., Any]:
     since = time.strftime("%Y-%m-%d %H:%M:%S")
     owner.write_text(json.dumps({"pid": os.getpid(), "host": socket.gethostname(), "since": since}))
     return weakref.finalize(holder, _release, lock, owner)
+
+
+def wait_for_folder(folder: Path, seconds: float) -> None:
+    """Waits until no process has a folder, for so long at most; takes nothing.
+
+    A file server holds the lock of a machine that was lost until it notices: NFS after 90 seconds,
+    as it is usually set.
+    """
+    if (folder / ".lock").exists():
+        lock = FileLock(folder / ".lock", timeout=0, is_singleton=True)
+        with contextlib.suppress(Timeout), lock.acquire(timeout=seconds):
+            pass
 
 
 def _release(lock: FileLock, owner: Path) -> None:

@@ -1,6 +1,7 @@
-"""What the jobs of a sweep and the process that began it tell each other.
+"""What the jobs of a sweep and the process that began it tell each other, on whatever machines.
 
-A folder in the system's temporary one holds it: whether the sweep is to stop, and what failed.
+A folder beside the runs' holds it: whether the sweep is to stop, and which jobs run, have finished
+and failed. A file for each, as several machines cannot add to one.
 """
 
 from __future__ import annotations
@@ -11,7 +12,9 @@ import contextlib
 import json
 import math
 import os
+import shutil
 import signal
+import socket
 import statistics
 import subprocess
 import sys
@@ -23,11 +26,15 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig
 
 from torchrl_l2c2.experiment.signals import FINISHING, SAME_SIGNAL_SECONDS, terminate
 
 VARIABLE = "TORCHRL_L2C2_SWEEP"  # of the environment, which a launcher's processes inherit
 POLL_SECONDS = 0.2
+REMOTE_POLL_SECONDS = 2.0  # of a file system that hundreds of machines may share
+LOST = "lost with its process or machine, or still running"
 GUARD = Path(__file__).with_name("guard.py")
 
 
@@ -35,103 +42,167 @@ class Sweep:
     """A sweep, as the process that began it and its jobs see it.
 
     Attributes:
-        begun_by: the process that began it.
+        begun_by: the process that began it, with its machine.
         overrides: of its command.
+        begun_here: the one that this process began; ``None`` where it began none.
         job_is_here: whether a job runs in this process.
     """
 
+    begun_here: Sweep | None = None
     job_is_here = False
     _following = False
 
-    def __init__(self, folder: Path, begun_by: int, overrides: Sequence[str] = ()) -> None:
+    def __init__(self, folder: Path, begun_by: tuple[str, int], overrides: Sequence[str]) -> None:
         self._folder, self.begun_by, self.overrides = folder, begun_by, overrides
 
     @classmethod
     def of_this_job(cls) -> Sweep:
-        """The sweep that this job belongs to."""
-        folder, begun_by, overrides = json.loads(os.environ[VARIABLE])
-        return cls(Path(folder), begun_by, overrides)
+        """The sweep that this job belongs to.
+
+        Raises:
+            RuntimeError: the launcher told the job nothing of it, or its folder is nowhere here.
+        """
+        if VARIABLE not in os.environ:
+            raise RuntimeError(f"the launcher passes no {VARIABLE} on to the jobs' environment.")
+        folder, (host, process), overrides, _ = json.loads(os.environ[VARIABLE])
+        if not Path(folder).parent.is_dir():
+            raise RuntimeError(
+                f"{str(Path(folder).parent)!r} is not on {socket.gethostname()}: choose an outputs "
+                "folder on a file system that all machines share."
+            )
+        return cls(Path(folder), (host, process), overrides)
+
+    @property
+    def is_remote(self) -> bool:
+        """Whether another program started this process, as a cluster does, and may do so again."""
+        host, process = self.begun_by
+        return host != socket.gethostname() or process not in (os.getpid(), os.getppid())
 
     @property
     def stopped_by(self) -> int | None:
         """The signal that stopped it; ``None`` where it goes on."""
-        path = self._folder / "stopped"
-        return int(path.read_text()) if path.exists() else None
+        try:
+            return int((self._folder / "stopped").read_text())
+        except FileNotFoundError:
+            # A job that was still to come, of a sweep that has ended.
+            return None if self._folder.is_dir() else signal.SIGTERM
 
     def stop(self, signal_number: int) -> None:
         """No job is to begin any more; those that train are to save and end."""
-        if self.stopped_by is not None:
-            return
-        partial = self._folder / f"stopped.{os.getpid()}"
-        partial.write_text(str(signal_number))
-        partial.replace(self._folder / "stopped")
+        if self.stopped_by is None:
+            self._put("stopped", str(signal_number))
 
-    def add_failure(self, job: str, reason: str) -> None:
+    def share(self, outputs: Path) -> None:
+        """Has what jobs tell below a folder that all their machines see; before any begins."""
+        stopped, self._folder = self.stopped_by, outputs / f".{self._folder.name}"
+        self._folder.mkdir(parents=True)
+        self.publish()
+        if stopped is not None:
+            self.stop(stopped)
+
+    def publish(self) -> None:
+        """Tells processes that are born from now on of it."""
+        told = [str(self._folder), self.begun_by, [*self.overrides], os.getcwd()]
+        os.environ[VARIABLE] = json.dumps(told)
+
+    def end(self) -> None:
+        """Nothing is told any more, and what still runs somewhere is to save and end."""
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def add_failure(self, number: int, job: str, reason: str) -> None:
         """Keeps why a job failed until the sweep's end."""
-        with open(self._folder / "failed", "a") as file:
-            file.write(json.dumps([job, reason]) + "\n")
+        self._put(f"failed_{number:06d}", json.dumps([job, reason]))
+        self._ended(number)
 
     @property
     def failures(self) -> list[tuple[str, str]]:
-        """Jobs that failed, with the reason in one line."""
-        path = self._folder / "failed"
-        lines = path.read_text().splitlines() if path.exists() else []
-        return [(job, reason) for job, reason in map(json.loads, lines)]
+        """Jobs that failed or did not end, with the reason in one line."""
+        failed = {number: (job, reason) for number, (job, reason) in self._all("failed")}
+        if self.stopped_by is None:
+            lost = f"{LOST}; the same command continues it"
+            failed |= {number: (job, lost) for number, job in self._all("running")}
+        return [failed[number] for number in sorted(failed)]
 
-    def add_finished(self, folder: Path, seconds: float) -> None:
+    def add_finished(self, number: int, folder: Path, seconds: float) -> None:
         """Keeps where a finished run lies, and how long it took, until the sweep's end."""
-        with open(self._folder / "finished", "a") as file:
-            file.write(json.dumps([str(folder), seconds]) + "\n")
+        self._put(f"finished_{number:06d}", json.dumps([str(folder), seconds]))
 
     @property
     def finished(self) -> list[Path]:
         """Folders of the runs that are finished, by this sweep or before."""
-        return [Path(folder) for folder, _ in self._finished()]
+        return [Path(folder) for _, (folder, _) in self._all("finished")]
 
-    def standing(self, number: int, params: Mapping[str, str], at_once: int) -> str:
+    def standing(self, number: int, params: Mapping[str, str]) -> str:
         """Where a sweep stands when a job begins, such as ``"run 3 of 72, about 4.1 h left"``.
 
         Args:
             number (int): of the job, from 1.
             params (Mapping): sweeps of the configuration, by setting.
-            at_once (int): jobs that run at the same time.
         """
         total = count_jobs(self.overrides, params)
-        seconds = [each for _, each in self._finished() if math.isfinite(each)]
+        seconds = [each for _, (_, each) in self._all("finished") if math.isfinite(each)]
         place = f"run {number} of {total}"
         if not seconds:
             return place
-        rounds = math.ceil((total - number + 1) / at_once)
+        rounds = math.ceil((total - number + 1) / max(1, len(self._all("running"))))
         return f"{place}, {_about(rounds * statistics.fmean(seconds))} left"
 
-    def _finished(self) -> list[tuple[str, float]]:
-        path = self._folder / "finished"
-        lines = path.read_text().splitlines() if path.exists() else []
-        return [(folder, seconds) for folder, seconds in map(json.loads, lines)]
-
     @contextlib.contextmanager
-    def job(self) -> Iterator[None]:
-        """A job of the sweep runs within it: a stop ends it in order, wherever it is."""
-        if os.getpid() != self.begun_by:
+    def job(self, number: int, job: str) -> Iterator[bool]:
+        """A job of the sweep runs within it: a stop ends it in order, wherever it is.
+
+        Args:
+            number (int): of the job; the same one where it is begun again.
+            job (str): what it is called.
+
+        Yields:
+            bool: whether it was begun before, and lost.
+        """
+        begun_before = (self._folder / f"running_{number:06d}").exists()
+        self._put(f"running_{number:06d}", json.dumps(job))
+        if self.begun_by != (socket.gethostname(), os.getpid()):
             self._follow()
         Sweep.job_is_here = True
         try:
-            yield
+            yield begun_before
+            self._ended(number)
         finally:
             Sweep.job_is_here = False
 
+    def _ended(self, number: int) -> None:
+        (self._folder / f"running_{number:06d}").unlink(missing_ok=True)
+
+    def _put(self, name: str, content: str) -> None:
+        """Writes a file that is there whole or not at all, unless the sweep has ended."""
+        partial = self._folder / f".{name}.{socket.gethostname()}.{os.getpid()}"
+        with contextlib.suppress(FileNotFoundError):
+            partial.write_text(content)
+            partial.replace(self._folder / name)
+
+    def _all(self, kind: str) -> list[tuple[int, Any]]:
+        """What the jobs told, by their numbers."""
+        told = []
+        for path in sorted(self._folder.glob(f"{kind}_*")):
+            with contextlib.suppress(FileNotFoundError):  # A job that has just ended.
+                told.append((int(path.name.rpartition("_")[2]), json.loads(path.read_text())))
+        return told
+
     def _follow(self) -> None:
-        """A stop reaches this process as SIGTERM, and it dies with the one that began the sweep."""
+        """A stop reaches this process as SIGTERM, and it dies with the one that began the sweep.
+
+        Unless it is remote: whether it lives on is then for the program that started it.
+        """
         signal.signal(signal.SIGTERM, terminate)
         if Sweep._following:
             return
         Sweep._following = True
+        remote = self.is_remote
 
         def follow() -> None:
             told = False
             while True:
-                time.sleep(POLL_SECONDS)
-                if os.getppid() != self.begun_by:
+                time.sleep(REMOTE_POLL_SECONDS if remote else POLL_SECONDS)
+                if not remote and os.getppid() != self.begun_by[1]:
                     os._exit(1)
                 if not told and Sweep.job_is_here and self.stopped_by is not None:
                     told = True
@@ -140,7 +211,21 @@ class Sweep:
         threading.Thread(target=follow, daemon=True).start()
 
 
-def _start_guard(mark: str) -> None:
+class ShareSweep(Callback):
+    """Puts what a sweep's jobs tell beside its runs, where every machine that runs one sees it."""
+
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        """Called by Hydra, once the folder is known and before its launcher starts."""
+        if Sweep.begun_here is not None:
+            Sweep.begun_here.share(Path(config.hydra.sweep.dir).absolute())
+
+
+def enter_folder() -> None:
+    """Goes where the sweep was begun, for launchers whose processes begin elsewhere."""
+    os.chdir(json.loads(os.environ[VARIABLE])[-1])
+
+
+def start_guard(mark: str) -> None:
     """Starts what ends the processes with this mark in their environment when this one is gone."""
     if not Path("/proc/self/environ").exists():
         return
@@ -181,8 +266,10 @@ def begin_sweep(overrides: Sequence[str] = ()) -> Iterator[Sweep]:
     Args:
         overrides (sequence of str): of its command.
     """
+    # Till it is known where the runs' folders are.
     with tempfile.TemporaryDirectory(prefix="torchrl_l2c2_") as folder:
-        sweep, first = Sweep(Path(folder), os.getpid(), overrides), 0.0
+        begun_by = (socket.gethostname(), os.getpid())
+        sweep, first = Sweep(Path(folder), begun_by, overrides), 0.0
 
         def receive(number: int, frame: Any) -> None:
             nonlocal first
@@ -195,11 +282,14 @@ def begin_sweep(overrides: Sequence[str] = ()) -> Iterator[Sweep]:
             elif time.monotonic() - first > SAME_SIGNAL_SECONDS:
                 terminate(number, frame)
 
-        _start_guard(folder)
-        os.environ[VARIABLE] = json.dumps([folder, os.getpid(), [*overrides]])
+        start_guard(Path(folder).name)
+        sweep.publish()
+        Sweep.begun_here = sweep
         previous = {n: signal.signal(n, receive) for n in (signal.SIGINT, signal.SIGTERM)}
         try:
             yield sweep
+            sweep.end()
         finally:
             for number, handler in previous.items():
                 signal.signal(number, handler)
+            Sweep.begun_here = None

@@ -12,6 +12,7 @@ import numpy as np
 
 from torchrl_l2c2.experiment.folder import write_atomically
 from torchrl_l2c2.experiment.reports.comparison import Estimate
+from torchrl_l2c2.experiment.reports.front import means, pareto_front
 from torchrl_l2c2.experiment.reports.groups import Group, group_records
 from torchrl_l2c2.experiment.reports.paper import METHODS
 from torchrl_l2c2.experiment.reports.records import FIGURES
@@ -84,6 +85,35 @@ def draw_plane(groups: Sequence[Group], figure: str, path: str | Path) -> None:
     for axis in axes[len(panels) :]:
         axis.set_visible(False)
     finish(picture, axes, f"{FIGURES[figure]}; hollow: the paper", path)
+
+
+def draw_front(groups: Sequence[Group], figure: str, path: str | Path) -> None:
+    """Draws every setting as a dot, and those of the Pareto front with their numbers and a line.
+
+    Along the line, whatever is gained in return is paid for in smoothness.
+
+    Args:
+        groups (sequence of Group): of one task and algorithm.
+        figure (str): one of ``FIGURES``.
+        path (str or Path): of the file; its ending, ``.png`` or ``.svg``, decides what it is.
+    """
+    picture, axes = subplots(1, 1, (5.4, 4.0))
+    styles = _styles(groups)
+    front = pareto_front(groups, figure)
+    for group in groups:
+        if place := means(group, figure):
+            color = styles[group.name]["color"]
+            axes[0].plot(*place[::-1], "o", color=color, alpha=1.0 if group in front else 0.3)
+    steps = [means(group, figure)[::-1] for group in front]
+    axes[0].step(*zip(*steps, strict=True), where="post", color="#444444", linewidth=1)
+    for number, step in enumerate(steps, 1):
+        offset = {"xytext": (4, -10), "textcoords": "offset points"}
+        axes[0].annotate(str(number), step, fontsize=9, **offset)
+    axes[0].set_xlabel("action variation")
+    axes[0].set_ylabel("return")
+    first = groups[0].first
+    title = f"{first.task}, {first.algorithm}: {len(groups)} settings, {FIGURES[figure]}"
+    _finish(picture, axes, title, path)
 
 
 def _draw_curve(

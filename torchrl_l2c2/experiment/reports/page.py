@@ -11,13 +11,17 @@ from torchrl_l2c2.experiment.reports.choice import choice_table
 from torchrl_l2c2.experiment.reports.comparison import statistics_tables, summary
 from torchrl_l2c2.experiment.reports.document import picture, whole_page
 from torchrl_l2c2.experiment.reports.field import field_table
-from torchrl_l2c2.experiment.reports.figures import draw_learning_curves, draw_plane
+from torchrl_l2c2.experiment.reports.figures import draw_front, draw_learning_curves, draw_plane
+from torchrl_l2c2.experiment.reports.front import front_table, searched
 from torchrl_l2c2.experiment.reports.groups import group_records
 from torchrl_l2c2.experiment.reports.measures import measures_table
 from torchrl_l2c2.experiment.reports.records import FIGURES, Record
 from torchrl_l2c2.experiment.reports.runs import FinishedRun
 from torchrl_l2c2.experiment.reports.score import readings
 from torchrl_l2c2.experiment.reports.tables import Table, results_tables, runs_table, score_table
+
+# What a front is drawn of: the policy's mean is what is deployed.
+FRONT = "late_mean"
 
 
 def all_tables(records: Sequence[Record]) -> list[Table]:
@@ -27,6 +31,7 @@ def all_tables(records: Sequence[Record]) -> list[Table]:
     return [
         *results_tables(groups),
         *statistics_tables(groups),
+        *(front_table(found, FRONT) for found in searched(groups)),
         *([score_table(scored)] if scored else []),
         runs_table(records),
     ]
@@ -82,6 +87,9 @@ def _draw(folder: Path, records: Sequence[Record], runs: Sequence[FinishedRun]) 
         if groups:
             paths.append(folder / f"plane_{figure}.svg")
             draw_plane(groups, figure, paths[-1])
+    for number, found in enumerate(searched(group_records(records)), 1):
+        paths.append(folder / f"front_{number}_{found[0].first.task.replace('/', '_')}.svg")
+        draw_front(found, FRONT, paths[-1])
     return paths
 
 

@@ -89,7 +89,7 @@ def _results(
     rows = [
         [
             *(group.first.task, group.first.algorithm, group.name, number_range(group.seeds)),
-            *(_pooled(group, figure, quantity) for quantity in QUANTITIES for figure in figures),
+            *(pooled(group, figure, quantity) for quantity in QUANTITIES for figure in figures),
             *(_published(group.first, quantity) for quantity in QUANTITIES),
         ]
         for group in groups
@@ -185,7 +185,8 @@ def number_range(values: Sequence[int]) -> str:
     )
 
 
-def _pooled(group: Group, figure: str, quantity: str) -> str:
+def pooled(group: Group, figure: str, quantity: str) -> str:
+    """The mean of a group, with the standard deviation over its seeds in brackets."""
     scores = group.scores(figure, quantity)
     if not len(scores):
         return "-"

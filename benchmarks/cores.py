@@ -1,0 +1,141 @@
+"""How long the paper's table takes on so many cores: ``python -m benchmarks.cores``.
+
+On paper, from the times of its runs: those of ``results/runs.csv``, and where a task and a method
+are not among them yet, a short run whose pace the whole one would keep. Runs share nothing but the
+file system, so that a sweep is a list of them of which every core that is free takes the next.
+"""
+
+from __future__ import annotations
+
+import argparse
+import heapq
+import logging
+import math
+import time
+from collections.abc import Mapping, Sequence
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
+
+from benchmarks.timing import machine
+from torchrl_l2c2.experiment import Experiment, ExperimentConfig
+from torchrl_l2c2.experiment.command import CONF
+from torchrl_l2c2.experiment.regularizers import REGULARIZERS
+from torchrl_l2c2.experiment.reports import Record, read_records
+from torchrl_l2c2.experiment.tasks import TASKS
+
+RECORDS = Path(__file__).parents[1] / "results" / "runs.csv"
+CORES = (1, 2, 4, 16, 64, 128, 256, 512)
+PACE_SECONDS = 20.0
+
+
+def makespan(seconds: Sequence[float], cores: int) -> float:
+    """When the last of these runs ends, if every core that is free takes the next one.
+
+    Examples:
+        >>> makespan([3.0, 3.0, 2.0, 4.0], 2)
+        7.0
+        >>> makespan([3.0, 3.0, 2.0, 4.0], 8)
+        4.0
+    """
+    free = [0.0] * cores
+    for each in seconds:
+        heapq.heapreplace(free, free[0] + each)
+    return max(free)
+
+
+def sweep() -> list[tuple[str, str]]:
+    """Task and regularizer of every run of ``experiment=table3``, in its order."""
+    params = OmegaConf.load(CONF / "experiment" / "table3.yaml").hydra.sweeper.params
+    parse = OverridesParser.create().parse_override
+    choices = {
+        name: [str(v) for v in parse(f"{name}={value}").sweep_string_iterator()]
+        for name, value in params.items()
+    }
+    return [
+        (one["task"], one["regularizer"])
+        for one in (dict(zip(choices, each, strict=True)) for each in product(*choices.values()))
+    ]
+
+
+def recorded(records: Sequence[Record], task: str, method: str) -> list[float]:
+    """Seconds of the runs of a task and a method that had the table's length."""
+    length = f"{TASKS[task].episodes} episodes"
+    return [
+        record.seconds
+        for record in records
+        if (record.task, record.method, record.length) == (task, method, length)
+        and math.isfinite(record.seconds)
+    ]
+
+
+def paced(task: str, method: str) -> float:
+    """Seconds that a run would take whose episodes are all as long as they may be.
+
+    By the processor's time of this process: what else the machine does is not in it.
+    """
+    config = ExperimentConfig(
+        task=TASKS[task], regularizer=REGULARIZERS[method], late_share=0.0, test_episodes=0
+    )
+    begun = time.process_time()
+    experiment = Experiment(config)
+    experiment.train(2)
+    start, frames = time.process_time(), experiment.player.frames
+    while time.process_time() - start < PACE_SECONDS:
+        experiment.train(len(experiment.metrics) + 1)
+    took = time.process_time() - start
+    pace = (experiment.player.frames - frames) / took
+    experiment.close()
+    return start - begun + config.task.episodes * config.task.time_limit / pace
+
+
+def main() -> None:
+    """Prints the table, and what it was made from."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.cores", description=__doc__)
+    parser.add_argument("--records", default=RECORDS, help="default: results/runs.csv")
+    chosen = parser.parse_args()
+    logging.getLogger("torchrl").setLevel(logging.ERROR)
+    records, runs, where = read_records(chosen.records), sweep(), machine()
+    lines = ["| task | method | minutes | from |", "| --- | --- | --- | --- |"]
+    seconds: dict[tuple[str, str], float] = {}
+    for task, method in dict.fromkeys(runs):
+        known = recorded(records, task, method)
+        # Of runs that shared their core with others the fastest shared least.
+        seconds[task, method] = min(known) if known else paced(task, method)
+        source = f"the fastest of {len(known)} runs" if known else "pace, at most"
+        lines.append(f"| {task} | {method} | {seconds[task, method] / 60:.0f} | {source} |")
+    print(report([seconds[each] for each in runs], lines, where))
+
+
+def report(seconds: Sequence[float], sources: Sequence[str], where: Mapping[str, Any]) -> str:
+    """The page: hours by cores, where more cores stop to help, and what a run takes."""
+    total, longest = sum(seconds), max(seconds)
+    table = ["| cores | hours | of the cores' time, in use |", "| --- | --- | --- |"]
+    for cores in CORES:
+        whole = makespan(seconds, cores)
+        table.append(f"| {cores} | {whole / 3600:.1f} | {total / whole / cores:.0%} |")
+    enough = next(n for n in range(1, len(seconds) + 1) if makespan(seconds, n) <= 1.001 * longest)
+    return "\n".join(
+        [
+            "# The paper's table on many cores",
+            "",
+            f"`python -m benchmarks.cores > results/cores.md`, commit {where['commit']}",
+            "",
+            *table,
+            "",
+            f"{len(seconds)} runs of one core each, {total / 3600:.0f} hours in all. The longest "
+            f"takes {longest / 3600:.1f} hours, and no number of cores makes the table faster than "
+            f"that: from {enough} cores on, more of them change nothing.",
+            "",
+            *sources,
+            "",
+            f"{where['cpu']}, {where['cores']} cores, load {where['load']:.1f}.",
+        ]
+    )
+
+
+if __name__ == "__main__":
+    main()

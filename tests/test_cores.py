@@ -1,0 +1,25 @@
+"""How long a sweep takes on so many cores, on paper."""
+
+import pytest
+
+from benchmarks.cores import makespan, report, sweep
+
+
+@pytest.mark.parametrize(("cores", "hours"), [(1, 15.0), (2, 10.0), (3, 8.0), (4, 7.0), (9, 6.0)])
+def test_a_free_core_takes_the_next_run(cores, hours):
+    """By hand: 1, 2, 3, 3 and 6 hours in this order."""
+    assert makespan([1.0, 2.0, 3.0, 3.0, 6.0], cores) == hours
+
+
+def test_the_table_has_all_of_the_papers_runs():
+    """A seed's runs before the next seed's."""
+    runs = sweep()
+    assert len(runs) == 288 and len(set(runs)) == 16 and runs[:16] == runs[16:32]
+
+
+def test_the_page_says_where_it_stops_scaling():
+    """Four runs of an hour and one of three: with three cores they end with the longest."""
+    where = {"commit": "abc", "cpu": "a processor", "cores": 2, "load": 1.0}
+    page = report([3600.0] * 4 + [3 * 3600.0], [], where)
+    assert "| 1 | 7.0 | 100% |" in page and "| 2 | 5.0 | 70% |" in page
+    assert "The longest takes 3.0 hours" in page and "from 5 cores on" in page

@@ -1,0 +1,70 @@
+"""The Pareto front of return and smoothness, by hand and by Optuna."""
+
+import re
+
+import numpy as np
+import pytest
+
+from tests.test_reports import make_config, make_run
+from torchrl_l2c2.experiment import L2C2Config
+from torchrl_l2c2.experiment.reports import read_runs, write_report
+from torchrl_l2c2.experiment.reports.front import front_table, pareto_front, searched
+from torchrl_l2c2.experiment.reports.groups import group_records
+
+# beta -> return and action variation; 1 and 3 are alike, 5 is beaten in one by 4.
+SETTINGS = {
+    1: (100.0, 0.05),
+    2: (90.0, 0.05),
+    3: (100.0, 0.05),
+    4: (120.0, 0.08),
+    5: (120.0, 0.09),
+    6: (50.0, 0.02),
+    7: (110.0, 0.10),
+}
+
+
+def groups(folder, settings):
+    for beta, (total, variation) in settings.items():
+        for seed in (0, 1):
+            config = make_config(regularizer=L2C2Config(beta=float(beta)), seed=seed)
+            shift = 4.0 if seed else -4.0  # the mean over seeds is what counts
+            make_run(folder / f"{beta}_{seed}", config, total + shift, variation)
+    return group_records(run.record for run in read_runs(folder))
+
+
+def test_the_front_is_what_nothing_beats(tmp_path):
+    """From the smoothest on; equal ones are all on it."""
+    front = pareto_front(groups(tmp_path, SETTINGS), "late_mean")
+    betas = [group.first.other_settings["regularizer.beta"] for group in front]
+    assert betas[0] == "6" and set(betas[1:3]) == {"1", "3"} and betas[3:] == ["4"]
+
+
+def test_the_front_is_optunas(tmp_path):
+    """On random points, by its own definition."""
+    optuna = pytest.importorskip("optuna")
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    draws = np.random.default_rng(0)
+    settings = {beta: (draws.integers(0, 40), draws.integers(1, 40) / 400) for beta in range(1, 40)}
+    study = optuna.create_study(directions=["maximize", "minimize"])
+    for values in settings.values():
+        study.add_trial(optuna.trial.create_trial(values=list(values)))
+    ours = pareto_front(groups(tmp_path, settings), "late_mean")
+    found = {float(group.first.other_settings["regularizer.beta"]) for group in ours}
+    assert found == {trial.number + 1.0 for trial in study.best_trials}
+
+
+def test_the_report_has_the_front_and_its_picture(tmp_path):
+    """Numbered alike; fewer than four settings of a method are a comparison, not a search."""
+    few = groups(tmp_path / "few", {beta: SETTINGS[beta] for beta in (1, 4, 6)})
+    assert searched(few) == []
+    many = groups(tmp_path / "many", SETTINGS)
+    assert searched(many) == [many]
+    rows = front_table(many, "late_mean").rows
+    # make_run: the late policies' mean is 12 more than the total.
+    assert rows[0] == ["1", "L2C2, beta=6", "0, 1", "62.00 (5.66)", "0.032 (0.000)"]
+    assert rows[3][:2] == ["4", "L2C2, beta=4"] and len(rows) == 4
+    runs = read_runs(tmp_path / "many")
+    page = write_report(tmp_path / "report", [run.record for run in runs], runs)
+    assert "Pareto front" in page.read_text()
+    picture = (page.parent / "front_1_swingup.svg").read_text()
+    assert set("1234") <= set(re.findall(r">(\d)</text>", picture))

@@ -1,0 +1,103 @@
+"""The search: what is searched, how a trial is run, and that it goes on."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+optuna = pytest.importorskip("optuna")
+
+from torchrl_l2c2.experiment.search import Search, main, read_space  # noqa: E402
+
+ROOT = Path(__file__).parents[1]
+GAINS = ("regularizer.lambda_max=tag(log, interval(0.1, 10))", "regularizer.beta=interval(0,1)")
+SHORT = (
+    "task.episodes=40", "task.max_steps=60", "algorithm.updates=4", "test_episodes=2",
+    "compile=false", "checkpoint_interval=0", "seed=0,1",
+)  # fmt: skip
+
+
+def test_hydras_grammar_says_what_is_searched():
+    """Intervals and choices; sweeps are of every trial."""
+    space, fixed = read_space([*GAINS, "regularizer=choice(caps,l2c2)", "seed=0,1", "task=ant"])
+    assert space == {
+        "regularizer.lambda_max": optuna.distributions.FloatDistribution(0.1, 10.0, log=True),
+        "regularizer.beta": optuna.distributions.FloatDistribution(0.0, 1.0),
+        "regularizer": optuna.distributions.CategoricalDistribution(("caps", "l2c2")),
+    }
+    assert fixed == ["seed=0,1", "task=ant"]
+
+
+def test_a_trial_is_a_sweep_in_a_folder_of_its_own(tmp_path):
+    """With values of four digits, as names of folders have them."""
+    search = Search(tmp_path, [*GAINS, "seed=0,1", "hydra/launcher=joblib"])
+    values = {"regularizer.lambda_max": 0.123456, "regularizer.beta": 1 / 3}
+    assert search.command(3, values)[1:] == [
+        *("-m", "torchrl_l2c2.experiment", "-m", "seed=0,1", "hydra/launcher=joblib"),
+        *("regularizer.lambda_max=0.1235", "regularizer.beta=0.3333"),
+        f"outputs={tmp_path}/trial_0003",
+    ]
+
+
+def test_a_search_goes_on_with_the_trial_that_was_lost(tmp_path):
+    """Two at once take different ones; proposals do not depend on how often it was begun anew."""
+    first = Search(tmp_path, GAINS)
+    beginning = first.trials(3)
+    number, values = next(beginning)
+    assert number == 0
+    # Another process would see the lock; here the study alone says that the trial was begun.
+    beginning.close()
+    again = dict(Search(tmp_path, GAINS).trials(3))
+    assert again[0] == values and again.keys() == {0, 1, 2}
+    whole = dict(Search(tmp_path / "whole", GAINS).trials(3))
+    assert again == whole
+    assert [json.loads(line)["op_code"] for line in (tmp_path / "journal.log").open()]
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [(("seed=0,1",), "nothing is searched"), ((*GAINS, "task=ant"), "choose another folder")],
+)
+def test_what_cannot_be_searched_is_refused(tmp_path, settings, told):
+    """And another search's folder is left as it is."""
+    Search(tmp_path, GAINS)
+    with pytest.raises(ValueError, match=told):
+        Search(tmp_path, settings)
+    with pytest.raises(SystemExit, match=f"error: .*{told}"):
+        main([*settings, "--output", str(tmp_path)])
+
+
+def start(folder):
+    command = [sys.executable, "-m", "torchrl_l2c2.experiment.search", *SHORT, *GAINS]
+    with open(folder / "said", "a") as output:
+        return subprocess.Popen(
+            [*command, "--trials", "4", "--output", str(folder / "search")],
+            stdout=output,
+            stderr=output,
+            start_new_session=True,
+            env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)},
+        )
+
+
+@pytest.mark.slow
+def test_a_stopped_search_ends_with_a_front(tmp_path):
+    """Stopped in its second trial, and the same command again."""
+    process = start(tmp_path)
+    ends = time.monotonic() + 200
+    while not list((tmp_path / "search").glob("trial_0001/**/checkpoint_*.pt")):
+        assert time.monotonic() < ends and process.poll() is None
+        time.sleep(0.1)
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(60) == 128 + signal.SIGTERM, (tmp_path / "said").read_text()
+    assert start(tmp_path).wait(500) == 0, (tmp_path / "said").read_text()
+    said = (tmp_path / "said").read_text()
+    assert said.count("trial 2 of 4: ") == 2 and "continuing after episode" in said
+    study = Search(tmp_path / "search", [*SHORT, *GAINS]).study
+    assert [trial.state.name for trial in study.trials] == ["COMPLETE"] * 4
+    assert "Pareto front" in (tmp_path / "search" / "report" / "report.html").read_text()
+    assert (tmp_path / "search" / "report" / "front_1_swingup.svg").exists()

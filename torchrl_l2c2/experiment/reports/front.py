@@ -1,0 +1,72 @@
+"""What no other setting beats in return and smoothness at once: the Pareto front."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+
+from torchrl_l2c2.experiment.reports.comparison import SIGNS
+from torchrl_l2c2.experiment.reports.groups import Group
+from torchrl_l2c2.experiment.reports.records import FIGURES, QUANTITIES
+from torchrl_l2c2.experiment.reports.tables import Table, number_range, pooled
+
+# Fewer settings of one method are a comparison, which tables of results show.
+LEAST = 4
+
+
+def searched(groups: Sequence[Group]) -> list[list[Group]]:
+    """Groups of a task, an algorithm and a length, where a method was run with several settings."""
+    together: dict[tuple[str, ...], list[Group]] = defaultdict(list)
+    for group in groups:
+        together[group.first.task, group.first.algorithm, group.first.length].append(group)
+    return [
+        found
+        for found in together.values()
+        if max(Counter(group.first.method for group in found).values()) >= LEAST
+    ]
+
+
+def means(group: Group, figure: str) -> tuple[float, ...]:
+    """Return and action variation, means over seeds; fewer numbers where one is not known."""
+    scores = [group.scores(figure, quantity) for quantity in SIGNS]
+    return tuple(float(each.mean()) for each in scores if len(each))
+
+
+def pareto_front(groups: Sequence[Group], figure: str) -> list[Group]:
+    """Those with which no other one can compete in both, from the smoothest on.
+
+    A group is left out if another one is at least as good in return and in action variation, and
+    better in one of them.
+
+    Args:
+        groups (sequence of Group): of one task and algorithm.
+        figure (str): one of ``FIGURES``.
+    """
+    known = [(group, means(group, figure)) for group in groups]
+    # The smoothest first, and of equally smooth ones that with the largest return.
+    ordered = sorted((m[1], -m[0], i) for i, (_, m) in enumerate(known) if len(m) == len(SIGNS))
+    front: list[int] = []
+    best: tuple[float, float] | None = None
+    for variation, loss, place in ordered:
+        if best is None or loss < best[1] or (variation, loss) == best:
+            front.append(place)
+            best = (variation, loss)
+    return [known[place][0] for place in front]
+
+
+def front_table(groups: Sequence[Group], figure: str) -> Table:
+    """The front, numbered as in its picture; means over seeds, standard deviations in brackets."""
+    first, front = groups[0].first, pareto_front(groups, figure)
+    rows = [
+        [
+            *(str(place), group.name, number_range(group.seeds)),
+            *(pooled(group, figure, quantity) for quantity in QUANTITIES),
+        ]
+        for place, group in enumerate(front, 1)
+    ]
+    note = (
+        f"{len(front)} of {len(groups)} settings; every other one returns no more and is no "
+        "smoother than one of these. The best of many has been lucky, too: run it on new seeds."
+    )
+    title = f"{first.task}, {first.algorithm}: Pareto front, {FIGURES[figure]}"
+    return Table(title, ["", "settings", "seeds", *QUANTITIES.values()], rows, [note])

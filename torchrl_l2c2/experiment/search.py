@@ -1,0 +1,260 @@
+"""Search for settings that return more and act more smoothly, by Optuna: two objectives, one front.
+
+A trial is a sweep of the main command with the values that Optuna proposes, in a folder of its own;
+what stops, goes on as every sweep does. Trials are in ``journal.log`` as lines of JSON, which
+several processes, also on several machines, may add to.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import statistics
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import ChoiceSweep, IntervalSweep, Override
+
+from torchrl_l2c2.experiment.folder import make_folder
+from torchrl_l2c2.experiment.lock import FolderInUseError, lock_folder
+from torchrl_l2c2.experiment.reports import find_runs, write_report
+from torchrl_l2c2.experiment.reports.comparison import SIGNS
+from torchrl_l2c2.experiment.reports.front import front_table
+from torchrl_l2c2.experiment.reports.groups import group_records
+from torchrl_l2c2.experiment.sweep import start_guard
+
+if TYPE_CHECKING:
+    from optuna import Study
+    from optuna.distributions import BaseDistribution
+
+DESCRIPTION = """\
+Searches for settings with a large return and a small action variation, and writes a report with the
+Pareto front. Settings are those of the main command, and of Hydra's grammar:
+
+  name=interval(0,1)            searched, a real number
+  name=tag(log,interval(1,9))   searched on a logarithmic scale
+  name=choice(a,b)              searched, one of these
+  seed=0,1,2                    every trial runs all of them; its figures are their means
+  hydra/launcher=ray_cluster    where a trial's runs are: docs/clusters.md
+
+The same command goes on; several of them, begun at the same time, share the trials.
+"""
+EXAMPLE = r"""
+example:
+  python -m torchrl_l2c2.experiment.search --trials 30 --output outputs/search \
+    seed=0,1 'regularizer.lambda_max=tag(log,interval(.1,10))' 'regularizer.beta=interval(0,1)'
+"""
+FIGURE = "late_mean"
+DIGITS = 4
+MARK = "TORCHRL_L2C2_SEARCH"  # of the environment, by which the processes of a search are known
+
+
+class Search:
+    """A study in a folder: what is searched, and what every trial has in common.
+
+    Args:
+        folder (Path): made where it is not there.
+        overrides (sequence of str): of the main command, with what is searched among them.
+
+    Keyword Args:
+        seed (int): of Optuna's proposals; those of one process follow from it. Default 0.
+
+    Raises:
+        ImportError: Optuna is not installed.
+        ValueError: nothing is searched, or the folder is of another search.
+    """
+
+    def __init__(self, folder: Path, overrides: Sequence[str], *, seed: int = 0) -> None:
+        self.space, self.fixed = read_space(overrides)
+        if not self.space:
+            raise ValueError("nothing is searched; give a setting interval(a,b) or choice(a,b).")
+        self.folder, self._seed = make_folder(folder), seed
+        self.study = self._open()
+        settings = [each for each in self.fixed if not each.startswith("hydra")]
+        settings += [f"{name}={kind}" for name, kind in self.space.items()]
+        begun = self.study.user_attrs.get("settings", sorted(settings))
+        if begun != sorted(settings):
+            raise ValueError(
+                f"{str(folder)!r} holds a search with {' '.join(begun)}: choose another folder."
+            )
+        self.study.set_user_attr("settings", begun)
+
+    def trials(self, most: int) -> Iterator[tuple[int, dict[str, Any]]]:
+        """Numbers and values of what is to be run; what was begun and lost comes first.
+
+        Args:
+            most (int): how many there are to be in all.
+        """
+        from optuna.samplers import TPESampler
+        from optuna.trial import TrialState
+
+        for lost in self.study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
+            with self._taken(lost.number) as ours:
+                if ours:
+                    yield lost.number, lost.params
+        while (done := len(self.study.get_trials(deepcopy=False))) < most:
+            # What has been proposed before is of no matter: a continued search is the same.
+            entropy = np.random.SeedSequence([self._seed, done])
+            self.study.sampler = TPESampler(seed=int(entropy.generate_state(1)[0]))
+            trial = self.study.ask(self.space)
+            with self._taken(trial.number) as ours:
+                if ours:
+                    yield trial.number, trial.params
+
+    def command(self, number: int, values: Mapping[str, Any]) -> list[str]:
+        """A trial as a sweep of the main command."""
+        found = [f"{name}={_short(value)}" for name, value in values.items()]
+        main = (sys.executable, "-m", "torchrl_l2c2.experiment", "-m")
+        return [*main, *self.fixed, *found, f"outputs={self._of(number)}"]
+
+    def tell(self, number: int) -> dict[str, float]:
+        """Gives Optuna what a trial's runs came to, and returns it: means over them."""
+        runs = find_runs([self._of(number)]).runs
+        scores = {q: [run.record.figure(FIGURE, q) for run in runs] for q in SIGNS}
+        values = {quantity: statistics.fmean(each) for quantity, each in scores.items()}
+        self.study.tell(number, list(values.values()), skip_if_finished=True)
+        return values
+
+    def tell_failure(self, number: int) -> None:
+        """A trial some of whose runs failed; those that did not would flatter it."""
+        from optuna.trial import TrialState
+
+        self.study.tell(number, state=TrialState.FAIL, skip_if_finished=True)
+
+    def _open(self) -> Study:
+        try:
+            import optuna
+            from optuna.storages.journal import JournalFileBackend
+        except ImportError as error:
+            raise ImportError(
+                f"{error}; pip install 'torchrl-l2c2[search]' installs Optuna."
+            ) from error
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        journal = JournalFileBackend(str(self.folder / "journal.log"))
+        return optuna.create_study(
+            study_name="search",
+            storage=optuna.storages.JournalStorage(journal),
+            directions=["maximize" if sign > 0 else "minimize" for sign in SIGNS.values()],
+            load_if_exists=True,
+        )
+
+    @contextmanager
+    def _taken(self, number: int) -> Iterator[bool]:
+        """Whether this process has a trial for itself meanwhile."""
+        try:
+            give_back = lock_folder(make_folder(self._of(number)), self)
+        except FolderInUseError:
+            yield False
+            return
+        yield True
+        give_back()
+
+    def _of(self, number: int) -> Path:
+        return self.folder / f"trial_{number:04d}"
+
+
+def read_space(overrides: Sequence[str]) -> tuple[dict[str, BaseDistribution], list[str]]:
+    """What is searched, as Optuna has it, and what is not.
+
+    Raises:
+        ValueError: a range that cannot be.
+    """
+    from optuna.distributions import CategoricalDistribution, FloatDistribution
+
+    space: dict[str, BaseDistribution] = {}
+    fixed = []
+    for override in OverridesParser.create().parse_overrides([*overrides]):
+        name, value = override.get_key_element(), override.value()
+        if isinstance(value, IntervalSweep):
+            assert value.start is not None and value.end is not None
+            space[name] = FloatDistribution(value.start, value.end, log="log" in value.tags)
+        elif isinstance(value, ChoiceSweep) and not value.simple_form:
+            space[name] = CategoricalDistribution(_choices(override))
+        else:
+            assert override.input_line is not None
+            fixed.append(override.input_line)
+    return space, fixed
+
+
+def _choices(override: Override) -> list[str]:
+    return [str(choice) for choice in override.sweep_string_iterator()]
+
+
+def _short(value: Any) -> Any:
+    """Names of folders have it in them; more digits change nothing that a search could find."""
+    return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
+
+
+def run_sweep(command: Sequence[str]) -> int:
+    """Runs a sweep in a process of its own, which hears the signals that this one gets.
+
+    Returns:
+        int: its exit status; 128 and the signal's number where one stopped it.
+    """
+    with subprocess.Popen(command) as process:
+        heard = (signal.SIGINT, signal.SIGTERM)
+        previous = {n: signal.signal(n, lambda n, _: process.send_signal(n)) for n in heard}
+        try:
+            return process.wait()
+        finally:
+            for number, handler in previous.items():
+                signal.signal(number, handler)
+
+
+def main(arguments: Iterable[str] | None = None) -> None:
+    """Does what the command line says; an error is one line."""
+    parser = _parser()
+    chosen = parser.parse_args(None if arguments is None else list(arguments))
+    try:
+        search = Search(Path(chosen.output), chosen.settings, seed=chosen.sampler_seed)
+        os.environ[MARK] = mark = f"{search.folder.resolve()} {os.getpid()}"
+        start_guard(mark)
+        for number, values in search.trials(chosen.trials):
+            told = ", ".join(f"{name}={_short(value)}" for name, value in values.items())
+            print(f"trial {number + 1} of {chosen.trials}: {told}", flush=True)
+            status = run_sweep(search.command(number, values))
+            if status == 1:
+                search.tell_failure(number)
+            elif status:
+                sys.exit(status if status > 0 else 128 - status)
+            else:
+                scores = (f"{name} {score:.4g}" for name, score in search.tell(number).items())
+                print(f"trial {number + 1}: {', '.join(scores)}", flush=True)
+        _report(search.folder)
+    except (ValueError, OSError, RuntimeError, ImportError) as error:
+        sys.exit(f"error: {error}")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m torchrl_l2c2.experiment.search",
+        description=DESCRIPTION,
+        epilog=EXAMPLE.lstrip(),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("settings", nargs="+", metavar="NAME=VALUE", help="as above")
+    add("--trials", type=int, default=30, help="in all (default: 30)")
+    add("--output", default="outputs/search", help="folder (default: outputs/search)")
+    add("--sampler-seed", type=int, default=0, help="of Optuna's proposals (default: 0)")
+    return parser
+
+
+def _report(folder: Path) -> None:
+    found = find_runs([folder])
+    records = [run.record for run in found.runs]
+    if not records:
+        raise RuntimeError(f"no trial has finished; see train.log below {str(folder)!r}.")
+    page = write_report(folder / "report", records, found.runs, found.notes)
+    print(front_table(group_records(records), FIGURE).markdown(), f"report: {page}", sep="\n\n")
+
+
+if __name__ == "__main__":
+    main()
