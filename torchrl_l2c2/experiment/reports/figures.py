@@ -98,11 +98,11 @@ def draw_front(groups: Sequence[Group], figure: str, path: str | Path) -> None:
         path (str or Path): of the file; its ending, ``.png`` or ``.svg``, decides what it is.
     """
     picture, axes = subplots(1, 1, (5.4, 4.0))
-    styles = _styles(groups)
+    looks = styles(groups)
     front = pareto_front(groups, figure)
     for group in groups:
         if place := means(group, figure):
-            color = styles[group.name]["color"]
+            color = looks[group.name]["color"]
             axes[0].plot(*place[::-1], "o", color=color, alpha=1.0 if group in front else 0.3)
     steps = [means(group, figure)[::-1] for group in front]
     axes[0].step(*zip(*steps, strict=True), where="post", color="#444444", linewidth=1)
@@ -113,7 +113,7 @@ def draw_front(groups: Sequence[Group], figure: str, path: str | Path) -> None:
     axes[0].set_ylabel("return")
     first = groups[0].first
     title = f"{first.task}, {first.algorithm}: {len(groups)} settings, {FIGURES[figure]}"
-    _finish(picture, axes, title, path)
+    finish(picture, axes, title, path)
 
 
 def _draw_curve(
