@@ -23,6 +23,7 @@ objectives.transitions objectives.relative_pearson
 objectives.regularized objectives.neighbors
 objectives.l2c2 objectives.caps objectives.cats objectives.lcp objectives.sr2l
 objectives.grad_caps
+objectives.asap objectives.tchebycheff
 objectives.ppo_rpe
 objectives.__init__
 rsl_rl.networks rsl_rl.storage
@@ -41,7 +42,7 @@ experiment.rollouts
 experiment.regularizers.base
 experiment.regularizers.none experiment.regularizers.caps experiment.regularizers.l2c2
 experiment.regularizers.cats experiment.regularizers.grad_caps experiment.regularizers.lcp
-experiment.regularizers.sr2l
+experiment.regularizers.sr2l experiment.regularizers.asap
 experiment.regularizers.__init__
 experiment.algorithms.normalization
 experiment.algorithms.agent experiment.algorithms.networks experiment.algorithms.base
@@ -58,6 +59,7 @@ experiment.reports.tables
 experiment.reports.comparison experiment.reports.measures
 experiment.reports.front
 experiment.reports.figures experiment.reports.field
+experiment.reports.choice
 experiment.reports.page experiment.reports.readme experiment.reports.results
 experiment.reports.__init__
 experiment.reports.__main__
@@ -71,7 +73,7 @@ experiment.diagnosis.words experiment.diagnosis.pictures experiment.diagnosis.ru
 experiment.diagnosis.film
 experiment.diagnosis.page
 experiment.diagnosis.__init__
-experiment.diagnose
+experiment.diagnose experiment.noise
 experiment.learner
 experiment.gain
 experiment.continuation experiment.schedules

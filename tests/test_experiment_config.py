@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
@@ -25,6 +26,7 @@ from torchrl_l2c2.experiment import (
 from torchrl_l2c2.experiment.command import CONF, check_preset, register
 from torchrl_l2c2.experiment.config import GROUPS
 from torchrl_l2c2.experiment.manual import manual, page
+from torchrl_l2c2.experiment.naming import run_name
 from torchrl_l2c2.experiment.regularizers import REGULARIZERS
 from torchrl_l2c2.experiment.settings import SettingError, describe
 from torchrl_l2c2.experiment.tasks import FIELD_TASKS, PAPER_TASKS
@@ -108,7 +110,7 @@ def test_settings_and_components_have_the_same_defaults(settings, component):
 def test_every_comparison_is_made_of_valid_runs(name, regularizer):
     """With the task and sizes that its file says."""
     # Its sweep chooses the tasks and the algorithms.
-    chosen = ["task=pendulum", "algorithm=ppo"] if name == "field_table" else []
+    chosen = ["task=pendulum", "algorithm=ppo"] if name.startswith("field_") else []
     config = ExperimentConfig.from_dict(
         composed(f"experiment={name}", f"regularizer={regularizer}", *chosen)
     )
@@ -116,12 +118,31 @@ def test_every_comparison_is_made_of_valid_runs(name, regularizer):
         "table3": (TaskConfig().env_id, "ppo_rpe", 32),
         "table3_tau": (TaskConfig().env_id, "ppo_rpe", 32),
         "pendulum": ("Pendulum-v1", "ppo_rpe", 64),
+        "field_gains": ("Pendulum-v1", "ppo", 64),
         "field_table": ("Pendulum-v1", "ppo", 64),
         "cartpole": ("CartPole-v1", "dqn", 64),
     }[name]
     assert config.algorithm.name == algorithm and config.replay.batch_size == size
     assert config.regularizer.name == regularizer
     assert config.task.env_id == env_id
+
+
+def test_gains_are_compared_with_vanilla():
+    """Every choice is in the sweep, has what it is called, and a folder that says it."""
+    sweep = yaml.safe_load((CONF / "experiment" / "field_gains.yaml").read_text())
+    choices = sweep["hydra"]["sweeper"]["params"]["gains"].split(",")
+    assert sorted(choices) == sorted(p.name[: -len(".yaml")] for p in (CONF / "gains").iterdir())
+    for choice in choices:
+        config = ExperimentConfig.from_dict(
+            composed("experiment=field_gains", f"gains={choice}", "task=pendulum", "algorithm=ppo")
+        )
+        if choice == "none":
+            assert config.regularizer.name == "none"
+            continue
+        share = choice.removeprefix("share_")
+        assert config.regularizer.name == "l2c2_mean" and config.algorithm.num_envs == 4
+        assert config.regularizer.gain_target == float(share) and not config.regularizer.beta
+        assert f"/gain-gradient_gain_target-{float(share)}_" in run_name(config)
 
 
 # Frames, batches, learning rate, discount: numbers of rl_zoo3 2.9.2 and, where it

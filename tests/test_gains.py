@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 import warnings
 
 import pytest
+import torch
 
 from torchrl_l2c2.experiment import (
     AdamConfig,
@@ -17,11 +19,11 @@ from torchrl_l2c2.experiment import (
     L2C2Config,
     PPOConfig,
     PPORPEConfig,
+    RolloutReplayConfig,
     SACConfig,
     TaskConfig,
     UniformReplayConfig,
 )
-from torchrl_l2c2.experiment.config import GROUPS
 from torchrl_l2c2.experiment.influence import gradient_shares
 from torchrl_l2c2.experiment.settings import SettingError
 from torchrl_l2c2.gains import ConstantGain, GradientGain, RampGain, TargetGain
@@ -39,18 +41,27 @@ class TestByHand:
         assert ramp.value == 0.0
         assert [ramp.step(k) for k in (0.0, 0.25, 0.5, 1.0, 1.1)] == [0.0, 1.5, 3.0, 3.0, 3.0]
 
+    def test_the_first_measurement_of_a_gradient_sets_the_gain(self):
+        """A share of 5e-6 at the gain 1 is .1 at 20 thousand, whatever the rate."""
+        assert GradientGain(0.1, rate=0.1).step(5e-6) == pytest.approx(2e4)
+
     def test_a_gradients_share_is_met_at_once_with_rate_1(self):
-        """A share of .02 at the gain 1 is .1 at the gain 5; sqrt(5) with rate 1/2."""
-        assert GradientGain(0.1, rate=1.0).step(0.02) == pytest.approx(5.0)
-        assert GradientGain(0.1, rate=0.5).step(0.02) == pytest.approx(math.sqrt(5))
+        """Also by later measurements: .02 at the gain 3 is .1 at 15."""
+        gain = GradientGain(0.1, rate=1.0)
+        gain.step(0.1 / 3.0)
+        assert gain.step(0.02) == pytest.approx(15.0)
 
     def test_gradients_are_averaged_on_the_logarithm(self):
-        """Shares at the gain 1 of .1 and of .1 * 4^-n: the mean of the logarithms counts."""
-        gain, value = GradientGain(0.1, rate=0.1), 1.0
-        for unit in (0.05, 0.2, 0.4):
-            expected = math.exp(0.9 * math.log(value) + 0.1 * math.log(0.1 / unit))
+        """Shares per gain of .1 * 4^-n: their geometric mean, then a moving one of the rate 1/4."""
+        gain, units = GradientGain(0.1, rate=0.25), [0.05, 0.2, 0.4, 0.1, 0.8, 0.05]
+        wanted, value = [math.log(0.1 / unit) for unit in units], 1.0
+        for k, unit in enumerate(units):
             value = gain.step(value * unit)
-            assert value == pytest.approx(expected)
+            if k < 4:
+                expected = sum(wanted[: k + 1]) / (k + 1)
+            else:
+                expected = 0.75 * expected + 0.25 * wanted[k]
+            assert math.log(value) == pytest.approx(expected)
 
     @pytest.mark.parametrize("share", [0.0, math.inf, math.nan])
     def test_a_share_that_says_nothing_changes_nothing(self, share):
@@ -65,14 +76,20 @@ class TestByHand:
         assert gain.step(0.0) == pytest.approx(math.exp(0.25))
         assert gain.step(math.nan) == pytest.approx(math.exp(0.25))
 
-    @pytest.mark.parametrize(
-        "gain", [GradientGain(1.0, 1.0, 8.0, 2.0), TargetGain(1.0, 1.0, 8.0, 2.0)]
-    )
-    def test_the_gain_stays_within_its_bounds(self, gain):
-        """value * 8 and value / 8."""
-        up, down = (1e-9, 1e9) if isinstance(gain, GradientGain) else (1e9, 1e-9)
-        assert [gain.step(up) for _ in range(9)][-1] == 16.0
-        assert [gain.step(down) for _ in range(9)][-1] == 0.25
+    def test_the_gain_stays_within_its_bounds(self):
+        """8 times the first value and an eighth of it."""
+        gain = TargetGain(1.0, 1.0, limit=8.0, value=2.0)
+        assert [gain.step(1e9) for _ in range(9)][-1] == 16.0
+        assert [gain.step(1e-9) for _ in range(9)][-1] == 0.25
+
+    def test_a_gradients_gain_stays_within_bounds_around_the_first_that_was_measured(self):
+        """8 times 500 and an eighth of it, where the first share was .002 at the gain 1."""
+        gain = GradientGain(1.0, 1.0, limit=8.0)
+        gain.step(0.002)
+        again = GradientGain(1.0, 1.0, limit=8.0)
+        again.load_state_dict(gain.state_dict())
+        assert again.step(1e-9) == pytest.approx(4000.0)
+        assert again.step(1e9) == pytest.approx(62.5)
 
     def test_dual_ascent_finds_the_gain_that_meets_the_target(self):
         """Of a measure 1 / (1 + gain), which is 1/4 at the gain 3."""
@@ -137,6 +154,23 @@ def timeless(metrics):
     return [str({k: v for k, v in row.items() if "per_second" not in k}) for row in metrics]
 
 
+def assert_continues(config, folder, parted, episodes):
+    """A run that is interrupted after some episodes has the whole one's numbers and gains."""
+    whole = Experiment(config, folder / "whole")
+    whole.train(episodes)
+    first = Experiment(config, folder / "parts")
+    first.train(parted)
+    first.close()
+    second = Experiment(config, folder / "parts")
+    assert 0 < len(second.metrics) < episodes
+    second.train(episodes)
+    assert timeless(second.metrics) == timeless(whole.metrics)
+    state, expected = second.agent.loss.state_dict(), whole.agent.loss.state_dict()
+    assert all((state[name] == value).all() for name, value in expected.items())
+    first, last = whole.metrics[0], whole.metrics[-1]
+    assert any(first[name] != last[name] for name in first if name.startswith("gain"))
+
+
 class TestInARun:
     def test_a_constant_gain_adds_nothing_to_the_log(self):
         """Nor do other settings of the gain count then."""
@@ -188,20 +222,7 @@ class TestInARun:
     )
     def test_a_continued_run_is_the_uninterrupted_one(self, tmp_path, kind):
         """Parameters, gains and metrics, to the last bit."""
-        config = small(L2C2Config(**KINDS[kind]), late_share=0.0)
-        whole = Experiment(config, tmp_path / "whole")
-        whole.train()
-        first = Experiment(config, tmp_path / "parts")
-        first.train(3)
-        first.close()
-        second = Experiment(config, tmp_path / "parts")
-        assert len(second.metrics) == 3
-        second.train()
-        assert timeless(second.metrics) == timeless(whole.metrics)
-        state, expected = second.agent.loss.state_dict(), whole.agent.loss.state_dict()
-        assert all((state[name] == value).all() for name, value in expected.items())
-        first, last = whole.metrics[0], whole.metrics[-1]
-        assert any(first[name] != last[name] for name in first if name.startswith("gain"))
+        assert_continues(small(L2C2Config(**KINDS[kind]), late_share=0.0), tmp_path, 3, 6)
 
     @pytest.mark.parametrize("kind", ["constant", "ramp"])
     def test_only_a_constant_gain_is_told_to_be_faint(self, kind):
@@ -244,6 +265,81 @@ class TestInARun:
         assert [math.isnan(row["gain_measured_policy"]) for row in rows] == [True, True, False]
 
 
+ROLLOUTS = {
+    "episodes": {"frames": 80},
+    "simulators": {"frames": 100, "num_envs": 2},
+    "normalized": {
+        **{"frames": 100, "num_envs": 2, "clip_actions": True},
+        **{"normalize_observations": True, "normalize_rewards": True},
+    },
+}
+
+
+def small_ppo(kind="episodes", **settings):
+    """A rollout is forgotten before the gain is set, and several episodes end in it."""
+    regularizer = L2C2Config(**{**KINDS["gradient"], "policy_distance": "mean", **settings})
+    return small(
+        regularizer,
+        algorithm=PPOConfig(hidden=(8,), epochs=2, **ROLLOUTS[kind]),
+        replay=RolloutReplayConfig(batch_size=16),
+        late_share=0.0,
+    )
+
+
+class TestRollouts:
+    @pytest.mark.parametrize("kind", ROLLOUTS)
+    def test_the_share_is_measured_on_the_rollout_that_was_learned_from(self, kind, monkeypatch):
+        """With rate 1 the next measurement there gives the target."""
+        run, kept = Experiment(small_ppo(kind, gain_rate=1.0)), []
+        extend = run.learner.replay.extend
+        monkeypatch.setattr(run.learner.replay, "extend", lambda t: kept.append(t) or extend(t))
+        run.train(2)
+        rollout, batch = torch.cat(kept), run.learner.example()
+        rows = torch.linspace(0, len(rollout) - 1, 16).long()
+        assert len(run.learner.replay) == 0 < run.learner.updates
+        assert batch["observation"].equal(rollout["observation"][rows])
+        assert batch["advantage"].equal(rollout["advantage"][rows])
+        shares = gradient_shares(run.agent.loss, batch)
+        assert shares["loss_l2c2_actor"] == pytest.approx(0.3, rel=1e-4)
+        assert shares["loss_l2c2_critic"] == pytest.approx(0.3, rel=1e-4)
+
+    @pytest.mark.parametrize("kind", ROLLOUTS)
+    def test_it_is_measured_with_the_gain_that_was_applied(self, kind):
+        """Once for a rollout; with rate 1 every gain follows from the one before and its share."""
+        run = Experiment(small_ppo(kind, gain_rate=1.0))
+        rows = [row for row in run.train(10) if row["updates"]]
+        measured = [row for row in rows if not math.isnan(row["gain_measured_policy"])]
+        assert 2 <= len(measured) < len(rows)
+        for row, after in itertools.pairwise(measured):
+            expected = row["gain_policy"] * 0.3 / row["gain_measured_policy"]
+            assert after["gain_policy"] == pytest.approx(expected)
+            assert row["updates"] < after["updates"]
+
+    @pytest.mark.parametrize("kind", ROLLOUTS)
+    def test_a_continued_run_is_the_uninterrupted_one(self, tmp_path, kind):
+        """To the last bit, wherever in the rollouts it was interrupted."""
+        assert_continues(small_ppo(kind), tmp_path, 5, 10)
+
+    def test_the_values_have_a_share_of_their_own(self):
+        """A fifth of the policy's, by the log and in the gradients."""
+        run = Experiment(small_ppo(gain_rate=1.0, gain_target_value=0.06))
+        rows = run.train(2)
+        shares = gradient_shares(run.agent.loss, run.learner.example())
+        assert shares["loss_l2c2_actor"] == pytest.approx(0.3, rel=1e-4)
+        assert shares["loss_l2c2_critic"] == pytest.approx(0.06, rel=1e-4)
+        assert rows[-1]["gain_target"] == 0.3 and rows[-1]["gain_target_value"] == 0.06
+
+    def test_the_values_may_have_none(self):
+        """From the first update on; the policy has its share."""
+        run = Experiment(small_ppo(gain_rate=1.0, gain_target_value=0.0))
+        rows = run.train(4)
+        assert rows[1]["loss_l2c2_critic"] == rows[3]["loss_l2c2_critic"] == 0.0
+        assert rows[3]["gain_value"] == 0.0 < rows[3]["loss_l2c2_actor"]
+        shares = gradient_shares(run.agent.loss, run.learner.example())
+        assert shares["loss_l2c2_actor"] == pytest.approx(0.3, rel=1e-4)
+        assert shares["loss_l2c2_critic"] == 0.0
+
+
 class TestRefusals:
     def test_a_column_that_is_not_logged_is_named(self):
         """With those that are."""
@@ -270,12 +366,8 @@ class TestRefusals:
         with pytest.raises(SettingError, match=message):
             L2C2Config(**settings)
 
-    def test_gradients_are_not_measured_on_rollouts(self):
-        """They are gone when it is time to."""
-        regularizer = L2C2Config(**KINDS["gradient"])
-        with pytest.raises(
-            SettingError, match="must be constant, ramp or target with algorithm 'ppo'"
-        ):
-            ExperimentConfig(
-                algorithm=PPOConfig(), replay=GROUPS["replay"]["rollout"], regularizer=regularizer
-            )
+    @pytest.mark.parametrize("settings", [{}, {"gain": "gradient", "gain_target": 1.0, "beta": 0}])
+    def test_a_share_of_the_values_needs_their_gradient(self, settings):
+        """Measured, and there at all."""
+        with pytest.raises(SettingError, match="gain_target_value needs gain=gradient and a beta"):
+            L2C2Config(gain_target_value=0.1, **settings)

@@ -81,3 +81,14 @@ def test_long_names_of_different_settings_differ():
     long = [tuple(range(100, 130)), (*range(100, 129), 7)]
     names = {run_name(ExperimentConfig(algorithm=PPORPEConfig(hidden=h))) for h in long}
     assert len(names) == 2
+
+
+def test_long_names_begin_with_what_is_compared():
+    """The regularizer's settings; short ones are in the order of the groups."""
+    regularizer = L2C2Config(gain="ramp", beta=0.2)
+    short, long = (
+        run_name(ExperimentConfig(algorithm=PPORPEConfig(hidden=h), regularizer=regularizer))
+        for h in ((8,), tuple(range(100, 130)))
+    )
+    assert short.split("/")[3] == "hidden-8_gain-ramp_beta-0.2"
+    assert long.split("/")[3].startswith("gain-ramp_beta-0.2_hidden-100x101x")

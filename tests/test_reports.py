@@ -29,6 +29,7 @@ from torchrl_l2c2.experiment.reports import (
     write_report,
 )
 from torchrl_l2c2.experiment.reports.__main__ import main
+from torchrl_l2c2.experiment.reports.choice import choice_table
 from torchrl_l2c2.experiment.reports.comparison import statistics_tables
 from torchrl_l2c2.experiment.reports.differences import differences, fingerprint
 from torchrl_l2c2.experiment.reports.field import field_table
@@ -183,6 +184,49 @@ class TestFieldTable:
         assert {row[0] for row in table.rows} == {"hopper_v5"}
         assert "2440" in sweep_summary([tmp_path])
         assert field_table(read_runs(tmp_path / "paper")) is None
+
+
+class TestChoiceTable:
+    def test_settings_are_ordered_over_tasks_beside_vanilla(self, tmp_path):
+        """By hand: returns by 10 and by -25 of 100, Sm half and twice; another at .8 and .8."""
+        shares = {s: L2C2Config(gain="gradient", gain_target=s) for s in (0.1, 0.3)}
+        cases = {
+            "pendulum": {"none": (-100.0, 0.4), 0.1: (-90.0, 0.2), 0.3: (-100.0, 0.32)},
+            "lunarlander": {"none": (100.0, 0.4), 0.1: (75.0, 0.8), 0.3: (110.0, 0.32)},
+        }
+        for task, methods in cases.items():
+            for method, (total, sm) in methods.items():
+                # Vanilla has a seed of its own, which does not count.
+                for seed in range(3 if method == "none" else 2):
+                    config = make_config(
+                        task=task,
+                        algorithm=PPOConfig(),
+                        regularizer=shares.get(method, method),
+                        seed=seed,
+                    )
+                    folder = tmp_path / task / str(method) / str(seed)
+                    make_run(folder, config, total, 0.1)
+                    path = folder / "evaluation.json"
+                    content = json.loads(path.read_text())
+                    off = 10.0 * seed - 5.0 if seed < 2 else 1000.0
+                    content["summary"] |= {"return_mean": total + off, "sm_asap_mean": sm}
+                    path.write_text(json.dumps(content))
+        table = choice_table(read_runs(tmp_path))
+        assert table.rows == [
+            ["ppo", f"L2C2, gain_target={share}", "pendulum, lunarlander", "0, 1", *cells]
+            for share, cells in {
+                0.3: ["+5%", "+0% pendulum", "0.80", "0.80 pendulum"],
+                0.1: ["-8%", "-25% lunarlander", "1.00", "2.00 lunarlander"],
+            }.items()
+        ]
+        assert "-25% lunarlander" in sweep_summary([tmp_path])
+
+    def test_without_vanilla_there_is_nothing_to_compare(self, tmp_path):
+        """Nor on the paper's tasks."""
+        make_run(tmp_path / "a", make_config(task="pendulum", algorithm=PPOConfig()), 1.0, 0.1)
+        make_run(tmp_path / "b", make_config(regularizer="none"), 1.0, 0.1)
+        make_run(tmp_path / "c", make_config(), 1.0, 0.1)
+        assert choice_table(read_runs(tmp_path)) is None
 
 
 class TestGroups:

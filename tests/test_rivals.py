@@ -24,15 +24,19 @@ from torchrl.envs import CatFrames, GymEnv, TransformedEnv
 from torchrl.modules import Actor, IndependentNormal, ProbabilisticActor
 from torchrl.objectives import DDPGLoss, DQNLoss, PPOLoss
 
-from torchrl_l2c2 import CAPSLoss, CATSLoss, GradCAPSLoss, L2C2Loss, LCPLoss, SR2LLoss
+from torchrl_l2c2 import ASAPLoss, CAPSLoss, CATSLoss, GradCAPSLoss, L2C2Loss, LCPLoss, SR2LLoss
 from torchrl_l2c2.experiment import (
     AdamConfig,
+    ASAPConfig,
     CATSConfig,
     Experiment,
     ExperimentConfig,
     GradCAPSConfig,
+    L2C2Config,
     LCPConfig,
+    PPOConfig,
     PPORPEConfig,
+    RolloutReplayConfig,
     SR2LConfig,
     TaskConfig,
     UniformReplayConfig,
@@ -163,6 +167,79 @@ class TestGradCAPS:
         base = DQNLoss(action_values(), action_space="one-hot")
         with pytest.raises(TypeError, match="GradCAPSLoss needs a policy: DQNLoss has none"):
             GradCAPSLoss(base)
+
+
+class TestASAP:
+    PREDICTOR = torch.tensor([[0.5, 0.0, 0.0], [0.0, 0.0, 2.0]])
+
+    def loss(self, *args) -> ASAPLoss:
+        loss = ASAPLoss(linear_base(), *args, previous_key="before")
+        loss.asap_predictor.module.weight.data = self.PREDICTOR.clone()
+        return loss
+
+    def batch(self) -> TensorDict:
+        batch = transitions(2)
+        batch["observation"] = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+        batch["before"] = torch.tensor([[2.0, 0.0, 1.0], [0.0, 0.0, 1.0]])
+        batch["next", "observation"] = batch["observation"]
+        return batch
+
+    def test_the_terms_by_hand(self):
+        """Actions (1, 0) and (-2, 1); predicted (1, 2) and (0, 2): squared distances 4 and 5."""
+        terms = self.loss(0.3, 2.0).policy_regularizer(self.batch())
+        assert terms["loss_asap_spatial"].item() == pytest.approx(0.3 * 4.5)
+        assert terms["loss_asap_temporal"].item() == pytest.approx(2.0 * 4.5)
+
+    def test_the_spatial_term_trains_the_policy_and_the_temporal_one_the_predictor(self):
+        """2 (W s - P b) s' and 2 (P b - W s) b', means over the batch; nothing else."""
+        loss, batch = self.loss(1.0, 1.0), self.batch()
+        terms = loss.policy_regularizer(batch)
+        policy = [p for name, p in loss.named_parameters() if name.startswith("actor_network")]
+        parameters = [*policy, *loss.asap_predictor.parameters()]
+        off = batch["observation"] @ WEIGHT.T - batch["before"] @ self.PREDICTOR.T
+        for kind, seen, sign in (("spatial", "observation", 1), ("temporal", "before", -1)):
+            term = terms[f"loss_asap_{kind}"]
+            found = torch.autograd.grad(term, parameters, allow_unused=True, retain_graph=True)
+            expected = sign * 2.0 * off.T @ batch[seen] / 2.0
+            trained, other = found if kind == "spatial" else reversed(found)
+            assert other is None
+            torch.testing.assert_close(trained, expected)
+
+    def test_grad_caps_is_the_third(self):
+        """With its own numbers."""
+        found = self.loss(0.3, 2.0, 0.7, 0.2).policy_regularizer(self.batch())["loss_grad_caps"]
+        alone = GradCAPSLoss(linear_base(), 0.7, 0.2, previous_key="before")
+        assert found.equal(alone.policy_regularizer(self.batch())["loss_grad_caps"])
+
+    @pytest.mark.parametrize("make", [linear_normal, linear_base])
+    def test_the_predictor_begins_as_a_copy_of_the_policy(self, make):
+        """Where nothing moved it predicts what is done; later it has numbers of its own."""
+        loss, batch = ASAPLoss(make(), previous_key="before"), self.batch()
+        batch["before"] = batch["observation"]
+        assert loss.policy_regularizer(batch)["loss_asap_spatial"].item() == 0.0
+        for name, parameter in loss.named_parameters():
+            if name.startswith("actor_network"):
+                parameter.data.mul_(2.0)
+        assert loss.policy_regularizer(batch)["loss_asap_spatial"].item() > 0.0
+
+    def test_the_predictor_belongs_to_the_loss(self):
+        """Optimizers, checkpoints and copies have it."""
+        loss = self.loss()
+        assert any(p is q for p in loss.parameters() for q in loss.asap_predictor.parameters())
+        again = ASAPLoss(linear_base(), previous_key="before")
+        again.load_state_dict(loss.state_dict())
+        assert again.asap_predictor.module.weight.equal(self.PREDICTOR)
+        twin = copy.deepcopy(loss)
+        twin.asap_predictor.module.weight.data.zero_()
+        assert loss.asap_predictor.module.weight.equal(self.PREDICTOR)
+
+    def test_what_grad_caps_refuses_is_refused(self):
+        """By its own name."""
+        base = DQNLoss(action_values(), action_space="one-hot")
+        with pytest.raises(TypeError, match="ASAPLoss needs a policy: DQNLoss has none"):
+            ASAPLoss(base)
+        with pytest.raises(KeyError, match=r"no 'frames': append CatFrames\(N=2, dim=-1"):
+            ASAPLoss(linear_base()).policy_regularizer(self.batch())
 
 
 class TestSR2L:
@@ -411,7 +488,7 @@ def test_cats_compiles_into_one_graph():
         torch.testing.assert_close(compiled(batch)["loss_cats"], expected)
 
 
-RUNNING = [CATSConfig(), GradCAPSConfig(), SR2LConfig(steps=2), LCPConfig()]
+RUNNING = [CATSConfig(), GradCAPSConfig(), ASAPConfig(), SR2LConfig(steps=2), LCPConfig()]
 
 
 def small_run(regularizer, compile=False):
@@ -431,17 +508,73 @@ def test_they_run(regularizer):
     """With their terms in the log."""
     run = small_run(regularizer)
     first, second = run.train()
-    assert math.isfinite(second[f"loss_{regularizer.name}"])
+    term = {"asap": "loss_asap_spatial"}.get(regularizer.name, f"loss_{regularizer.name}")
+    assert math.isfinite(second[term])
     if regularizer.name == "cats":
         assert (first["gain"], second["gain"]) == (0.0, 0.5)
         assert run.agent.loss.cats_lambda.item() == pytest.approx(0.1)
 
 
+def test_the_predictor_of_asap_is_trained_and_continued(tmp_path):
+    """On rollouts, with a gain that follows the policy's terms; from a checkpoint as in one go."""
+    config = ExperimentConfig(
+        task=TaskConfig("pendulum", "Pendulum-v1", episodes=8, max_steps=40),
+        algorithm=PPOConfig(hidden=(8,), frames=100, num_envs=2, epochs=2),
+        regularizer=ASAPConfig(gain="gradient", gain_target=0.3),
+        replay=RolloutReplayConfig(batch_size=16),
+        optimizer=AdamConfig(),
+        compile=False,
+        late_share=0.0,
+        checkpoint_interval=0.0,
+    )
+    whole = Experiment(config, tmp_path / "whole")
+    first = {k: v.clone() for k, v in whole.agent.loss.asap_predictor.state_dict().items()}
+    rows = whole.train()
+    last = whole.agent.loss.asap_predictor.state_dict()
+    assert all((last[name] != value).any() for name, value in first.items())
+    assert math.isfinite(rows[-1]["gain_policy"]) and rows[-1]["gain_policy"] != 1.0
+    part = Experiment(config, tmp_path / "parts")
+    part.train(4)
+    part.close()
+    again = Experiment(config, tmp_path / "parts")
+    assert 4 <= len(again.metrics) < 8
+    again.train()
+    state = again.agent.loss.state_dict()
+    assert all((state[k] == v).all() for k, v in whole.agent.loss.state_dict().items())
+
+
+def test_asap_compiles_into_one_graph():
+    """With the eager numbers."""
+    torch._dynamo.reset()
+    loss, batch = ASAPLoss(linear_normal(), previous_key="before"), on_policy(4)
+    batch["before"] = batch["observation"] + 0.5
+    compiled = torch.compile(loss.policy_regularizer, fullgraph=True, backend="eager")
+    expected, found = loss.policy_regularizer(batch.copy()), compiled(batch.copy())
+    for key, value in expected.items():
+        torch.testing.assert_close(found[key], value)
+
+
+def test_asap_goes_around_every_loss_with_a_policy(case):
+    """Whose own terms stay as they are, to the bit."""
+    if case.policy is None:
+        pytest.skip("refused")
+    batch = batch_of(case)
+    batch["before"] = batch[case.observation].clone()
+    expected = run(plain(case), batch.copy())
+    found = run(ASAPLoss(plain(case), previous_key="before"), batch.copy())
+    assert all(bool((value == found[key]).all()) for key, value in expected.items())
+    assert found["loss_asap_spatial"].abs() < 1e-10 and found["loss_grad_caps"] > 0
+
+
 @pytest.mark.skipif(not compiler_available(), reason="no C++ compiler")
 @pytest.mark.slow
-@pytest.mark.parametrize("regularizer", [LCPConfig(), SR2LConfig(steps=2)], ids=lambda v: v.name)
+@pytest.mark.parametrize(
+    "regularizer",
+    [LCPConfig(), SR2LConfig(steps=2), ASAPConfig(), L2C2Config(tchebycheff_mu=0.1)],
+    ids=lambda v: v.name,
+)
 def test_with_gradients_of_their_own_their_update_is_one_graph_too(regularizer):
-    """With the numbers of the one that is not compiled."""
+    """With the numbers of the one that is not compiled; or with other networks, or weights."""
     found = []
     for compile in (True, False):
         run = small_run(regularizer, compile)

@@ -7,6 +7,7 @@ from .metrics import action_variation, local_lipschitz
 from .modules import Squish, make_actor, make_critic
 from .neighborhood import Neighborhood
 from .objectives import (
+    ASAPLoss,
     CAPSLoss,
     CATSLoss,
     GradCAPSLoss,
@@ -21,6 +22,7 @@ from .transforms import NeighborTransform, ObservationNoise
 from .updaters import TSoftUpdate
 
 __all__ = [
+    "ASAPLoss",
     "AdaTerm",
     "CAPSLoss",
     "CATSLoss",

@@ -16,6 +16,7 @@ Commands, with the extra "experiment": pip install "torchrl-l2c2[experiment]"
   python -m torchrl_l2c2.experiment -m seed=0,1,2    trains several, one after another
   python -m torchrl_l2c2.experiment.evaluate FOLDER  plays test episodes with a run's policy
   python -m torchrl_l2c2.experiment.diagnose FOLDER  a page of why its policy shakes
+  python -m torchrl_l2c2.experiment.noise FOLDER     how the policies below it bear noise
   python -m torchrl_l2c2.experiment.reports FOLDER   tables and pictures of the runs below a folder
   python -m torchrl_l2c2.experiment.search ...       gains by Optuna, for return and smoothness
   python -m torchrl_l2c2.experiment.manual           docs/settings.md

@@ -84,47 +84,51 @@ class RampGain(ConstantGain):
 
 
 class _BoundedGain(ConstantGain):
-    """A gain that moves by factors, within bounds around its first value."""
+    """A gain that moves by factors, within bounds around one of its values."""
 
     def __init__(self, rate: float, limit: float, value: float) -> None:
         check_real("rate", rate, above=0, at_most=1)
         check_real("value", value, above=0)
         check_real("limit", limit, above=1)
         super().__init__(value)
-        self.rate = float(rate)
-        self._low, self._high = value / limit, value * limit
+        self.rate, self.limit = float(rate), float(limit)
+        self._center = self.value
 
     def _multiply(self, factor: float) -> None:
-        self.value = min(max(self.value * factor, self._low), self._high)
+        low, high = self._center / self.limit, self._center * self.limit
+        self.value = min(max(self.value * factor, low), high)
 
 
 class GradientGain(_BoundedGain):
     r"""A gain that keeps a term's gradient at a share of that of the loss's own terms.
 
     .. math::
-        \lambda \leftarrow \lambda\, \left(\frac{c}{\rho}\right)^{\eta}, \qquad
+        \lambda \leftarrow \lambda\, \left(\frac{c}{\rho}\right)^{\max(\eta, 1/k)}, \qquad
         \rho = \frac{\lVert \nabla_\theta\, \lambda L_r \rVert}{\lVert \nabla_\theta L \rVert},
 
-    a moving average, on the logarithm, of the gains at which the share would have been :math:`c`;
-    kept within bounds. Norms of gradients are compared, as the value of an actor's loss has no
-    natural zero. A gain for each network: :math:`\theta` is what the term trains.
+    the average, on the logarithm, of the gains at which the share would have been :math:`c`: over
+    all :math:`k` measurements and, once these are more than :math:`1 / \eta`, a moving one; kept
+    within bounds. The first measurement sets the gain by itself, so that the size of the term does
+    not matter. Norms of gradients are compared, as the value of an actor's loss has no natural
+    zero. A gain for each network: :math:`\theta` is what the term trains.
 
     Args:
         share (float): :math:`c`, greater than 0. Larger values regularize more.
         rate (float): :math:`\eta`, in (0, 1]. Smaller values average over more steps. Defaults to
             ``0.1``.
-        limit (float): the gain stays between ``value / limit`` and ``value * limit``, greater
-            than 1. Defaults to ``1000``.
-        value (float): the first gain, greater than 0. Defaults to ``1.0``.
+        limit (float): the gain stays between the first that was measured divided by this, and
+            multiplied by it, greater than 1: a term whose gradient vanishes raises it no further.
+            Defaults to ``1000``.
+        value (float): the gain until something is measured, greater than 0. Defaults to ``1.0``.
 
     Raises:
         TypeError: if a value is not a real number.
         ValueError: if it is out of its range.
 
     Examples:
-        >>> gain = GradientGain(0.1, rate=0.5)
-        >>> gain.step(0.001), gain.step(0.1)  # a hundredth of it: the root of that; then all of it
-        (10.0, 10.0)
+        >>> gain = GradientGain(0.1)
+        >>> gain.step(0.001), gain.step(10.0)  # a hundredth of it; then, of two, a hundred times it
+        (100.0, 10.0)
     """
 
     def __init__(
@@ -132,13 +136,27 @@ class GradientGain(_BoundedGain):
     ) -> None:
         check_real("share", share, above=0)
         super().__init__(rate, limit, value)
-        self.share = float(share)
+        self.share, self._measurements = float(share), 0
 
     def step(self, measured: float = math.nan) -> float:
         """The next value after a share :math:`\\rho`; 0 and what is not finite change nothing."""
         if 0.0 < measured < math.inf:
-            self._multiply((self.share / measured) ** self.rate)
+            wanted = self.share / measured
+            self._measurements += 1
+            if self._measurements == 1:
+                self._center = self.value * wanted
+            self._multiply(wanted ** max(self.rate, 1 / self._measurements))
         return self.value
+
+    def state_dict(self) -> dict[str, float]:
+        """As of the others."""
+        measured = {"center": self._center, "measurements": self._measurements}
+        return {**super().state_dict(), **measured}
+
+    def load_state_dict(self, state: dict[str, float]) -> None:
+        """As of the others."""
+        super().load_state_dict(state)
+        self._center, self._measurements = state["center"], int(state["measurements"])
 
 
 class TargetGain(_BoundedGain):
@@ -157,8 +175,9 @@ class TargetGain(_BoundedGain):
             regularize more.
         rate (float): :math:`\eta`, in (0, 1]: the largest change of the logarithm in a step.
             Larger values reach the target sooner, and overshoot. Defaults to ``0.1``.
-        limit (float): as for :class:`GradientGain`. At the upper bound the target is out of reach.
-        value (float): likewise.
+        limit (float): the gain stays between ``value / limit`` and ``value * limit``, greater
+            than 1. At the upper bound the target is out of reach. Defaults to ``1000``.
+        value (float): the first gain, greater than 0. Defaults to ``1.0``.
 
     Raises:
         TypeError: if a value is not a real number.

@@ -5,6 +5,7 @@ from .environments import make_env
 from .evaluate import Evaluation, evaluate_policy
 from .optimizers import AdamConfig, AdaTermConfig
 from .regularizers import (
+    ASAPConfig,
     CAPSConfig,
     CATSConfig,
     GradCAPSConfig,
@@ -23,6 +24,7 @@ __all__ = [
     "FIELD_TASKS",
     "PAPER_TASKS",
     "TASKS",
+    "ASAPConfig",
     "AdaTermConfig",
     "AdamConfig",
     "CAPSConfig",

@@ -210,13 +210,6 @@ class ExperimentConfig:
                 f"{self.replay.name!r} is nothing that algorithm {self.algorithm.name!r} can learn "
                 "from: ppo needs rollout, the others prioritized or uniform.",
             )
-        if on_policy and getattr(self.regularizer, "gain", None) == "gradient":
-            raise SettingError(
-                "regularizer.gain",
-                f"must be constant, ramp or target with algorithm {self.algorithm.name!r}, got "
-                "'gradient': it is measured on a batch from a replay buffer, and a rollout is "
-                "forgotten once it is learned from.",
-            )
 
     def _check_rounds(self) -> None:
         """Several workers play whole episodes, and all of them as many."""

@@ -10,7 +10,6 @@ from torchrl_l2c2.experiment.influence import gradient_shares
 from torchrl_l2c2.experiment.learner import Learner
 from torchrl_l2c2.experiment.regularizers import GainConfig
 from torchrl_l2c2.experiment.settings import SettingError
-from torchrl_l2c2.experiment.update import ReplayUpdate
 from torchrl_l2c2.gains import ConstantGain, GradientGain, RampGain, TargetGain
 
 
@@ -33,7 +32,7 @@ class GainControl:
         self.gains: dict[str, ConstantGain] = {}
         if self._config is not None and self._config.gain != "constant":
             names = self._terms() if self._config.gain == "gradient" else ["all"]
-            self.gains = {name: _make_gain(self._config) for name in names}
+            self.gains = {name: _make_gain(self._config, name) for name in names}
             # A gain that is faint for now is no mistake.
             learner.tells_faint_regularizer = False
             self._apply()
@@ -41,7 +40,7 @@ class GainControl:
     def after(self, row: Mapping[str, float]) -> dict[str, float]:
         """Sets the gains for what follows an episode; gives what they were and were set from.
 
-        Without an update since the last time nothing is set.
+        Without an update since the last time nothing is set, and no gradient measured.
 
         Args:
             row (Mapping): what is logged of the episode.
@@ -56,8 +55,8 @@ class GainControl:
             suffix = "" if name == "all" else f"_{name}"
             logged[f"gain{suffix}"] = gain.value
             logged[f"gain_measured{suffix}"] = measured[name]
-        if self.gains and self._config is not None and self._config.gain_target is not None:
-            logged["gain_target"] = self._config.gain_target
+        if self.gains and self._config is not None:
+            logged |= self._config.targets
         if self.gains and self._learner.updates > self._updates:
             self._updates = self._learner.updates
             for name, gain in self.gains.items():
@@ -102,11 +101,15 @@ class GainControl:
             return {"all": spent / self._budget.total}
         if self._config.gain == "target":
             return {"all": self._column(row, self._config.gain_of)}
-        update = self._learner.update
-        if not self._learner.updates or not isinstance(update, ReplayUpdate):
+        if self._learner.updates == self._updates:
             return dict.fromkeys(self.gains, float("nan"))
-        shares = gradient_shares(self._learner.agent.loss, update.example())
-        return {name: max(shares[key] for key in keys) for name, keys in self._terms().items()}
+        shares = gradient_shares(self._learner.agent.loss, self._learner.example())
+        # What the loss's own terms do not train, as a predictor beside the policy, has no share.
+        finite = {key: share for key, share in shares.items() if share < float("inf")}
+        return {
+            name: max((finite[key] for key in keys if key in finite), default=float("nan"))
+            for name, keys in self._terms().items()
+        }
 
     @staticmethod
     def _column(row: Mapping[str, float], name: str) -> float:
@@ -117,9 +120,11 @@ class GainControl:
         return row[name]
 
 
-def _make_gain(config: GainConfig) -> ConstantGain:
+def _make_gain(config: GainConfig, name: str) -> ConstantGain:
     if config.gain == "ramp":
         return RampGain(length=config.gain_length)
-    assert config.gain_target is not None
+    target = config.targets.get(f"gain_target_{name}", config.targets["gain_target"])
+    if not target:
+        return ConstantGain(0.0)
     kind = GradientGain if config.gain == "gradient" else TargetGain
-    return kind(config.gain_target, config.gain_rate, config.gain_limit)
+    return kind(target, config.gain_rate, config.gain_limit)

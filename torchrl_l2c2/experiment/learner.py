@@ -81,6 +81,7 @@ class Learner:
         self.compiles = compile
         self._skip_nonfinite = skip_nonfinite
         self._terms: list[torch.Tensor] = []
+        self._learned_from: TensorDictBase | None = None
         self._rows = RowWriter(replay)
         self._read_keys = list(agent.loss.in_keys)
         if agent.advantage is not None:
@@ -132,8 +133,13 @@ class Learner:
             self.replay.sampler.ran_out = False
             while not self.replay.sampler.ran_out:
                 self._update()
+        self._learned_from = self.update.example()
         self.replay.empty()
         self.agent.refresh_policy()
+
+    def example(self) -> TensorDictBase:
+        """A batch from all over what was last learned from, also once that is forgotten."""
+        return self.update.example() if self._learned_from is None else self._learned_from
 
     def _update(self) -> None:
         with_policy = (self.updates + 1) % self.agent.policy_delay == 0

@@ -33,7 +33,8 @@ def run_name(config: ExperimentConfig) -> str:
     Returns:
         str: ``task/algorithm/regularizer/setting-value_setting-value/seed_0``, of letters, digits
         and ``.+-_`` alone; without the fourth part where every setting is the usual one. Too long
-        a part is cut, and a hash of the whole stands for the rest.
+        a part is cut, and a hash of the whole stands for the rest; the regularizer's settings
+        come first then.
 
     Examples:
         >>> from torchrl_l2c2.experiment import ExperimentConfig, L2C2Config
@@ -41,13 +42,20 @@ def run_name(config: ExperimentConfig) -> str:
         'swingup/ppo_rpe/l2c2/sigma-2.0_beta-0.2/seed_3'
     """
     chosen = [getattr(config, group).name for group in ("task", "algorithm", "regularizer")]
-    unusual = [f"{_plain(name)}-{_plain(value)}" for name, value in _unusual(config)]
-    parts = [*map(_plain, chosen), *(["_".join(unusual)] if unusual else []), f"seed_{config.seed}"]
+    parts = [*map(_plain, chosen), *_settings_part(config), f"seed_{config.seed}"]
     return str(PurePosixPath(*map(_short, parts)))
 
 
-def _unusual(config: ExperimentConfig) -> Iterator[tuple[str, Any]]:
-    """The settings that change a run's numbers and are not those of its choices."""
+def _settings_part(config: ExperimentConfig) -> list[str]:
+    unusual = list(_unusual(config))
+    if sum(len(_written(*each[1:])) + 1 for each in unusual) > LONGEST + 1:
+        # What runs are compared in is not to be cut off.
+        unusual.sort(key=lambda each: each[0] != "regularizer")
+    return ["_".join(_written(*each[1:]) for each in unusual)] if unusual else []
+
+
+def _unusual(config: ExperimentConfig) -> Iterator[tuple[str, str, Any]]:
+    """The settings that change a run's numbers and are not those of its choices, with groups."""
     usual_names = {
         "replay": config.algorithm.usual_replay,
         "optimizer": config.algorithm.usual_optimizer,
@@ -56,17 +64,17 @@ def _unusual(config: ExperimentConfig) -> Iterator[tuple[str, Any]]:
     for group in sorted(GROUPS.keys() - FREE_SETTINGS):
         chosen = getattr(config, group)
         if chosen.name != usual_names.get(group, chosen.name):
-            yield group, chosen.name
+            yield group, group, chosen.name
         usual = _usual(group, chosen)
         for name, value in vars(chosen).items():
             free = name == "name" or (group == "task" and name in FREE_TASK_SETTINGS)
             if not free and value != getattr(usual, name):
                 alone = group == "regularizer" or names[name] == 1
-                yield name if alone else f"{group}.{name}", value
+                yield group, name if alone else f"{group}.{name}", value
     usual = ExperimentConfig()
     for name in sorted(vars(config).keys() - GROUPS.keys() - FREE_SETTINGS - {"seed"}):
         if getattr(config, name) != getattr(usual, name):
-            yield name, getattr(config, name)
+            yield "", name, getattr(config, name)
 
 
 def _usual(group: str, chosen: Any) -> Any:
@@ -74,6 +82,10 @@ def _usual(group: str, chosen: Any) -> Any:
     if group == "task" and chosen.name not in GROUPS[group]:
         return TaskConfig(chosen.name, chosen.env_id)
     return GROUPS[group][chosen.name]
+
+
+def _written(name: str, value: Any) -> str:
+    return f"{_plain(name)}-{_plain(value)}"
 
 
 def _plain(value: Any) -> str:

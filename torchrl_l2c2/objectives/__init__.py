@@ -1,5 +1,6 @@
 """Losses: L2C2, its rivals, what they are built on, and PPO-RPE."""
 
+from torchrl_l2c2.objectives.asap import ASAPLoss
 from torchrl_l2c2.objectives.caps import CAPSLoss
 from torchrl_l2c2.objectives.cats import CATSLoss
 from torchrl_l2c2.objectives.grad_caps import GradCAPSLoss
@@ -11,6 +12,7 @@ from torchrl_l2c2.objectives.shared_evaluation import SharedEvaluation
 from torchrl_l2c2.objectives.sr2l import SR2LLoss
 
 __all__ = [
+    "ASAPLoss",
     "CAPSLoss",
     "CATSLoss",
     "GradCAPSLoss",

@@ -88,7 +88,9 @@ class GradCAPSLoss(RegularizedLoss):
         check_choice("mean", mean, ("loc", "action"))
         check_real("epsilon", epsilon, above=0)
         if not self.policy_networks():
-            raise TypeError(f"GradCAPSLoss needs a policy: {type(base_loss).__name__} has none.")
+            raise TypeError(
+                f"{self._parts[0].__name__} needs a policy: {type(base_loss).__name__} has none."
+            )
         self.grad_caps_epsilon, self.grad_caps_mean = float(epsilon), mean
         self.grad_caps_frames_key, self.grad_caps_previous_key = frames_key, previous_key
         self.register_coefficient("grad_caps_lambda", lambda_temporal)
@@ -99,20 +101,31 @@ class GradCAPSLoss(RegularizedLoss):
 
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
         terms = super().policy_regularizer(tensordict)
-        squashed = self.grad_caps_mean == "action"
-        policies = self.policies_at(tensordict, self._states(tensordict))
-        here, there = (policy_mean(policy, squashed=squashed) for policy in policies)
-        term = grad_caps_term(there[0], here[0], there[1], self.grad_caps_epsilon)
-        term = self.reduce_term(term, tensordict)
+        means = self.successive_means(tensordict)
+        term = self.reduce_term(grad_caps_term(*means, self.grad_caps_epsilon), tensordict)
         return terms.set("loss_grad_caps", self.grad_caps_lambda * term)
 
-    def _states(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def successive_means(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
+        """The policy's means ``[*B, A]`` at the states before, the states and the next ones.
+
+        Args:
+            tensordict: the batch, ``[*B]``.
+        """
+        return self.made_once("grad_caps_means", lambda: self._evaluate_means(tensordict))
+
+    def _evaluate_means(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
+        squashed = self.grad_caps_mean == "action"
+        policies = self.policies_at(tensordict, self.states_around(tensordict))
+        here, there = (policy_mean(policy, squashed=squashed) for policy in policies)
+        return there[0], here[0], there[1]
+
+    def states_around(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The state before and the next one, ``[2, *B]``."""
         transitions = self.transitions(tensordict, self.policy_networks())
         if len(transitions) != 1:
             raise ValueError(
-                f"GradCAPSLoss needs a policy of one observation, got {list(transitions)}: join "
-                "them with CatTensors."
+                f"a policy of one observation is needed, got {list(transitions)}: join them with "
+                "CatTensors."
             )
         ((key, (state, successor)),) = transitions.items()
         before = self._before(tensordict, key, state).detach()
@@ -126,7 +139,7 @@ class GradCAPSLoss(RegularizedLoss):
         frames = tensordict.get(self.grad_caps_frames_key, None)
         if frames is None:
             raise KeyError(
-                f"GradCAPSLoss needs the observation before each state, and the batch has no "
+                "the observation before each state is needed, and the batch has no "
                 f"{self.grad_caps_frames_key!r}: append CatFrames(N=2, dim=-1, in_keys=[{key!r}], "
                 f"out_keys=[{self.grad_caps_frames_key!r}]) to the environment."
             )

@@ -1,5 +1,6 @@
 """What is added to the loss: a file for each regularizer, and a line here for each choice."""
 
+from torchrl_l2c2.experiment.regularizers.asap import ASAPConfig
 from torchrl_l2c2.experiment.regularizers.base import GainConfig, RegularizerConfig
 from torchrl_l2c2.experiment.regularizers.caps import CAPSConfig
 from torchrl_l2c2.experiment.regularizers.cats import CATSConfig
@@ -11,6 +12,7 @@ from torchrl_l2c2.experiment.regularizers.sr2l import SR2LConfig
 
 __all__ = [
     "REGULARIZERS",
+    "ASAPConfig",
     "CAPSConfig",
     "CATSConfig",
     "GainConfig",
@@ -27,6 +29,7 @@ REGULARIZERS: dict[str, RegularizerConfig] = {
     "caps": CAPSConfig(),
     "cats": CATSConfig(),
     "grad_caps": GradCAPSConfig(),
+    "asap": ASAPConfig(),
     "sr2l": SR2LConfig(),
     "lcp": LCPConfig(),
     "l2c2": L2C2Config(),

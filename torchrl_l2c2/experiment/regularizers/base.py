@@ -60,8 +60,8 @@ class GainConfig(RegularizerConfig):
     gain_limit: float = Field(
         default=1000.0,
         gt=1,
-        description="of gain=gradient and gain=target: the gain is at most this, and at least 1 "
-        "over this",
+        description="of gain=gradient and gain=target: the gain is at most this times the first "
+        "that was measured, or 1, and at least that divided by this",
     )
     gain_length: float = Field(
         default=1.0,
@@ -80,6 +80,11 @@ class GainConfig(RegularizerConfig):
                 f"is of gain=gradient and gain=target alone, got {self.gain_target} with "
                 f"gain={self.gain}: choose one of these, or leave gain_target at null.",
             )
+
+    @property
+    def targets(self) -> dict[str, float]:
+        """What gains are to meet, by the names of the settings; nothing where there is none."""
+        return {} if self.gain_target is None else {"gain_target": self.gain_target}
 
     def set_gains(self, loss: LossModule, policy: float, value: float) -> None:
         """Multiplies the terms that train the policy and the values, from what the settings say."""

@@ -46,6 +46,12 @@ class L2C2Config(GainConfig):
         ge=0,
         description="gain of the value's regularization relative to the policy's [paper]",
     )
+    gain_target_value: float | None = Field(
+        default=None,
+        ge=0,
+        description="of gain=gradient: gain_target of the value's regularization, where it is to "
+        "be another than the policy's; 0: none of it",
+    )
     num_samples: int = Field(default=1, ge=1, description="neighbors per transition [inferred: 1]")
     over_neighbors: Literal["mean", "max"] = Field(
         default="mean",
@@ -65,10 +71,38 @@ class L2C2Config(GainConfig):
         "their means before the squashing, or the KL divergence; they need other gains",
     )
 
+    tchebycheff_mu: float | None = Field(
+        default=None,
+        gt=0,
+        description="the policy descends the smooth maximum of its loss and its regularization, "
+        "smoother for larger values; null: their sum [paper]",
+    )
+    tchebycheff_ideal: float | None = Field(
+        default=None,
+        description="of tchebycheff_mu: the policy's loss that is hoped for, as minus the largest "
+        "value; null: 0",
+    )
+
     def __post_init__(self) -> None:
         GainConfig.__post_init__(self)
         if self.over_neighbors == "max" and self.num_samples == 1:
             raise SettingError("num_samples", "must be above 1 with over_neighbors=max, got 1.")
+        if self.gain_target_value is not None and (self.gain != "gradient" or not self.beta):
+            raise SettingError(
+                "gain_target_value",
+                f"needs gain=gradient and a beta above 0, got gain={self.gain} and "
+                f"beta={self.beta}: set these, or leave it at null.",
+            )
+        if self.tchebycheff_ideal is not None and self.tchebycheff_mu is None:
+            raise SettingError(
+                "tchebycheff_ideal",
+                f"is of tchebycheff_mu, which is null, got {self.tchebycheff_ideal}: set both.",
+            )
+
+    @property
+    def targets(self) -> dict[str, float]:
+        both = {"gain_target": self.gain_target, "gain_target_value": self.gain_target_value}
+        return {name: target for name, target in both.items() if target is not None}
 
     @property
     def neighborhood(self) -> Neighborhood:
@@ -85,8 +119,9 @@ class L2C2Config(GainConfig):
 
     def wrap(self, loss: LossModule) -> LossModule:
         from torchrl_l2c2.objectives import L2C2Loss
+        from torchrl_l2c2.objectives.tchebycheff import TchebycheffLoss
 
-        return L2C2Loss(
+        loss = L2C2Loss(
             loss,
             neighborhood=self.neighborhood,
             beta=self.beta,
@@ -95,6 +130,9 @@ class L2C2Config(GainConfig):
             fraction=self.fraction,
             policy_distance=self.policy_distance,
         )
+        if self.tchebycheff_mu is None:
+            return loss
+        return TchebycheffLoss(loss, self.tchebycheff_mu, (self.tchebycheff_ideal or 0.0, 0.0))
 
     def transform(self, generator: torch.Generator) -> NeighborTransform:
         from torchrl_l2c2.transforms import NeighborTransform

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from torchrl_l2c2.experiment.reports.choice import choice_table
 from torchrl_l2c2.experiment.reports.field import field_table
 from torchrl_l2c2.experiment.reports.groups import group_records
 from torchrl_l2c2.experiment.reports.page import write_report
@@ -79,8 +80,8 @@ def _report(chosen: argparse.Namespace) -> None:
         written.append(f"report: {write_report(folder, records, runs, notes)}")
     groups = group_records(records)
     tables = [score_table(readings(groups))] if chosen.score else results_tables(groups)
-    if not chosen.score and (beside := field_table(runs)) is not None:
-        tables.append(beside)
+    if not chosen.score:
+        tables += [t for t in (field_table(runs), choice_table(runs)) if t is not None]
     # Last: who reads but the first lines of it has the files all the same.
     print("\n\n".join([*(table.markdown() for table in tables), *notes, *written]))
 

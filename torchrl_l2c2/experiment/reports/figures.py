@@ -41,14 +41,14 @@ def draw_learning_curves(runs: Sequence[FinishedRun], path: str | Path) -> None:
     """
     groups = group_records(run.record for run in runs)
     runs_of = {run.record.identity: run for run in runs}
-    styles = _styles(groups)
+    looks = styles(groups)
     known = [name for name in PANELS if any(np.isfinite(run.column(name)).any() for run in runs)]
     window = max(10, max(len(run.metrics) for run in runs) // 40)
     figure, axes = subplots(len(known), 1, (3.4 * len(known) + 0.6, 3.6))
     for axis, name in zip(axes, known, strict=True):
         for group in groups:
             members = [runs_of[record.identity] for record in group.records]
-            style = {k: styles[group.name][k] for k in ("color", "linestyle")}
+            style = {k: looks[group.name][k] for k in ("color", "linestyle")}
             _draw_curve(axis, members, name, window, label=group.name, **style)
         axis.set_xlabel("thousand frames")
         axis.xaxis.set_major_formatter(lambda frames, _: f"{frames / 1000:g}")
@@ -56,7 +56,7 @@ def draw_learning_curves(runs: Sequence[FinishedRun], path: str | Path) -> None:
     if runs[0].solved_at is not None:
         axes[0].axhline(runs[0].solved_at, color="black", linestyle=":", linewidth=1)
     title = f"{runs[0].task}, {runs[0].algorithm}: training episodes, moving mean of {window}"
-    _finish(figure, axes, title, path)
+    finish(figure, axes, title, path)
 
 
 def draw_plane(groups: Sequence[Group], figure: str, path: str | Path) -> None:
@@ -76,15 +76,15 @@ def draw_plane(groups: Sequence[Group], figure: str, path: str | Path) -> None:
     picture, axes = subplots(across, down, (max(3.4 * across, 5.4), 3.2 * down + 0.6))
     for axis, (task, algorithm) in zip(axes, panels, strict=False):
         together = [g for g in groups if (g.first.task, g.first.algorithm) == (task, algorithm)]
-        styles = _styles(together)
+        looks = styles(together)
         for group in together:
-            _draw_point(axis, group, figure, styles[group.name])
+            _draw_point(axis, group, figure, looks[group.name])
         axis.set_title(f"{task}, {algorithm}", fontsize=10)
         axis.set_xlabel("action variation")
         axis.set_ylabel("return")
     for axis in axes[len(panels) :]:
         axis.set_visible(False)
-    _finish(picture, axes, f"{FIGURES[figure]}; hollow: the paper", path)
+    finish(picture, axes, f"{FIGURES[figure]}; hollow: the paper", path)
 
 
 def draw_front(groups: Sequence[Group], figure: str, path: str | Path) -> None:
@@ -98,11 +98,11 @@ def draw_front(groups: Sequence[Group], figure: str, path: str | Path) -> None:
         path (str or Path): of the file; its ending, ``.png`` or ``.svg``, decides what it is.
     """
     picture, axes = subplots(1, 1, (5.4, 4.0))
-    styles = _styles(groups)
+    looks = styles(groups)
     front = pareto_front(groups, figure)
     for group in groups:
         if place := means(group, figure):
-            color = styles[group.name]["color"]
+            color = looks[group.name]["color"]
             axes[0].plot(*place[::-1], "o", color=color, alpha=1.0 if group in front else 0.3)
     steps = [means(group, figure)[::-1] for group in front]
     axes[0].step(*zip(*steps, strict=True), where="post", color="#444444", linewidth=1)
@@ -113,7 +113,7 @@ def draw_front(groups: Sequence[Group], figure: str, path: str | Path) -> None:
     axes[0].set_ylabel("return")
     first = groups[0].first
     title = f"{first.task}, {first.algorithm}: {len(groups)} settings, {FIGURES[figure]}"
-    _finish(picture, axes, title, path)
+    finish(picture, axes, title, path)
 
 
 def _draw_curve(
@@ -181,22 +181,22 @@ def _bars(estimate: Estimate) -> list[list[float]] | None:
     return [[max(0.0, estimate.value - lower)], [max(0.0, upper - estimate.value)]]
 
 
-def _styles(groups: Sequence[Group]) -> dict[str, dict[str, str]]:
+def styles(groups: Sequence[Group]) -> dict[str, dict[str, str]]:
     """A color for each method, and a line and a marker for each of its groups."""
     others = sorted({g.first.method for g in groups} - METHODS.keys())
     colors = {name: color for name, (_, color) in METHODS.items()}
     colors |= {name: _OTHER_COLORS[i % len(_OTHER_COLORS)] for i, name in enumerate(others)}
     seen: Counter[str] = Counter()
-    styles = {}
+    found = {}
     for group in groups:
         method = group.first.method
-        styles[group.name] = {
+        found[group.name] = {
             "color": colors[method],
             "linestyle": _LINES[seen[method] % len(_LINES)],
             "marker": _MARKERS[seen[method] % len(_MARKERS)],
         }
         seen[method] += 1
-    return styles
+    return found
 
 
 def subplots(across: int, down: int, size: tuple[float, float]) -> tuple[Any, list[Any]]:
@@ -216,7 +216,15 @@ def subplots(across: int, down: int, size: tuple[float, float]) -> tuple[Any, li
     return figure, list(figure.subplots(down, across, squeeze=False).flat)
 
 
-def _finish(figure: Any, axes: Sequence[Any], title: str, path: str | Path) -> None:
+def finish(figure: Any, axes: Sequence[Any], title: str, path: str | Path) -> None:
+    """Gives a figure its grid, title and legend, and writes it.
+
+    Args:
+        figure: of :func:`subplots`.
+        axes: likewise.
+        title (str): above all of them.
+        path (str or Path): of the file; its ending decides what it is.
+    """
     named: dict[str, Any] = {}
     for axis in axes:
         axis.grid(alpha=0.25)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from torchrl_l2c2.experiment.folder import make_folder, write_atomically, write_json
+from torchrl_l2c2.experiment.reports.choice import choice_table
 from torchrl_l2c2.experiment.reports.comparison import statistics_tables, summary
 from torchrl_l2c2.experiment.reports.document import picture, whole_page
 from torchrl_l2c2.experiment.reports.field import field_table
@@ -57,7 +58,8 @@ def write_report(
     folder = make_folder(folder)
     tables, groups = all_tables(records), group_records(records)
     # Before every run by itself.
-    tables[-1:-1] = [t for t in (field_table(runs), measures_table(runs)) if t is not None]
+    of_runs = (field_table(runs), choice_table(runs), measures_table(runs))
+    tables[-1:-1] = [table for table in of_runs if table is not None]
     pictures = _draw(folder, records, runs)
     text = "\n\n".join(
         [

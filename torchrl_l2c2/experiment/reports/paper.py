@@ -44,6 +44,7 @@ METHODS = {
     "l2c2_ramp": ("L2C2, means, ramp", "#0b3d66"),
     "cats": ("CATS", "#b0416b"),
     "grad_caps": ("Grad-CAPS", "#8a6d1d"),
+    "asap": ("ASAP", "#4b6f44"),
 }
 
 

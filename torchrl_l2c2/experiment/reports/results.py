@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from torchrl_l2c2.experiment.reports.choice import choice_table
 from torchrl_l2c2.experiment.reports.field import field_table
 from torchrl_l2c2.experiment.reports.figures import draw_learning_curves
 from torchrl_l2c2.experiment.reports.groups import group_records
@@ -63,8 +64,7 @@ def sweep_summary(folders: Sequence[str | Path]) -> str:
     """
     found = find_runs(folders)
     tables = results_tables(group_records(run.record for run in found.runs)) if found.runs else []
-    if (beside := field_table(found.runs)) is not None:
-        tables.append(beside)
+    tables += [t for t in (field_table(found.runs), choice_table(found.runs)) if t is not None]
     none = [] if found.runs else [f"No finished run below {', '.join(map(str, folders))}."]
     return "\n\n".join([*(table.markdown() for table in tables), *none, *found.notes])
 

@@ -1,0 +1,277 @@
+"""How finished runs bear noise on their observations: return and smoothness at each level.
+
+``python -m torchrl_l2c2.experiment.noise FOLDER...`` plays test episodes with the policies of all
+runs below folders, and writes a table and pictures.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torchrl.envs import EnvBase, TransformedEnv
+from tqdm import tqdm
+
+from torchrl_l2c2.experiment.collection import play_episodes
+from torchrl_l2c2.experiment.environments import TEST_SEED
+from torchrl_l2c2.experiment.evaluate import evaluate_policy
+from torchrl_l2c2.experiment.folder import make_folder, write_atomically, write_json
+from torchrl_l2c2.experiment.process import ProcessState
+from torchrl_l2c2.experiment.reports import FinishedRun, find_runs
+from torchrl_l2c2.experiment.reports.comparison import Estimate
+from torchrl_l2c2.experiment.reports.figures import finish, styles, subplots
+from torchrl_l2c2.experiment.reports.groups import Group, group_records
+from torchrl_l2c2.experiment.reports.statistics import mean
+from torchrl_l2c2.experiment.reports.tables import Table, number, number_range
+from torchrl_l2c2.experiment.trained import load_policy
+from torchrl_l2c2.transforms import ObservationNoise
+
+LEVELS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
+# As a test's summary names them: how they are told, and the quantity whose digits they have.
+MEASURES = {
+    "return_mean": ("return", "return"),
+    "sm_asap_mean": ("Sm", "sm"),
+    "action_variation_mean": ("action variation", "action_variation"),
+}
+LEGEND = (
+    "Uniform noise on every feature of the observation, up to the level times the feature's "
+    "standard deviation either way, new at every step and in the place of the task's own; the "
+    "deviation is over the states that all runs of the task here visit without noise. Means over "
+    "seeds of test episodes with mean actions, 95% intervals of the bootstrap over seeds in "
+    "brackets; Sm in the form of the report's other table."
+)
+
+
+class UniformNoise(ObservationNoise):
+    """:class:`~torchrl_l2c2.ObservationNoise` that is uniform in a box of half the width ``scale``.
+
+    Examples:
+        >>> from torchrl.envs import GymEnv
+        >>> noise = UniformNoise(torch.tensor([0.0, 0.0, 5.0]))
+        >>> env = TransformedEnv(GymEnv("Pendulum-v1"), noise)
+        >>> env.rollout(3)["observation"][:, :2].norm(dim=-1)  # a sine and a cosine
+        tensor([1.0000, 1.0000, 1.0000])
+    """
+
+    def _apply_transform(self, obs: Tensor) -> Tensor:
+        noise = torch.rand(obs.shape, generator=self.generator, dtype=obs.dtype, device=obs.device)
+        return noise.mul_(2.0).sub_(1.0).mul_(self.scale).add_(obs)
+
+
+class Played(NamedTuple):
+    """A run's test at every level of noise.
+
+    Attributes:
+        run: whose policy acted.
+        summaries: of its test episodes, by level.
+    """
+
+    run: FinishedRun
+    summaries: Mapping[float, Mapping[str, float]]
+
+
+def play_with_noise(
+    runs: Sequence[FinishedRun],
+    levels: Sequence[float] = LEVELS,
+    *,
+    episodes: int = 10,
+    progress: bool = False,
+) -> list[Played]:
+    """Plays the policies of runs at every level of noise, which is the same for all of a task.
+
+    Each run has its own test's seed, at every level: without noise it plays its test again.
+
+    Args:
+        runs (sequence of FinishedRun): of any tasks.
+        levels (sequence of float): of the noise, in standard deviations of each feature, at least
+            0. Larger ones are harder.
+
+    Keyword Args:
+        episodes (int): of each run at each level, at least 1. More give a surer mean.
+        progress (bool): whether to show a progress bar.
+
+    Raises:
+        ValueError: a level below 0, or fewer than one episode.
+        FileNotFoundError: a run's policy is not there.
+    """
+    if bad := [level for level in levels if not 0 <= level < float("inf")]:
+        raise ValueError(f"levels must be finite and at least 0, got {bad[0]}.")
+    if episodes < 1:
+        raise ValueError(f"episodes must be at least 1, got {episodes}.")
+    scales = {
+        task: _visited_scale(
+            [run for run in runs if run.config["task"]["env_id"] == task], episodes
+        )
+        for task in dict.fromkeys(run.config["task"]["env_id"] for run in runs)
+    }
+    played = []
+    for run in tqdm(runs, "noise", unit="run", disable=None if progress else True, leave=False):
+        scale = scales[run.config["task"]["env_id"]]
+        summaries = {level: _test(run, level * scale, episodes) for level in levels}
+        played.append(Played(run, summaries))
+    return played
+
+
+def noise_table(played: Sequence[Played]) -> Table:
+    """A row for every group of runs and measure, a column for every level."""
+    groups, summaries = _grouped(played)
+    levels = list(played[0].summaries)
+    rows = [
+        [
+            *(group.first.task, group.first.algorithm, group.name, number_range(group.seeds), name),
+            *(_cell(group, summaries, level, measure, quantity) for level in levels),
+        ]
+        for group in groups
+        for measure, (name, quantity) in MEASURES.items()
+    ]
+    columns = ["task", "algorithm", "method", "seeds", "measure", *(f"{x:g}" for x in levels)]
+    return Table("Noise on the observations", columns, rows, [LEGEND])
+
+
+def draw_noise(played: Sequence[Played], path: str | Path) -> None:
+    """Draws every measure against the level, a line with its interval for every group of runs.
+
+    Args:
+        played (sequence of Played): of one task and algorithm.
+        path (str or Path): of the file; its ending, ``.png`` or ``.svg``, decides what it is.
+    """
+    groups, summaries = _grouped(played)
+    looks, levels = styles(groups), list(played[0].summaries)
+    figure, axes = subplots(len(MEASURES), 1, (3.4 * len(MEASURES) + 0.6, 3.6))
+    for axis, (measure, (name, _)) in zip(axes, MEASURES.items(), strict=True):
+        for group in groups:
+            found = [_estimate(group, summaries, level, measure) for level in levels]
+            known = [(x, each) for x, each in zip(levels, found, strict=True) if each is not None]
+            places, look = [x for x, _ in known], looks[group.name]
+            axis.plot(places, [each.value for _, each in known], label=group.name, **look)
+            ends = [each.interval or (each.value, each.value) for _, each in known]
+            band = {"color": look["color"], "alpha": 0.18, "linewidth": 0}
+            axis.fill_between(places, *zip(*ends, strict=True), **band)
+        axis.set_xlabel("noise, in deviations of each feature")
+        axis.set_ylabel(name)
+    first = groups[0].first
+    finish(figure, axes, f"{first.task}, {first.algorithm}: noise on the observations", path)
+
+
+def write_noise(folder: str | Path, played: Sequence[Played]) -> list[Path]:
+    """Writes ``noise.md``, ``noise.json`` and a picture for every task and algorithm.
+
+    Args:
+        folder (str or Path): made where it is not there.
+        played (sequence of Played): at least one, all at the same levels.
+
+    Returns:
+        list: of the files.
+    """
+    folder = make_folder(folder)
+    kinds = dict.fromkeys((each.run.task, each.run.algorithm) for each in played)
+    pictures = []
+    for task, algorithm in kinds:
+        together = [p for p in played if (p.run.task, p.run.algorithm) == (task, algorithm)]
+        pictures.append(folder / f"noise_{task.replace('/', '_')}_{algorithm}.svg")
+        draw_noise(together, pictures[-1])
+    table = folder / "noise.md"
+    shown = [f"![{path.stem.replace('_', ' ')}]({path.name})" for path in pictures]
+    write_atomically(table, "\n\n".join([noise_table(played).markdown(), *shown, ""]).encode())
+    tests = [
+        {
+            "folder": str(run.folder),
+            "levels": {f"{level:g}": dict(summary) for level, summary in summaries.items()},
+        }
+        for run, summaries in played
+    ]
+    write_json(folder / "noise.json", {"runs": tests})
+    return [table, folder / "noise.json", *pictures]
+
+
+def _visited_scale(runs: Sequence[FinishedRun], episodes: int) -> Tensor:
+    """Standard deviation of each feature over the states that runs visit without noise."""
+    states = []
+    for run in runs:
+        policy, env, max_steps = load_policy(run.folder, noise_scale=0.0)
+        with ProcessState(run.seed):
+            for episode in play_episodes(policy, env, episodes, max_steps=max_steps):
+                states.append(episode["observation"])
+        env.close()
+    return torch.cat(states).std(0)
+
+
+def _test(run: FinishedRun, scale: Tensor, episodes: int) -> dict[str, float]:
+    policy, env, max_steps = load_policy(run.folder, noise_scale=0.0)
+    noisy = _with_noise(env, scale, run.seed + TEST_SEED)
+    with ProcessState(run.seed):
+        summary = evaluate_policy(policy, noisy, episodes, max_steps=max_steps).summary()
+    noisy.close()
+    return dict(summary)
+
+
+def _with_noise(env: EnvBase, scale: Tensor, seed: int) -> EnvBase:
+    generator = torch.Generator().manual_seed(seed)
+    return TransformedEnv(env, UniformNoise(scale, generator=generator))
+
+
+Summaries = Mapping[tuple[str | int, ...], Mapping[float, Mapping[str, float]]]
+
+
+def _grouped(played: Sequence[Played]) -> tuple[list[Group], Summaries]:
+    groups = group_records(each.run.record for each in played)
+    return groups, {each.run.record.identity: each.summaries for each in played}
+
+
+def _estimate(group: Group, summaries: Summaries, level: float, measure: str) -> Estimate | None:
+    found = [summaries[record.identity][level].get(measure, np.nan) for record in group.records]
+    values = [value for value in found if not np.isnan(value)]
+    return Estimate.of(mean, np.array(values).reshape(-1, 1))
+
+
+def _cell(group: Group, summaries: Summaries, level: float, measure: str, quantity: str) -> str:
+    estimate = _estimate(group, summaries, level, measure)
+    if estimate is None:
+        return "-"
+    return estimate.text(partial(number, quantity=quantity, beside=estimate.value))
+
+
+def _levels(text: str) -> list[float]:
+    return [float(part) for part in text.split(",")]
+
+
+def main(arguments: Iterable[str] | None = None) -> None:
+    """The command line: plays with noise, writes and prints the table."""
+    parser = argparse.ArgumentParser(
+        prog="python -m torchrl_l2c2.experiment.noise",
+        description="Plays the policies of finished runs with noise on their observations.",
+    )
+    add = parser.add_argument
+    add("folders", nargs="+", metavar="FOLDER", help="of runs, at any depth, e.g. outputs/pendulum")
+    add(
+        "--levels",
+        type=_levels,
+        default=list(LEVELS),
+        help="of noise, in standard deviations of each feature (default: "
+        f"{','.join(f'{level:g}' for level in LEVELS)})",
+    )
+    add("--episodes", type=int, default=10, help="of each run at each level (default: 10)")
+    add("--output", metavar="FOLDER", help="of the files (default: noise/ in the first folder)")
+    chosen = parser.parse_args(None if arguments is None else list(arguments))
+    try:
+        found = find_runs(chosen.folders)
+        if not found.runs:
+            named = ", ".join(map(repr, chosen.folders))
+            raise FileNotFoundError(f"no finished run (evaluation.json) below {named}.")
+        played = play_with_noise(found.runs, chosen.levels, episodes=chosen.episodes, progress=True)
+        written = write_noise(chosen.output or Path(chosen.folders[0]) / "noise", played)
+    except (ValueError, OSError, RuntimeError, ImportError) as error:
+        sys.exit(f"error: {error}")
+    paths = [f"written: {path}" for path in written]
+    print("\n\n".join([noise_table(played).markdown(), *found.notes, "\n".join(paths)]))
+
+
+if __name__ == "__main__":
+    main()

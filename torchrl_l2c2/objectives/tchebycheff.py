@@ -1,0 +1,176 @@
+"""Smooth Tchebycheff scalarization: of a loss and its regularizers, the worse one counts most."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import dispatch
+from torch import Tensor
+from torchrl.objectives import LossModule
+
+from torchrl_l2c2._checks import check_real
+from torchrl_l2c2.objectives.specialization import SpecializedLoss
+
+OBJECTIVES = ("loss_actor", "loss_objective", "loss_entropy")
+"""The names under which TorchRL's losses return what trains their policy."""
+
+
+class TchebycheffLoss(SpecializedLoss):
+    r"""A regularized loss whose policy is trained by a smooth maximum instead of a sum.
+
+    With :math:`f_1` the sum of the loss's own terms that train the policy and :math:`f_2` that of
+    the regularizers', gains included, the policy descends
+
+    .. math::
+        g = \mu \ln \sum_i e^{(f_i - z_i) / \mu}, \qquad
+        \nabla g = \sum_i p_i \nabla f_i, \qquad
+        p_i = \frac{e^{(f_i - z_i) / \mu}}{\sum_j e^{(f_j - z_j) / \mu}},
+
+    the smooth Tchebycheff scalarization (arXiv 2402.19078), where without it the policy descends
+    :math:`f_1 + f_2`. A sum reaches the convex parts of a Pareto front alone; this reaches all of
+    it, by the gains. Every term of the policy is returned times its :math:`p_i`, so that the sum of
+    all terms has the gradient of :math:`g`; terms of values stay as they are. ``tchebycheff`` is
+    :math:`g` and ``tchebycheff_share`` is :math:`p_2`, for the log.
+
+    It goes around the last regularizer. Loops that call ``policy_regularizer`` themselves, without
+    ``forward``, take the shares from :func:`tchebycheff_shares`.
+
+    .. note:: The loss of an actor has no natural zero: that of SAC or TD3 is minus a value, so that
+        :math:`z_1` has to be about minus the largest value that can be hoped for, and that of PPO
+        is near 0 for good policies and for bad ones, so that :math:`f_2 - z_2` alone decides: the
+        share falls as the policy gets smoother.
+
+    Args:
+        base_loss (LossModule): a regularized loss, with a term that trains the policy. Its
+            reduction is not ``"none"``.
+        mu (float): :math:`\mu`, greater than 0, in the unit of the losses. Smaller values come
+            nearer to the maximum, where only the worse one counts; larger ones to the plain mean
+            of both, :math:`\mu \ln 2` aside. Defaults to ``1.0``.
+        ideal (pair of float): :math:`z`, the least values that are to be hoped for. Larger
+            :math:`z_1` train the regularizers more. Defaults to ``(0.0, 0.0)``.
+
+    Keyword Args:
+        objectives (iterable of str): names of the terms that are :math:`f_1`; those that the loss
+            does not have are passed over. Defaults to ``OBJECTIVES``.
+
+    Raises:
+        TypeError: the loss has no regularizer with a term of the policy, or an argument has the
+            wrong type.
+        ValueError: an argument is out of its range, the loss has none of the objectives or, in
+            use, terms are not single numbers.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.modules import Actor, ValueOperator
+        >>> from torchrl.objectives import DDPGLoss
+        >>> from torchrl_l2c2 import CATSLoss
+        >>> from torchrl_l2c2.objectives.tchebycheff import TchebycheffLoss
+        >>> value = ValueOperator(torch.nn.Bilinear(3, 1, 1), in_keys=["observation", "action"])
+        >>> loss = CATSLoss(DDPGLoss(Actor(torch.nn.Linear(3, 1)), value))
+        >>> loss = TchebycheffLoss(loss, mu=0.1, ideal=(-10.0, 0.0))
+        >>> loss.out_keys[-2:]
+        ['tchebycheff', 'tchebycheff_share']
+    """
+
+    def __init__(
+        self,
+        base_loss: LossModule,
+        mu: float = 1.0,
+        ideal: tuple[float, float] = (0.0, 0.0),
+        *,
+        objectives: Iterable[str] = OBJECTIVES,
+    ) -> None:
+        check_real("mu", mu, above=0)
+        for place, value in enumerate(ideal):
+            check_real(f"ideal[{place}]", value)
+        none: frozenset[str] = frozenset()
+        added = getattr(self, "added_terms", none) & getattr(self, "policy_terms", none)
+        if not added:
+            raise TypeError(
+                f"TchebycheffLoss weighs a regularizer of the policy against the loss, and "
+                f"{type(base_loss).__name__} has none: put L2C2Loss or another around it first."
+            )
+        names = list(objectives)
+        own = [key for key in self.out_keys if key in names]
+        if not own:
+            raise ValueError(
+                f"objectives must name what trains the policy among {list(self.out_keys)}, got "
+                f"{names}."
+            )
+        self.tchebycheff_mu = float(mu)
+        self.tchebycheff_ideal = tuple(map(float, ideal))
+        self._tchebycheff_keys = (own, [key for key in self.out_keys if key in added])
+        self.out_keys = [*self.out_keys, "tchebycheff", "tchebycheff_share"]
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """As the loss itself, with the policy's terms times their shares.
+
+        Args:
+            tensordict (TensorDictBase): the batch, as the loss itself takes it.
+        """
+        terms = super().forward(tensordict)
+        sums = [sum(terms[key] for key in keys) for keys in self._tchebycheff_keys]
+        if any(each.ndim for each in sums):
+            raise ValueError(
+                "TchebycheffLoss needs terms that are single numbers, got "
+                f"{[tuple(each.shape) for each in sums]}: make the loss with reduction='mean'."
+            )
+        values = torch.stack(sums).detach()
+        shares = tchebycheff_shares(values, self.tchebycheff_ideal, self.tchebycheff_mu)
+        for keys, share in zip(self._tchebycheff_keys, shares, strict=True):
+            for key in keys:
+                terms.set(key, share * terms[key])
+        value = smooth_tchebycheff(values, self.tchebycheff_ideal, self.tchebycheff_mu)
+        return terms.set("tchebycheff", value).set("tchebycheff_share", shares[1])
+
+
+def smooth_tchebycheff(
+    values: Tensor,  # shape: [N]
+    ideal: Iterable[float],  # N of them
+    mu: float,
+) -> Tensor:  # shape: []
+    r"""The smooth Tchebycheff scalarization :math:`\mu \ln \sum_i e^{(f_i - z_i) / \mu}`.
+
+    It is at least the largest of :math:`f_i - z_i`, and at most :math:`\mu \ln N` more.
+
+    Args:
+        values: :math:`f`, weights included.
+        ideal: :math:`z`, a number for each.
+        mu: :math:`\mu`, greater than 0.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_l2c2.objectives.tchebycheff import smooth_tchebycheff
+        >>> smooth_tchebycheff(torch.tensor([3.0, 1.0]), (1.0, 1.0), mu=0.1)
+        tensor(2.)
+    """
+    return mu * torch.logsumexp(_over(values, ideal) / mu, 0)
+
+
+def tchebycheff_shares(
+    values: Tensor,  # shape: [N]
+    ideal: Iterable[float],  # N of them
+    mu: float,
+) -> Tensor:  # shape: [N]
+    """The derivative of :func:`smooth_tchebycheff` by each value: a softmax.
+
+    Args:
+        values: as there.
+        ideal: as there.
+        mu: as there.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_l2c2.objectives.tchebycheff import tchebycheff_shares
+        >>> tchebycheff_shares(torch.tensor([3.0, 3.0]), (1.0, 1.0), mu=0.1)
+        tensor([0.5000, 0.5000])
+    """
+    return torch.softmax(_over(values, ideal) / mu, 0)
+
+
+def _over(values: Tensor, ideal: Iterable[float]) -> Tensor:
+    return torch.stack([value - least for value, least in zip(values, ideal, strict=True)])
