@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import os
 import signal
 import sys
 import traceback
@@ -98,6 +99,7 @@ def check_launcher(arguments: Sequence[str]) -> None:
 def main() -> None:
     """Runs what the command line says."""
     check_launcher(sys.argv)
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Nothing is reported unasked.
     keep_ctrl_c_from_children()
     signal.signal(signal.SIGTERM, terminate)
     register()

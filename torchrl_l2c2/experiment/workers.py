@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import os
 import signal
 import weakref
 from collections.abc import Callable, Iterator
@@ -212,6 +213,7 @@ class RayEpisodeCollector(WorkersCollector, RayCollector):
         keep_previous: bool = False,
     ) -> None:
         self._seed, self._random_frames, self._frames = seed, random_frames, 0
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Nothing is reported unasked.
         super().__init__(
             [create_env] * num_workers,
             policy,
