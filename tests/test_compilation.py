@@ -81,21 +81,6 @@ def test_other_arguments_have_graphs_of_their_own_and_known_ones_none_anew():
     assert len(runs) == 6
 
 
-def test_one_graph_serves_all_sizes_that_may_vary():
-    """Sizes above one; one row is a graph of its own, as it is in broadcasting."""
-    table = torch.arange(12.0).reshape(6, 2)
-    rows_of, runs = counted(lambda stored, rows, scale: (stored[rows] * scale).sum(0))
-    ours = compiled(rows_of, varying=(1, 2))
-    for size in (5, 2, 3, 6, 1, 1):
-        rows, scale = torch.arange(size), torch.full((size, 1), 2.0)
-        torch.testing.assert_close(ours(table, rows, scale), 2.0 * table[:size].sum(0))
-    assert len(runs) == 2
-    # Sizes that differ where they did not, and other sizes of what does not vary.
-    assert ours(table, torch.arange(4), torch.full((1, 1), 1.0)).tolist() == [12.0, 16.0]
-    assert ours(table[:4], torch.arange(4), torch.full((4, 1), 1.0)).tolist() == [12.0, 16.0]
-    assert len(runs) == 4
-
-
 def test_contents_may_not_decide_what_is_done():
     """It is told, instead of what the first call's contents decide being done ever after."""
     with pytest.raises(torch.fx.experimental.symbolic_shapes.GuardOnDataDependentSymNode):

@@ -9,9 +9,8 @@ times as long at the start of every run, and it checks more at every call.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from typing import Any
 
 import torch
@@ -23,12 +22,12 @@ from torch._inductor.custom_graph_pass import CustomGraphPass, get_hash_for_file
 from torch._subclasses import FakeTensor, FakeTensorMode
 from torch.fx import Graph, GraphModule
 from torch.fx.experimental.proxy_tensor import get_proxy_mode, make_fx, track_tensor_tree
-from torch.fx.experimental.symbolic_shapes import DimDynamic, ShapeEnv, StatelessSymbolicContext
+from torch.fx.experimental.symbolic_shapes import ShapeEnv
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
-from torch.utils._pytree import tree_flatten, tree_leaves, tree_map_only, tree_unflatten
+from torch.utils._pytree import tree_flatten, tree_map_only, tree_unflatten
 
 
-def compiled(function: Callable[..., Any], *, varying: Collection[int] = ()) -> Callable[..., Any]:
+def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compiles a function into one graph, with the gradients that it takes.
 
     Random numbers are drawn as without compilation. What comes out has no gradient.
@@ -42,10 +41,6 @@ def compiled(function: Callable[..., Any], *, varying: Collection[int] = ()) -> 
         function (Callable): what is compiled, at its first call. What it does may not depend on
             what its tensors hold, and it may keep none of them.
 
-    Keyword Args:
-        varying (Collection): positions of the arguments whose tensors may have any first size: one
-            graph serves them all. Default none.
-
     Returns:
         Callable: the compiled function.
     """
@@ -56,9 +51,7 @@ def compiled(function: Callable[..., Any], *, varying: Collection[int] = ()) -> 
         key = (*rest, *((t.shape, t.stride(), t.dtype, t.device) for t in tensors))
         program = programs.get(key)
         if program is None or program.spec != spec:
-            alike = (other for other in programs.values() if other.serves(tensors, rest, spec))
-            program = next(alike, None) or _Program(function, args, varying)
-            programs[key] = program
+            program = programs[key] = _Program(function, args)
         return program(tensors)
 
     return call
@@ -70,39 +63,24 @@ class _Program:
     Args:
         function (Callable): what is compiled.
         args (tuple): the arguments.
-        varying (Collection): as for :func:`compiled`.
 
     Attributes:
         spec: how the arguments are nested.
     """
 
-    def __init__(
-        self, function: Callable[..., Any], args: tuple[Any, ...], varying: Collection[int]
-    ) -> None:
-        tensors, self._rest, self.spec = _split(args)
-        varies = [
-            position in varying
-            for position, arg in enumerate(args)
-            for leaf in tree_leaves(arg)
-            if isinstance(leaf, Tensor)
-        ]
-        self._shapes = ShapeEnv()
-        mode = FakeTensorMode(allow_non_fake_inputs=True, shape_env=self._shapes)
-        self._inputs = list(map(partial(_without_contents, mode), tensors, varies))
-        # One row, or none, is never more: such tensors are of another graph.
-        self._vary = [
-            n for n, t in enumerate(self._inputs) if t.ndim and isinstance(t.shape[0], torch.SymInt)
-        ]
+    def __init__(self, function: Callable[..., Any], args: tuple[Any, ...]) -> None:
+        tensors, rest, self.spec = _split(args)
+        # The compiler's cache wants to know that no size is unknown.
+        mode = FakeTensorMode(allow_non_fake_inputs=True, shape_env=ShapeEnv())
+        inputs = [_without_contents(mode, tensor) for tensor in tensors]
         reached = _Reached(mode)
 
-        def on_tensors(*sizes_and_tensors: Tensor) -> list[Tensor]:
-            tensors = sizes_and_tensors[len(self._vary) :]
+        def on_tensors(*tensors: Tensor) -> list[Tensor]:
             with reached:
-                returned = function(*_join(tensors, self._rest, self.spec))
+                returned = function(*_join(tensors, rest, self.spec))
             written, *self._returned = _split(returned)
             return written
 
-        inputs = self._with_sizes(self._inputs)
         with _compiling(), mode:
             module = make_fx(on_tensors)(*inputs)
         self._reached = reached.tensors
@@ -110,26 +88,8 @@ class _Program:
 
     def __call__(self, tensors: list[Tensor]) -> Any:
         with torch.no_grad():
-            written = self._run(*self._with_sizes(tensors), *self._reached)
+            written = self._run(*tensors, *self._reached)
         return _join(written, *self._returned)
-
-    def serves(self, tensors: list[Tensor], rest: list[Any], spec: Any) -> bool:
-        """Whether such arguments differ in sizes alone that may vary."""
-        if not self._vary or (rest, spec) != (self._rest, self.spec):
-            return False
-        for n, (tensor, ours) in enumerate(zip(tensors, self._inputs, strict=True)):
-            fixed = slice(n in self._vary, None)
-            if (tensor.dtype, tensor.device) != (ours.dtype, ours.device):
-                return False
-            if (tensor.shape[fixed], tensor.stride()) != (ours.shape[fixed], ours.stride()):
-                return False
-        # What the graph takes for granted: that the sizes are the same, for one thing.
-        stand_ins: list[Any] = self._inputs
-        return self._shapes.evaluate_guards_for_args(stand_ins, tensors)
-
-    def _with_sizes(self, tensors: list[Tensor]) -> list[Any]:
-        """The graph's inputs: the compiler wants the sizes that vary by themselves."""
-        return [*(tensors[n].shape[0] for n in self._vary), *tensors]
 
 
 def _split(tree: Any) -> tuple[list[Tensor], list[Any], Any]:
@@ -145,12 +105,8 @@ def _join(tensors: Iterable[Tensor], rest: list[Any], spec: Any) -> Any:
     return tree_unflatten([next(given) if leaf is Tensor else leaf for leaf in rest], spec)
 
 
-def _without_contents(mode: FakeTensorMode, tensor: Tensor, varies: bool = False) -> Tensor:
-    if not (varies and tensor.ndim):
-        return mode.from_tensor(tensor, static_shapes=True)
-    # Tensors of one size have one unknown size.
-    sizes = [DimDynamic.DUCK, *[DimDynamic.STATIC] * (tensor.ndim - 1)]
-    return mode.from_tensor(tensor, symbolic_context=StatelessSymbolicContext(sizes))
+def _without_contents(mode: FakeTensorMode, tensor: Tensor) -> Tensor:
+    return mode.from_tensor(tensor, static_shapes=True)
 
 
 @contextmanager
@@ -232,7 +188,6 @@ def _compile(
         "size_asserts": False,
         "post_grad_custom_post_pass": _BiasesApart(),
     }
-    # The compiler's cache wants to know where the sizes come from.
     with torch.no_grad(), tracing(TracingContext(mode)), inductor_config.patch(options):
         program: Any = compile_fx(module, inputs)
     return program

@@ -6,17 +6,14 @@ step that learns from them, and the rows get their new priorities.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import (
-    SamplerWithoutReplacement,
-    TensorDictPrioritizedReplayBuffer,
-    TensorDictReplayBuffer,
-)
+from torchrl.data import TensorDictPrioritizedReplayBuffer, TensorDictReplayBuffer
 
 from torchrl_l2c2.experiment.algorithms.agent import Agent
 from torchrl_l2c2.experiment.compilation import compiled
@@ -39,7 +36,6 @@ def make_update(
     compile: bool,
     skip_nonfinite: bool = False,
     read: Callable[..., TensorDictBase] | None = None,
-    varying: Collection[int] = (),
 ) -> Step:
     """One gradient step as a function of a batch: loss, gradients, optimizer, target networks.
 
@@ -52,8 +48,6 @@ def make_update(
         skip_nonfinite (bool): whether a batch with a loss or gradient that is NaN or infinite
             changes nothing and gives ``None``. The step is two graphs then.
         read (Callable, optional): makes the batch of other things, as the first part of the graph.
-        varying (Collection): positions of the step's arguments whose tensors' first sizes differ
-            from batch to batch, for a compiled step. Default none.
 
     Returns:
         Callable: takes whether the policy is updated too, then the batch or what ``read`` makes it
@@ -102,9 +96,9 @@ def make_update(
         return values, priority
 
     if compile and whole and not skip_nonfinite:
-        return compiled(update, varying=varying)
+        return compiled(update)
     if compile:
-        differentiate = compiled(differentiate, varying=varying)
+        differentiate = compiled(differentiate)
         apply = compiled(apply) if whole else apply
     if not skip_nonfinite:
         return update
@@ -173,15 +167,10 @@ class ReplayUpdate:
         self._source: TensorDictBase | None = None
         self._names: tuple[NestedKey, ...] = ()
         self._stored: tuple[Tensor, ...] = ()
-        # The last of a rollout's batches is smaller.
-        sizes_vary = isinstance(self._sampler, SamplerWithoutReplacement)
-        self.update = make_update(
-            agent,
-            compile=compile,
-            skip_nonfinite=skip_nonfinite,
-            read=self.read,
-            varying=(2, 3, 4) if sizes_vary else (),  # rows, weight and uniform of a draw
-        )
+        make = partial(make_update, agent, skip_nonfinite=skip_nonfinite, read=self.read)
+        self.update = make(compile=compile)
+        # Of the last of a rollout's batches, which may have any size: none is worth a graph.
+        self._smaller_update = make(compile=False)
 
     def __call__(self, with_policy: bool) -> tuple[Tensor, Tensor | None] | None:
         """One update, which sets the batch's priorities as well.
@@ -193,7 +182,8 @@ class ReplayUpdate:
             tuple: as the function that :func:`make_update` returns.
         """
         draw = self.draw()
-        result = self.update(with_policy, *draw)
+        smaller = len(draw.rows) < self._batch_size
+        result = (self._smaller_update if smaller else self.update)(with_policy, *draw)
         if result is not None:
             self.prioritize(draw.rows, result[1])
         return result
