@@ -32,12 +32,20 @@ def peer_rows(effort: Effort) -> Iterable[Row]:
         same = {**settings, "layers": [layer, layer], "batch": batch}
         what = f"SAC here / SBX SAC, layers of {layer}, batch {batch}"
         yield from against(what, "sac", "sbx sac", same, at_most=0.9, **how)
+        what = f"TD3 here / SBX TD3, layers of {layer}, batch {batch}"
+        yield from against(what, "td3", "sbx td3", same, **how)
     same = {**settings, "layers": [100, 100], "batch": 32}
     what = "L2C2 here / Stable-Baselines3 SAC without it, layers of 100, batch 32"
     yield from against(what, "paper", "sb3 sac", same, at_most=0.25, **how)
     same = {**settings, "layers": [64, 64], "batch": 64}
     what = "PPO here / Stable-Baselines3 PPO, layers of 64, batch 64"
     yield from against(what, "ppo", "sb3 ppo", same, at_most=0.4, **how)
+    what = "PPO here / SBX PPO, layers of 64, batch 64"
+    yield from against(what, "ppo", "sbx ppo", same, **how)
+    # Short episodes: a turn here ends with one.
+    same = {**same, "env_id": "CartPole-v1", "frames": min(64, steps)}
+    what = "DQN here / SBX DQN, layers of 64, batch 64"
+    yield from against(what, "dqn", "sbx dqn", same, **how)
 
 
 class Peer:
@@ -88,7 +96,7 @@ def against(
     settings: dict[str, Any],
     *,
     rounds: int,
-    at_most: float,
+    at_most: float | None = None,
     python: str = sys.executable,
 ) -> Iterable[Row]:
     """Time per frame here by a peer's, in turns; a row for each clock.
@@ -101,7 +109,7 @@ def against(
 
     Keyword Args:
         rounds (int): turns of each.
-        at_most (float): the limit.
+        at_most (float, optional): the limit; none by default.
         python (str): the peer's interpreter. Default: this one.
     """
     both = [Peer(ours, settings, sys.executable), Peer(peer, settings, python)]
