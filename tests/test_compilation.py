@@ -87,6 +87,20 @@ def test_contents_may_not_decide_what_is_done():
         compiled(lambda x: x if x.sum() > 0 else -x)(torch.ones(2))
 
 
+def test_what_keeps_a_traced_tensor_is_told():
+    """At the next graph that would read it."""
+    kept = []
+
+    def keeping(x):
+        kept.append(x * 2.0)
+        return x + kept[0]
+
+    ours = compiled(keeping)
+    assert ours(torch.ones(2)).tolist() == [3.0, 3.0]
+    with pytest.raises(RuntimeError, match=r"shape \(2,\) without contents was kept"):
+        ours(torch.ones(1))
+
+
 def test_biases_are_added_where_the_product_is_used():
     """No addmm is left, whose first step is a copy of the bias; the numbers are the same."""
     torch.manual_seed(0)

@@ -20,6 +20,7 @@ from torchrl_l2c2.experiment import (
     RolloutReplayConfig,
     SACConfig,
     TaskConfig,
+    TD3Config,
     UniformReplayConfig,
 )
 from torchrl_l2c2.experiment.compilation import compiler_available
@@ -140,6 +141,27 @@ def test_compiled_it_learns_the_same_and_follows_what_may_change(name):
     same(ours, plain, rtol=1e-3, atol=1e-4)
     actor = experiment.agent.loss.out_keys.index("loss_l2c2_actor")
     assert compiled[1, actor] > 30.0 * compiled[0, actor]
+
+
+@pytest.mark.skipif(not compiler_available(), reason="no C++ compiler")
+@pytest.mark.parametrize("name", ["td3", pytest.param("sac", marks=pytest.mark.slow)])
+def test_a_loss_that_was_compiled_still_has_its_contents(name):
+    """With and without the policy, two graphs, and then as it is: TorchRL's losses keep tensors."""
+    algorithm = {"td3": TD3Config, "sac": SACConfig}[name](hidden=(8,), random_frames=0)
+    case = replace(CASES["sac"], algorithm=algorithm, regularizer=NoRegularizerConfig())
+    played = Experiment(case)
+    played.train()
+    state, seen = played.state_dict(), []
+    for compile in (True, False):
+        experiment = Experiment(replace(case, compile=compile))
+        state["config"] = json.dumps(experiment.config.to_dict())
+        begin(experiment, state)
+        for with_policy in (False, True):
+            experiment.learner.update(with_policy)
+        loss = experiment.agent.loss
+        seen.append(torch.stack([loss(experiment.learner.example())[k] for k in loss.out_keys[:2]]))
+    torch.testing.assert_close(*seen, rtol=1e-3, atol=1e-4)
+    assert all(type(value) is torch.Tensor for value in seen)
 
 
 def test_advantages_are_those_of_the_whole_episode():

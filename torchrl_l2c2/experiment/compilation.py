@@ -9,6 +9,7 @@ times as long at the start of every run, and it checks more at every call.
 from __future__ import annotations
 
 import shutil
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -115,7 +116,10 @@ def _compiling() -> Iterator[None]:
     before = torch.compiler._is_compiling_flag
     torch.compiler._is_compiling_flag = True
     try:
-        yield
+        with warnings.catch_warnings():
+            # That locks are not watched meanwhile, and of a setting of torch's that it reads.
+            warnings.filterwarnings("ignore", module="tensordict")
+            yield
     finally:
         torch.compiler._is_compiling_flag = before
 
@@ -153,6 +157,11 @@ class _Reached(TorchDispatchMode):
 
     def _input(self, tensor: Tensor) -> Tensor:
         if isinstance(tensor, FakeTensor):
+            if tensor.fake_mode is not self._mode:
+                raise RuntimeError(
+                    f"a tensor of shape {tuple(tensor.shape)} without contents was kept when an "
+                    "earlier graph was made: what is compiled may keep none of its tensors."
+                )
             return tensor
         where = (tensor.data_ptr() or id(tensor), tensor.shape, tensor.stride(), tensor.dtype)
         if where not in self._known:

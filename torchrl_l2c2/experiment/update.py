@@ -14,6 +14,7 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import TensorDictPrioritizedReplayBuffer, TensorDictReplayBuffer
+from torchrl.objectives import LossModule
 
 from torchrl_l2c2.experiment.algorithms.agent import Agent
 from torchrl_l2c2.experiment.compilation import compiled
@@ -68,6 +69,8 @@ def make_update(
         # A copy, as losses write into what they are given, some of it with a gradient.
         batch = drawn[0].copy() if read is None else read(*drawn)
         terms = agent.loss(batch)
+        if torch.compiler.is_compiling():
+            _forget_stand_ins(agent.loss)
         priority = batch.get("td_error", None)
         total = sum(
             terms[key]
@@ -112,6 +115,13 @@ def make_update(
         return values, priority
 
     return checked_update
+
+
+def _forget_stand_ins(loss: LossModule) -> None:
+    """Has TorchRL's losses detach their parameters anew: they keep what came of it while traced."""
+    for module in loss.modules():
+        if isinstance(module, LossModule):
+            module._erase_cache()
 
 
 class Draw(NamedTuple):
