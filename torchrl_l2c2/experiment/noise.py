@@ -56,8 +56,9 @@ class UniformNoise(ObservationNoise):
         >>> from torchrl.envs import GymEnv
         >>> noise = UniformNoise(torch.tensor([0.0, 0.0, 5.0]))
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), noise)
-        >>> env.rollout(3)["observation"][:, :2].norm(dim=-1)  # a sine and a cosine
-        tensor([1.0000, 1.0000, 1.0000])
+        >>> sine_and_cosine = env.rollout(3)["observation"][:, :2]
+        >>> sine_and_cosine.norm(dim=-1).round(decimals=3)
+        tensor([1., 1., 1.])
     """
 
     def _apply_transform(self, obs: Tensor) -> Tensor:
