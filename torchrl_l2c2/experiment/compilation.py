@@ -18,7 +18,6 @@ import torch
 from torch import Tensor
 from torch._guards import TracingContext, tracing
 from torch._inductor import config as inductor_config
-from torch._inductor.compile_fx import compile_fx
 from torch._inductor.custom_graph_pass import CustomGraphPass, get_hash_for_files
 from torch._subclasses import FakeTensor, FakeTensorMode
 from torch.fx import Graph, GraphModule
@@ -191,6 +190,9 @@ def _compile(
         if getattr(node.target, "namespace", None) == "profiler":
             graph.erase_node(node)
     module.recompile()
+    # Takes a second to import, which those who compile nothing need not wait.
+    from torch._inductor.compile_fx import compile_fx
+
     options = {
         "fallback_random": True,
         # The sizes of the inputs are checked before the program is chosen: once is enough.

@@ -96,7 +96,7 @@ class ExperimentConfig:
     )
     compile: bool = Field(
         default=True,
-        description="torch.compile the update where a C++ compiler is found; false: eager",
+        description="compile updates and policies where a C++ compiler is found; false: eager",
     )
     on_nonfinite: Literal["stop", "skip"] = Field(
         default="stop",

@@ -15,7 +15,7 @@ from torchrl_l2c2.experiment.algorithms.agent import Agent
 from torchrl_l2c2.experiment.collection import EpisodeCollector, check_finite
 from torchrl_l2c2.experiment.frames import Frame, stack_frames
 from torchrl_l2c2.experiment.rollouts import RolloutCollector
-from torchrl_l2c2.experiment.workers import WorkersCollector
+from torchrl_l2c2.experiment.workers import MultiEpisodeCollector, RayEpisodeCollector
 from torchrl_l2c2.metrics import action_variation
 
 Played = TypeVar("Played")
@@ -46,7 +46,7 @@ class Player:
     """Plays an agent's episodes, and measures and counts what is played.
 
     Args:
-        collector (EpisodeCollector, WorkersCollector or RolloutCollector): plays.
+        collector: plays, as :func:`~.workers.make_collector` makes it.
         agent (Agent): whose policy it plays.
         env_id (str): for errors.
 
@@ -56,7 +56,10 @@ class Player:
 
     def __init__(
         self,
-        collector: EpisodeCollector | WorkersCollector | RolloutCollector,
+        collector: EpisodeCollector
+        | MultiEpisodeCollector
+        | RayEpisodeCollector
+        | RolloutCollector,
         agent: Agent,
         env_id: str,
     ) -> None:

@@ -29,8 +29,8 @@ def traceable_step(optimizer: Optimizer) -> Callable[[], object] | None:
         return None
     for group in optimizer.param_groups:
         if not isinstance(group["lr"], Tensor):
-            # Not in double precision, with which torch traces everything a second time.
-            group["lr"] = torch.tensor(group["lr"], dtype=torch.float32)
+            # As precise as the number: a run that is continued uncompiled goes on with the same.
+            group["lr"] = torch.tensor(group["lr"], dtype=torch.float64)
     if isinstance(optimizer, Adam):
         _begin(optimizer)
         return partial(adam_step, optimizer)

@@ -34,7 +34,7 @@ RESTARTS = 3  # of a worker of Ray's
 
 def make_collector(
     config: ExperimentConfig, env: EnvBase, agent: Agent, *, compile: bool
-) -> EpisodeCollector | WorkersCollector | RolloutCollector:
+) -> EpisodeCollector | MultiEpisodeCollector | RayEpisodeCollector | RolloutCollector:
     """What plays a run's episodes: this process, or as many others as the settings say."""
     options: dict[str, Any] = {
         "compile_policy": compile and agent.policy_compiles,
@@ -49,8 +49,10 @@ def make_collector(
     if config.num_workers == 1:
         frames = 1 if config.algorithm.schedule == "step" else config.task.time_limit
         return EpisodeCollector(env, agent.policy, frames_per_batch=frames, **options)
-    kinds = {"processes": MultiEpisodeCollector, "ray": RayEpisodeCollector}
-    return kinds[config.workers](
+    ray = config.workers == "ray"
+    kind: type[MultiEpisodeCollector | RayEpisodeCollector]
+    kind = RayEpisodeCollector if ray else MultiEpisodeCollector
+    return kind(
         partial(make_env, config.task, config.seed),
         agent.policy,
         num_workers=config.num_workers,
@@ -60,20 +62,12 @@ def make_collector(
     )
 
 
-class WorkersCollector:
+class _Rounds:
     """Rounds of an episode of every worker, which their number and the run's seed decide alone."""
 
     _seed: int
     _frames: int
     _rounds_played = 0
-
-    def rollout(self) -> list[TensorDictBase]:
-        """One episode of every worker, as :meth:`EpisodeCollector.rollout` gives them."""
-        raise NotImplementedError
-
-    def shutdown(self, *args: Any, **kwargs: Any) -> None:
-        """Ends the workers; nothing can be collected any more."""
-        raise NotImplementedError
 
     def generator_state(self) -> dict[str, Any]:
         """What the following episodes depend on, but for the policy."""
@@ -88,7 +82,7 @@ class WorkersCollector:
         return int(entropy.generate_state(1)[0])
 
 
-class MultiEpisodeCollector(WorkersCollector, MultiSyncCollector):
+class MultiEpisodeCollector(_Rounds, MultiSyncCollector):
     """An :class:`EpisodeCollector` in each of several processes, which play an episode at a time.
 
     Episodes depend on the seed, the number of rounds played before and their place in the round,
@@ -166,7 +160,7 @@ class MultiEpisodeCollector(WorkersCollector, MultiSyncCollector):
     def shutdown(self, *args: Any, **kwargs: Any) -> None:
         """Ends the processes; nothing can be collected any more."""
         atexit.unregister(self._at_exit)
-        MultiSyncCollector.shutdown(self, *args, **kwargs)
+        super().shutdown(*args, **kwargs)
 
     def rollout(self) -> list[TensorDictBase]:
         """One episode of every process, as :meth:`EpisodeCollector.rollout` gives them."""
@@ -183,7 +177,7 @@ class MultiEpisodeCollector(WorkersCollector, MultiSyncCollector):
         return [episode.exclude("collector") for episode in episodes]
 
 
-class RayEpisodeCollector(WorkersCollector, RayCollector):
+class RayEpisodeCollector(_Rounds, RayCollector):
     """A :class:`MultiEpisodeCollector` whose workers are Ray's, on whatever machines it has.
 
     The same settings and seed give the same episodes, to the bit where processors are of one kind.
@@ -244,10 +238,6 @@ class RayEpisodeCollector(WorkersCollector, RayCollector):
         self._rounds_played += 1
         self._frames += sum(map(len, episodes))
         return episodes
-
-    def shutdown(self, *args: Any, **kwargs: Any) -> None:
-        """Ends the workers, and Ray where it was begun here."""
-        RayCollector.shutdown(self)
 
 
 class _EpisodeWorker(EpisodeCollector):
