@@ -310,6 +310,31 @@ class TestGroups:
         _, last = results_tables(groups)
         assert any("runs of 10 episodes and of 20 episodes are rows" in note for note in last.notes)
 
+    def test_a_run_can_be_read_as_if_it_had_ended_earlier(self, tmp_path):
+        """Its own episodes up to there; what only its end was tested for is unknown."""
+        make_run(tmp_path / "run", make_config(), 1.0, 0.1)
+        (run,) = read_runs(tmp_path)
+        for row, total in zip(run.metrics, range(20), strict=True):
+            row["return"] = str(total)
+        record = run.until(19).record
+        # The last tenth of 19 episodes are two, the 18th and the 19th.
+        assert (record.late_sampled_return, record.episodes, record.updates) == (17.5, 19, 190)
+        assert (record.length, record.settings) == ("19 episodes", run.record.settings)
+        assert math.isnan(record.late_mean_return) and math.isnan(record.last_sampled_return)
+        assert run.until(21) is None and run.until(0) is None
+
+    def test_a_run_of_frames_is_cut_by_them(self, tmp_path):
+        """Its episodes are as long as they like."""
+        config = make_config()
+        config = replace(config, task=replace(config.task, frames=2000))
+        make_run(tmp_path / "run", config, 1.0, 0.1)
+        (run,) = read_runs(tmp_path)
+        assert run.record.length == "2000 frames"
+        assert (run.until(1550).record.length, run.until(1550).record.episodes) == (
+            "1550 frames",
+            15,
+        )
+
     def test_runs_of_several_versions_are_pooled_and_told(self, records):
         """Their numbers may differ for no other reason."""
         ours = [r for r in records if (r.task, r.method) == ("swingup", "caps")]
@@ -624,6 +649,22 @@ class TestReport:
         assert str(tmp_path / "report" / "report.html") in capsys.readouterr().out
         assert (tmp_path / "report" / "report.html").exists()
         assert len(read_runs(tmp_path)) == 1
+
+    def test_lengths_are_rows_beside_vanilla_of_the_same_length(self, forty, tmp_path, capsys):
+        """And a score each; without tables of what nobody tested."""
+        swingup = str(forty / "swingup")
+        main([swingup, "--length", "20", "10", "--score"])
+        scores = [line.split(" | ") for line in capsys.readouterr().out.splitlines()]
+        assert [row[1] for row in scores if row[0] == "| swingup"] == [
+            "task.episodes=10",
+            "task.episodes=20",
+        ]
+        main([swingup, "--length", "10", "30", "--output", str(tmp_path)])
+        printed = capsys.readouterr().out
+        assert "Last policy" not in printed and printed.count("| swingup |") == 4
+        assert "20 runs are not as long as a length that was asked for" in printed
+        report = (tmp_path / "report.md").read_text()
+        assert report.count("**Statistics") == 1 and "0.50 [0.50, 0.50]" in report
 
     def test_what_cannot_be_done_is_one_line(self, tmp_path, capsys):
         """An empty folder, no folder, a file that is not there."""

@@ -13,7 +13,7 @@ from torchrl_l2c2.experiment.reports.groups import group_records
 from torchrl_l2c2.experiment.reports.page import write_report
 from torchrl_l2c2.experiment.reports.readme import fill_readme
 from torchrl_l2c2.experiment.reports.records import Record, merge, read_records, write_records
-from torchrl_l2c2.experiment.reports.runs import FinishedRun, find_runs
+from torchrl_l2c2.experiment.reports.runs import FinishedRun, Found, find_runs
 from torchrl_l2c2.experiment.reports.score import readings
 from torchrl_l2c2.experiment.reports.tables import results_tables, score_table
 
@@ -26,6 +26,7 @@ examples:
   python -m torchrl_l2c2.experiment.reports outputs
   python -m torchrl_l2c2.experiment.reports outputs --csv results/runs.csv
   python -m torchrl_l2c2.experiment.reports --from results/runs.csv --readme README.md
+  python -m torchrl_l2c2.experiment.reports outputs --length 200 300 --score
 """
 
 
@@ -35,6 +36,8 @@ def main(arguments: Iterable[str] | None = None) -> None:
     chosen = parser.parse_args(None if arguments is None else list(arguments))
     if bool(chosen.folders) == bool(chosen.records):
         parser.error("name folders of runs, or a file of records with --from")
+    if chosen.records and chosen.length:
+        parser.error("--length needs the runs' folders: records have the end of training alone")
     if chosen.records and chosen.csv:
         parser.error("--csv writes records of folders; --from has them already")
     try:
@@ -61,6 +64,14 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--csv", metavar="CSV", help="file that gets a line for every run, or its newer line")
     add("--score", action="store_true", help="print how near vanilla and CAPS come to the paper")
+    add(
+        "--length",
+        nargs="+",
+        type=int,
+        metavar="N",
+        help="what the results had been after so many episodes of training (frames, where runs are "
+        "as long as so many frames), by training's own episodes",
+    )
     add("--readme", metavar="FILE", help="make the results between this file's marks anew")
     return parser
 
@@ -98,7 +109,22 @@ def _read(
         named = ", ".join(map(repr, chosen.folders))
         nothing = f"no finished run (evaluation.json) below {named}; name a folder of train.py's."
         raise FileNotFoundError(" ".join([nothing, *found.notes]))
+    if chosen.length:
+        return _shortened(found, chosen.length)
     return [run.record for run in found.runs], found.runs, found.notes
+
+
+def _shortened(
+    found: Found, lengths: Sequence[int]
+) -> tuple[Sequence[Record], Sequence[FinishedRun], Sequence[str]]:
+    cut = [run.until(length) for length in sorted(set(lengths)) for run in found.runs]
+    runs = [run for run in cut if run is not None]
+    notes = list(found.notes)
+    if len(runs) < len(cut):
+        notes.append(f"{len(cut) - len(runs)} runs are not as long as a length that was asked for")
+    if not runs:
+        raise ValueError(f"no run is as long as {min(lengths)} episodes, or frames; ask for less.")
+    return [run.record for run in runs], runs, notes
 
 
 if __name__ == "__main__":

@@ -70,8 +70,9 @@ def improvement(
 
 
 def statistics_tables(groups: Sequence[Group]) -> list[Table]:
-    """Interquartile means and probabilities of improvement, a table for each kind of figure."""
-    return [_statistics(figure, groups) for figure in FIGURES]
+    """Interquartile means and probabilities of improvement, a table for each figure there is."""
+    known = [f for f in FIGURES if any(len(group.scores(f, "return")) for group in groups)]
+    return [_statistics(figure, groups) for figure in known]
 
 
 def _statistics(figure: str, groups: Sequence[Group]) -> Table:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_l2c2.experiment.folder import make_folder, write_atomically
-from torchrl_l2c2.experiment.reports.differences import read_differences
+from torchrl_l2c2.experiment.reports.differences import BUDGETS, read_differences
 from torchrl_l2c2.experiment.reports.paper import Published, method_order, paper_of
 from torchrl_l2c2.experiment.tasks import TASKS
 
@@ -78,7 +78,9 @@ class Record:
     def place(self) -> tuple[Any, ...]:
         """Sorts as tables do: the paper's order, and what differs least from the defaults first."""
         task = list(TASKS).index(self.task) if self.task in TASKS else len(TASKS)
-        settings = (len(self.other_settings), self.differences, self.settings)
+        # The length has its place after them.
+        others = [f"{k}={v}" for k, v in self.other_settings.items() if k not in BUDGETS]
+        settings = (len(others), others, self.settings)
         method = (self.algorithm, *method_order(self.method))
         amount, unit = self.length.split()
         return (task, self.task, *method, *settings, unit, int(amount), self.seed)

@@ -7,7 +7,7 @@ import json
 import math
 import statistics
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -101,6 +101,28 @@ class FinishedRun:
             differences=write_differences(differences(self.config)),
             **{name: float(f"{value:.6g}") for name, value in numbers.items()},
         )
+
+    def until(self, length: int) -> FinishedRun | None:
+        """The run as if its training had ended earlier; ``None`` where it was shorter than that.
+
+        Its training's own episodes are all that is known of it then, those with sampled actions:
+        tests of earlier policies with their means were not played.
+
+        Args:
+            length (int): in episodes, or in frames where the run's own length is in frames; at
+                least as many as the first episode has.
+        """
+        unit = "episodes" if self.config["task"].get("frames") is None else "frames"
+        column = self.column("episode" if unit == "episodes" else "frames")
+        if not column or not column[0] <= length <= column[-1]:
+            return None
+        kept = [
+            {name: cell for name, cell in row.items() if not name.startswith("test_")}
+            for row, reached in zip(self.metrics, column, strict=True)
+            if reached <= length
+        ]
+        config = {**self.config, "task": {**self.config["task"], unit: length}}
+        return replace(self, config=config, evaluation={}, metrics=kept)
 
     def _length(self) -> str:
         frames = self.config["task"].get("frames")

@@ -71,10 +71,16 @@ class Table:
 
 def results_tables(groups: Sequence[Group]) -> list[Table]:
     """Means over seeds, standard deviations in brackets: late policies, and the last policy."""
+    titles = {"Late policies": ("late_mean", "late_sampled")}
+    last = ("last_mean", "last_sampled")
+    # Runs that were cut short by --length have none of it.
+    if any(len(group.scores(figure, "return")) for group in groups for figure in last):
+        titles["Last policy"] = last
     notes = [LEGEND, *settings_notes(groups)]
+    *others, end = titles
     return [
-        _results("Late policies", ("late_mean", "late_sampled"), groups, []),
-        _results("Last policy", ("last_mean", "last_sampled"), groups, notes),
+        *(_results(title, titles[title], groups, []) for title in others),
+        _results(end, titles[end], groups, notes),
     ]
 
 
@@ -139,6 +145,8 @@ def score_table(readings: Sequence[Reading]) -> Table:
         seeds = list(dict.fromkeys(number_range(g.seeds) for g in (reading.vanilla, reading.caps)))
         for figure in ("late_mean", "late_sampled"):
             cells = reading.cells(figure)
+            if all(map(math.isnan, cells.values())):
+                continue
             rows.append(
                 [
                     *(first.task, first.differences or "the defaults", "; ".join(seeds)),
