@@ -25,6 +25,7 @@ from tqdm import tqdm
 
 from benchmarks.collection_rows import collection_rows, worker_rows
 from benchmarks.peers import peer_rows
+from benchmarks.regularizer_rows import regularizer_rows
 from benchmarks.run_rows import import_rows, process_rows, run_rows, start_rows, work
 from benchmarks.setups import QUICK, Effort
 from benchmarks.timing import Row, machine, to_markdown, to_text
@@ -35,6 +36,7 @@ ROWS: dict[str, Callable[[Effort], Iterable[Row]]] = {
     "import": import_rows,
     "update": update_rows,
     "ppo_update": ppo_update_rows,
+    "regularizers": regularizer_rows,
     "update_4096": large_update_rows,
     "collection": collection_rows,
     "workers": worker_rows,

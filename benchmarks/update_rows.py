@@ -7,16 +7,9 @@ from functools import partial
 
 import torch
 
+from benchmarks.regularizer_rows import ppo_update
 from benchmarks.setups import REGULARIZERS, Effort, matrix_products, updates
 from benchmarks.timing import Row, alternate
-from torchrl_l2c2.experiment import (
-    Experiment,
-    ExperimentConfig,
-    NoRegularizerConfig,
-    PPOConfig,
-    TaskConfig,
-)
-from torchrl_l2c2.experiment.update import ReplayUpdate
 
 
 def update_rows(effort: Effort) -> Iterable[Row]:
@@ -58,19 +51,8 @@ def update_rows(effort: Effort) -> Iterable[Row]:
 
 def ppo_update_rows(effort: Effort) -> Iterable[Row]:
     """PPO's update at batch 64, two layers of 64."""
-    config = ExperimentConfig(
-        task=TaskConfig(max_steps=effort.steps, episodes=1),
-        algorithm=PPOConfig(),
-        regularizer=NoRegularizerConfig(),
-        compile=False,
-    )
-    actions = {}
-    for name, compile in {"eager": False, "compiled": effort.compile}.items():
-        experiment = Experiment(config)
-        experiment.learner.remember(experiment.player.collector.rollout())
-        update = ReplayUpdate(experiment.agent, experiment.learner.replay, compile=compile)
-        draw = update.draw()
-        actions[name] = partial(update.update, True, *draw)
+    compiled = {"eager": False, "compiled": effort.compile}
+    actions = {name: ppo_update(effort, "none", how) for name, how in compiled.items()}
     times = alternate(actions, repeats=effort.rounds, calls=20, warm_up=5)
     us = {f"{name} us": 1e6 * seconds for name, seconds in times.items()}
     yield Row(

@@ -45,6 +45,8 @@ METHODS = {
     "cats": ("CATS", "#b0416b"),
     "grad_caps": ("Grad-CAPS", "#8a6d1d"),
     "asap": ("ASAP", "#4b6f44"),
+    "sr2l": ("SR2L", "#444444"),
+    "lcp": ("LCP", "#9c755f"),
 }
 
 
