@@ -19,6 +19,8 @@ from torchrl.modules import Delta, GRUModule, LSTMModule, TanhDelta
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import _vmap_func
 
+from torchrl_l2c2.objectives.precision import autocast_at, in_full_precision
+
 Policy = Distribution | Tensor
 """A policy at some states: a distribution or, where it is deterministic, its actions."""
 
@@ -138,7 +140,8 @@ class Evaluation:
         if self.forward_pass is None:
             return evaluate(network, tensordict)
         states = None
-        if is_compiling() and self._fits_one_pass(network, tensordict):
+        alone = not is_compiling() or autocast_at(tensordict)
+        if not alone and self._fits_one_pass(network, tensordict):
             states = known_states(tensordict)
         if states is None:
             here = evaluate(network, tensordict)
@@ -170,7 +173,9 @@ class Evaluation:
         chosen: Tensor | None,
     ) -> tuple[TensorDictBase, TensorDictBase]:
         """A network's outputs at the batch's states, ``[1, *B]``, and at others, ``[K, *B]``."""
-        shared = ForwardPass() if self.forward_pass is None else self.forward_pass
+        shared = self.forward_pass
+        if shared is None or autocast_at(states):
+            shared = ForwardPass()  # What the loss has evaluated is rounded.
         wiring, known = self.wiring[network], shared.at_batch.get(network)
         dim, num = int(is_ensemble(loss, network)), len(states)
         if chosen is not None:
@@ -218,7 +223,7 @@ class Evaluation:
             params = TensorDict.from_module(net) if params is None else params
             params = params.apply(lambda p: p if p.requires_grad else p.clone())
         run = net.get_dist_params if network == POLICY_NETWORK and wiring.stochastic else net
-        with set_exploration_type(loss.deterministic_sampling_mode):
+        with set_exploration_type(loss.deterministic_sampling_mode), in_full_precision(rows):
             if params is None:
                 return run(rows)
             if not params.ndim:
