@@ -18,6 +18,7 @@ distances transforms modules updaters optim.adaterm metrics.actions
 policy_distances
 optim.__init__ metrics.policy metrics.spectrum
 metrics.__init__
+objectives.precision
 objectives.specialization objectives.evaluation objectives.shared_evaluation
 objectives.transitions objectives.relative_pearson
 objectives.regularized objectives.neighbors
@@ -44,7 +45,7 @@ experiment.regularizers.none experiment.regularizers.caps experiment.regularizer
 experiment.regularizers.cats experiment.regularizers.grad_caps experiment.regularizers.lcp
 experiment.regularizers.sr2l experiment.regularizers.asap
 experiment.regularizers.__init__
-experiment.algorithms.normalization
+experiment.algorithms.normalization experiment.algorithms.clip_ppo
 experiment.algorithms.agent experiment.algorithms.networks experiment.algorithms.base
 experiment.algorithms.ppo_rpe experiment.algorithms.sac experiment.algorithms.td3
 experiment.algorithms.dqn experiment.algorithms.ppo

@@ -106,10 +106,10 @@ class PPOConfig(AlgorithmConfig):
     ) -> Agent:
         from torch import nn
         from torchrl.modules import ValueOperator
-        from torchrl.objectives import ClipPPOLoss
         from torchrl.objectives.value import GAE
 
         from torchrl_l2c2.experiment.algorithms.agent import Agent
+        from torchrl_l2c2.experiment.algorithms.clip_ppo import TraceableClipPPOLoss
         from torchrl_l2c2.experiment.algorithms.networks import (
             check_actions,
             normal_actor,
@@ -127,7 +127,7 @@ class PPOConfig(AlgorithmConfig):
         if self.orthogonal:
             orthogonal(actor, last=0.01)
             orthogonal(critic, last=1.0)
-        loss = ClipPPOLoss(
+        loss = TraceableClipPPOLoss(
             actor,
             critic,
             clip_epsilon=self.clip_epsilon,

@@ -1,0 +1,89 @@
+"""Every kind of update can be traced, and its graph does what the update does.
+
+The graphs are run as they are: what the compiler then makes of them is tested elsewhere, and takes
+most of the time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+import torch._inductor.compile_fx
+
+from torchrl_l2c2.experiment import (
+    DQNConfig,
+    Experiment,
+    ExperimentConfig,
+    L2C2Config,
+    PPOConfig,
+    PPORPEConfig,
+    PrioritizedReplayConfig,
+    RolloutReplayConfig,
+    SACConfig,
+    TaskConfig,
+    TD3Config,
+    UniformReplayConfig,
+)
+from torchrl_l2c2.experiment.compilation import compiler_available
+from torchrl_l2c2.experiment.regularizers import REGULARIZERS
+
+pytestmark = pytest.mark.skipif(not compiler_available(), reason="no C++ compiler")
+
+TASK = TaskConfig("task", "Pendulum-v1", max_steps=40, episodes=3)
+PPO = PPOConfig(frames=40, epochs=2, hidden=(8,))
+FIXED = replace(PPO, num_envs=1, clip_actions=True, log_scale=0.0)
+ALGORITHMS = {
+    "PPO-RPE": PPORPEConfig(updates=6, hidden=(8,)),
+    "SAC": SACConfig(random_frames=20, hidden=(8,)),
+    "TD3": TD3Config(random_frames=20, hidden=(8,)),
+    "DQN": DQNConfig(random_frames=20, hidden=(8,)),
+    "PPO": PPO,
+    "PPO, entropy that is estimated": replace(PPO, entropy_coeff=0.01),
+    "PPO, entropy of a normal": replace(FIXED, entropy_coeff=0.01),
+    "PPO, normalized": replace(FIXED, normalize_observations=True, normalize_rewards=True),
+}
+METHODS = {
+    **REGULARIZERS,
+    "half of the batch": L2C2Config(fraction=0.5),
+    "the worst of four": L2C2Config(num_samples=4, over_neighbors="max"),
+    "Tchebycheff": L2C2Config(tchebycheff_mu=0.1),
+}
+PAIRS = [(name, method) for name in ALGORITHMS for method in ("none", "l2c2")]
+PAIRS += [("PPO", method) for method in METHODS if method not in ("none", "l2c2")]
+
+
+def train(algorithm, regularizer, compile):
+    discrete, name = algorithm.name == "dqn", algorithm.name
+    replays = {"ppo": RolloutReplayConfig, "ppo_rpe": PrioritizedReplayConfig}
+    config = ExperimentConfig(
+        task=replace(TASK, env_id="CartPole-v1" if discrete else "Pendulum-v1"),
+        algorithm=algorithm,
+        regularizer=regularizer,
+        replay=replays.get(name, UniformReplayConfig)(batch_size=20),
+        compile=compile,
+        late_share=0.0,
+    )
+    experiment = Experiment(config)
+    experiment.train()
+    return experiment
+
+
+@pytest.mark.parametrize("name, method", PAIRS)
+def test_the_graph_learns_what_the_update_does(name, method, monkeypatch):
+    """The same parameters, random numbers and all, but for the order of sums."""
+    graphs = []
+
+    def keep(module, inputs):
+        graphs.append(module)
+        return module
+
+    plain = train(ALGORITHMS[name], METHODS[method], compile=False)
+    monkeypatch.setattr(torch._inductor.compile_fx, "compile_fx", keep)
+    traced = train(ALGORITHMS[name], METHODS[method], compile=True)
+    assert graphs and traced.learner.updates == plain.learner.updates > 3
+    for ours, theirs in zip(
+        traced.agent.loss.parameters(), plain.agent.loss.parameters(), strict=True
+    ):
+        torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)

@@ -1,0 +1,23 @@
+"""TorchRL's clipped PPO, with an entropy bonus that can be a part of a graph."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+from torchrl.objectives import ClipPPOLoss
+
+
+class TraceableClipPPOLoss(ClipPPOLoss):
+    """Takes an entropy that has a closed form as it is.
+
+    TorchRL's loss looks whether it is finite, and otherwise estimates it: what a graph computes
+    may not depend on that. That of a normal with a positive scale is finite.
+    """
+
+    def _get_entropy(self, dist: Distribution, adv_shape: torch.Size) -> Tensor:
+        try:
+            entropy = dist.entropy()
+        except NotImplementedError:
+            return super()._get_entropy(dist, adv_shape)
+        return entropy.unsqueeze(-1)
