@@ -1,0 +1,74 @@
+"""PPO with L2C2 on several devices: every process plays by itself, gradients are averaged.
+
+``torchrun --nproc-per-node=2 examples/several_devices.py`` shows in seconds that it runs, on the
+CPU; with ``200000`` behind it, it swings the pendulum up. Where there are GPUs, each process has
+one.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+
+import torch
+import torch.distributed as dist
+from torch.nn.parallel import DistributedDataParallel
+from torchrl.collectors import Collector
+from torchrl.envs import ExplorationType, GymEnv, set_exploration_type
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+from torchrl_l2c2 import L2C2Loss, action_variation, make_actor, make_critic
+
+FRAMES = 2000  # of all processes
+FRAMES_PER_BATCH = 500  # of each
+EPOCHS, PARTS = 5, 5
+
+
+def main(frames: int) -> None:
+    cuda = torch.cuda.is_available()
+    dist.init_process_group("nccl" if cuda else "gloo")
+    rank, size = dist.get_rank(), dist.get_world_size()
+    device = torch.device(f"cuda:{os.environ['LOCAL_RANK']}" if cuda else "cpu")
+
+    torch.manual_seed(0)
+    env = GymEnv("Pendulum-v1")
+    env.set_seed(rank)
+    actor = make_actor(3, env.action_spec, hidden=(64, 64)).to(device)
+    critic = make_critic(3, num_heads=1, hidden=(64, 64)).to(device)
+    # The advantages are normalized by each process: the mean over processes is not that of all.
+    loss = L2C2Loss(ClipPPOLoss(actor, critic, entropy_coeff=0.0, normalize_advantage=True))
+    # A LossModule like any: what it returns is averaged over processes where it is differentiated.
+    parallel = DistributedDataParallel(loss)
+    advantage = GAE(gamma=0.9, lmbda=0.95, value_network=critic)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
+    torch.manual_seed(rank)  # From here on every process draws its own numbers.
+    collector = Collector(
+        env, actor, frames_per_batch=FRAMES_PER_BATCH, total_frames=frames // size, device=device
+    )
+    for collected in collector:
+        collected["next", "reward"] *= 0.1
+        for _ in range(EPOCHS):
+            with torch.no_grad():
+                advantage(collected)
+            for batch in collected[torch.randperm(FRAMES_PER_BATCH)].chunk(PARTS):
+                terms = parallel(batch)
+                sum(term for key, term in terms.items() if key.startswith("loss_")).backward()
+                torch.nn.utils.clip_grad_norm_(loss.parameters(), 1.0)
+                optimizer.step()
+                optimizer.zero_grad()
+
+    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+        episode = env.rollout(200, actor.to("cpu"))
+    mine = torch.cat([parameter.detach().flatten() for parameter in loss.parameters()])
+    first = mine.clone()
+    dist.broadcast(first, 0)
+    # In one piece, as processes write at once.
+    told = f"process {rank} of {size}: return {episode['next', 'reward'].sum().item():.1f}"
+    told += f", action variation {action_variation(episode['action']).item():.3f}"
+    print(f"{told}, apart from the first {(mine - first).abs().max().item()}\n", end="", flush=True)
+    dist.destroy_process_group()
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else FRAMES)
