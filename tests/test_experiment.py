@@ -312,6 +312,19 @@ def test_a_loss_that_is_not_finite_stops_the_run_with_its_name(monkeypatch):
         experiment.train()
 
 
+def test_a_longer_run_begins_as_a_shorter_one():
+    """Also through the last tenth of the shorter one, where its policies are tested."""
+    runs = [
+        Experiment(small(task=replace(PENDULUM, episodes=episodes), late_share=0.5)).train()
+        for episodes in (4, 6)
+    ]
+    tests = ("test_return", "test_action_variation")
+    short, long = (
+        [known({**row, **dict.fromkeys(tests, math.nan)}) for row in run] for run in runs
+    )
+    assert long[:4] == short and "test_return" in known(runs[0][-1])
+
+
 ALGORITHMS = {
     "sac": SACConfig(random_frames=20),
     "td3": TD3Config(random_frames=20),
