@@ -6,7 +6,7 @@ import html
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from torchrl_l2c2.experiment.reports.groups import (
     Group,
@@ -71,22 +71,17 @@ class Table:
 
 def results_tables(groups: Sequence[Group]) -> list[Table]:
     """Means over seeds, standard deviations in brackets: late policies, and the last policy."""
-    titles = {"Late policies": ("late_mean", "late_sampled")}
-    last = ("last_mean", "last_sampled")
-    # Runs that were cut short by --length have none of it.
-    if any(len(group.scores(figure, "return")) for group in groups for figure in last):
-        titles["Last policy"] = last
-    notes = [LEGEND, *settings_notes(groups)]
-    *others, end = titles
-    return [
-        *(_results(title, titles[title], groups, []) for title in others),
-        _results(end, titles[end], groups, notes),
+    tables = [
+        _results("Late policies", ("late_mean", "late_sampled"), groups),
+        _results("Last policy", ("last_mean", "last_sampled"), groups),
     ]
+    # Runs that were cut short by --length have no last policy.
+    known = [table for table in tables if table.rows] or tables[:1]
+    known[-1] = replace(known[-1], notes=[LEGEND, *settings_notes(groups)])
+    return known
 
 
-def _results(
-    title: str, figures: Sequence[str], groups: Sequence[Group], notes: Sequence[str]
-) -> Table:
+def _results(title: str, figures: Sequence[str], groups: Sequence[Group]) -> Table:
     columns = ["task", "algorithm", "method", "seeds"]
     columns += [
         f"{QUANTITIES[q]}, {FIGURES[f].split(', ')[1]}" for q in QUANTITIES for f in figures
@@ -99,8 +94,9 @@ def _results(
             *(_published(group.first, quantity) for quantity in QUANTITIES),
         ]
         for group in groups
+        if any(len(group.scores(figure, "return")) for figure in figures)
     ]
-    return Table(title, columns, rows, notes)
+    return Table(title, columns, rows)
 
 
 def settings_notes(groups: Sequence[Group]) -> list[str]:
