@@ -20,7 +20,7 @@ from torchrl_l2c2.experiment import (
     TaskConfig,
     make_env,
 )
-from torchrl_l2c2.experiment.collection import on_tensors
+from torchrl_l2c2.experiment.acting import on_tensors
 from torchrl_l2c2.experiment.environments import quiet_output
 from torchrl_l2c2.modules import make_actor
 

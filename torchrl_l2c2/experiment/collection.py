@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.collectors import Collector
@@ -22,7 +22,7 @@ from torchrl.envs import (
     set_exploration_type,
 )
 
-from torchrl_l2c2.experiment.compilation import compiled
+from torchrl_l2c2.experiment.acting import on_tensors
 from torchrl_l2c2.experiment.frames import Frame, stack_frames
 from torchrl_l2c2.transforms import ObservationNoise
 
@@ -321,16 +321,3 @@ def _flat(transform: Transform) -> Iterator[Transform]:
             yield from _flat(inner)
     else:
         yield transform
-
-
-def on_tensors(
-    policy: TensorDictModule, keys: list[str], compile_policy: bool
-) -> Callable[[Tensor], tuple[Tensor, ...]]:
-    """The policy as a function from an observation to the tensors it writes."""
-
-    def act(observation: Tensor) -> tuple[Tensor, ...]:
-        written = policy(TensorDict({"observation": observation}))
-        return tuple(written.get(key) for key in keys)
-
-    # It is always called in the same exploration type.
-    return compiled(act) if compile_policy else act

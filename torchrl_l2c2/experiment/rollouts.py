@@ -14,7 +14,8 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
-from torchrl_l2c2.experiment.collection import PREVIOUS, on_tensors, simulator_and_noise
+from torchrl_l2c2.experiment.acting import on_tensors
+from torchrl_l2c2.experiment.collection import PREVIOUS, simulator_and_noise
 from torchrl_l2c2.experiment.frames import Frame, stack_frames
 
 

@@ -252,7 +252,7 @@ class Experiment:
                 episodes or config.test_episodes,
                 max_steps=config.task.time_limit,
                 sampled=sampled,
-                compile_policy=self._compile and (not sampled or self.agent.policy_compiles),
+                compile_policy=self._compile,
                 progress=progress,
             )
             env.close()

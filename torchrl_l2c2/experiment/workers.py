@@ -37,7 +37,7 @@ def make_collector(
 ) -> EpisodeCollector | MultiEpisodeCollector | RayEpisodeCollector | RolloutCollector:
     """What plays a run's episodes: this process, or as many others as the settings say."""
     options: dict[str, Any] = {
-        "compile_policy": compile and agent.policy_compiles,
+        "compile_policy": compile,
         "keep_previous": config.regularizer.reads_previous,
     }
     algorithm = config.algorithm

@@ -85,8 +85,3 @@ class Agent:
     def _network(self) -> nn.Module:
         """The policy without what only explores."""
         return self.policy if self.exploration is None else self.policy[0]
-
-    @property
-    def policy_compiles(self) -> bool:
-        """Whether the policy compiles: modules that only explore take decisions that do not."""
-        return self.exploration is None
