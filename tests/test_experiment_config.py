@@ -237,7 +237,7 @@ def test_wrong_settings_are_refused_with_what_is_allowed(settings, message):
     [
         ({"workers": "ray"}, "num_workers must be more than 1 with workers=ray, got 1"),
         ({"num_workers": 0}, "num_workers must be greater than or equal to 1, got 0"),
-        ({"num_workers": 3}, r"task.episodes must be a multiple of num_workers=3.*use 399"),
+        ({"num_workers": 7}, r"task.episodes must be a multiple of num_workers=7.*use 294"),
         (
             {"num_workers": 2, "algorithm": SACConfig()},
             "num_workers must be 1 with algorithm.schedule=step",
