@@ -672,6 +672,12 @@ class TestReport:
             main([str(tmp_path)])
         with pytest.raises(SystemExit, match=r"error: there is no file"):
             main(["--from", str(tmp_path / "runs.csv")])
+        make_run(tmp_path / "run", make_config(), 1.0, 0.1)
+        with pytest.raises(SystemExit, match="error: no run is as long as 30 episodes"):
+            main([str(tmp_path), "--length", "30"])
+        with pytest.raises(SystemExit):
+            main([str(tmp_path), "--length", "0"])
+        assert "--length must be at least 1, got 0" in capsys.readouterr().err
         with pytest.raises(SystemExit):
             main([])
         assert "name folders of runs" in capsys.readouterr().err

@@ -38,6 +38,8 @@ def main(arguments: Iterable[str] | None = None) -> None:
         parser.error("name folders of runs, or a file of records with --from")
     if chosen.records and chosen.length:
         parser.error("--length needs the runs' folders: records have the end of training alone")
+    if min(chosen.length or [1]) < 1:
+        parser.error(f"--length must be at least 1, got {min(chosen.length)}")
     if chosen.records and chosen.csv:
         parser.error("--csv writes records of folders; --from has them already")
     try:
