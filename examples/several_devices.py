@@ -1,7 +1,7 @@
 """PPO with L2C2 on several devices: every process plays by itself, gradients are averaged.
 
 ``torchrun --nproc-per-node=2 examples/several_devices.py`` shows in seconds that it runs, on the
-CPU; with ``200000`` behind it, it swings the pendulum up. Where there are GPUs, each process has
+CPU; ``200000`` behind it are the frames to learn for. Where there are GPUs, each process has
 one.
 """
 
