@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
+from torchrl.modules.distributions import has_analytic_entropy
 from torchrl.objectives import ClipPPOLoss
 
 
@@ -16,8 +17,6 @@ class TraceableClipPPOLoss(ClipPPOLoss):
     """
 
     def _get_entropy(self, dist: Distribution, adv_shape: torch.Size) -> Tensor:
-        try:
-            entropy = dist.entropy()
-        except NotImplementedError:
-            return super()._get_entropy(dist, adv_shape)
-        return entropy.unsqueeze(-1)
+        if has_analytic_entropy(dist):
+            return dist.entropy().unsqueeze(-1)
+        return super()._get_entropy(dist, adv_shape)
