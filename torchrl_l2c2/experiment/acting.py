@@ -32,7 +32,7 @@ def on_tensors(
     """
     if not compile_policy:
         return _written(policy, keys)
-    network, exploring = _apart(policy)
+    network, exploring = network_of(policy), exploring_in(policy)
     if exploring is None:
         return compiled(_written(network, keys))
     names = list(network.out_keys)
@@ -54,7 +54,12 @@ def _written(policy: TensorDictModule, keys: list[str]) -> Callable[[Tensor], tu
     return act
 
 
-def _apart(policy: TensorDictModule) -> tuple[TensorDictModule, nn.Module | None]:
-    """The network, and what only explores behind it."""
+def exploring_in(policy: TensorDictModule) -> nn.Module | None:
+    """The module of TorchRL's at the end of a policy that only explores; ``None`` without one."""
     last = policy[-1] if isinstance(policy, TensorDictSequential) else None
-    return (policy[:-1], last) if isinstance(last, EXPLORING) else (policy, None)
+    return last if isinstance(last, EXPLORING) else None
+
+
+def network_of(policy: TensorDictModule) -> TensorDictModule:
+    """The policy without what only explores."""
+    return policy if exploring_in(policy) is None else policy[:-1]

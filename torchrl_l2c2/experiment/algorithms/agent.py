@@ -15,6 +15,7 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
 from torchrl.objectives.value import GAE
 
+from torchrl_l2c2.experiment.acting import exploring_in, network_of
 from torchrl_l2c2.experiment.algorithms.normalization import Normalization
 
 
@@ -28,7 +29,6 @@ class Agent:
             a copy on the CPU (:meth:`act_on_cpu`).
         optimizer: of all of the loss's parameters.
         target_updater: moves the target networks after every update; ``None`` without any.
-        exploration: the part of ``policy`` that only explores; ``None`` where it samples.
         advantage: estimates advantages of an episode, for on-policy learning.
         max_grad_norm: norm that gradients are scaled down to; ``None`` leaves them.
         policy_terms: the algorithm's own terms that train the policy; a regularizer's loss knows
@@ -41,7 +41,6 @@ class Agent:
     policy: TensorDictModule
     optimizer: Optimizer
     target_updater: TargetNetUpdater | None = None
-    exploration: nn.Module | None = None
     advantage: GAE | None = None
     max_grad_norm: float | None = None
     policy_terms: frozenset[str] = field(default_factory=frozenset)
@@ -51,6 +50,11 @@ class Agent:
 
     def __post_init__(self) -> None:
         self.policy_terms |= getattr(self.loss, "policy_terms", frozenset())
+
+    @property
+    def exploration(self) -> nn.Module | None:
+        """The part of ``policy`` that only explores; ``None`` where it samples."""
+        return exploring_in(self.policy)
 
     @property
     def device(self) -> torch.device:
@@ -68,20 +72,14 @@ class Agent:
 
         For one observation after the other the way to another device takes longer than the policy.
         """
-        self._trained = self._network()
+        self._trained = network_of(self.policy)
         self.policy = deepcopy(self.policy).to("cpu")
-        if self.exploration is not None:
-            self.exploration = self.policy[-1]
 
     @torch.no_grad()
     def refresh_policy(self) -> None:
         """Gives a copy of the policy that acts the parameters as they are now."""
         if self._trained is None:
             return
-        acting, trained = self._network().state_dict(), self._trained.state_dict()
+        acting, trained = network_of(self.policy).state_dict(), self._trained.state_dict()
         for name, value in acting.items():
             value.copy_(trained[name])
-
-    def _network(self) -> nn.Module:
-        """The policy without what only explores."""
-        return self.policy if self.exploration is None else self.policy[0]

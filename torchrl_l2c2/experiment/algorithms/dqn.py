@@ -84,5 +84,4 @@ class DQNConfig(OffPolicyConfig):
             policy=TensorDictSequential(sharing(values, loss.value_network_params), greedy),
             optimizer=optimizer.make(loss.parameters()),
             target_updater=SoftUpdate(loss, tau=self.tau),
-            exploration=greedy,
         )

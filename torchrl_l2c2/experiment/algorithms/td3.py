@@ -101,7 +101,6 @@ class TD3Config(OffPolicyConfig):
             policy=TensorDictSequential(sharing(actor, loss.actor_network_params), noise),
             optimizer=optimizer.make(loss.parameters()),
             target_updater=SoftUpdate(loss, tau=self.tau),
-            exploration=noise,
             policy_terms=frozenset({"loss_actor"}),
             policy_delay=self.policy_delay,
         )
