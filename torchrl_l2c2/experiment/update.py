@@ -51,9 +51,10 @@ def make_update(
         read (Callable, optional): makes the batch of other things, as the first part of the graph.
 
     Returns:
-        Callable: takes whether the policy is updated too, then the batch or what ``read`` makes it
-        of. Returns the means of ``agent.loss.out_keys``, in their order, as one tensor, and the
-        new priorities of the batch, if the loss gives any. Parameters have no ``grad`` after it.
+        Callable: takes whether the policy is updated too, and the target networks with it, then the
+        batch or what ``read`` makes it of. Returns the means of ``agent.loss.out_keys``, in their
+        order, as one tensor, and the new priorities of the batch, if the loss gives any. Parameters
+        have no ``grad`` after it.
     """
     parameters = [p for group in agent.optimizer.param_groups for p in group["params"]]
     keys = agent.loss.out_keys
@@ -81,13 +82,13 @@ def make_update(
         values = torch.stack([terms[key].detach().float().mean() for key in keys])
         return values, None if priority is None else priority.detach(), gradients
 
-    def apply(gradients: tuple[Tensor | None, ...]) -> None:
+    def apply(with_policy: bool, gradients: tuple[Tensor | None, ...]) -> None:
         for parameter, gradient in zip(parameters, gradients, strict=True):
             parameter.grad = gradient
         if agent.max_grad_norm is not None:
             torch.nn.utils.clip_grad_norm_(parameters, agent.max_grad_norm)
         step()
-        if agent.target_updater is not None:
+        if agent.target_updater is not None and with_policy:
             agent.target_updater.step()
         # Kept, they would be outputs of the graph, and each output takes time.
         for parameter in parameters:
@@ -95,7 +96,7 @@ def make_update(
 
     def update(with_policy: bool, *drawn: Any) -> tuple[Tensor, Tensor | None]:
         values, priority, gradients = differentiate(with_policy, *drawn)
-        apply(gradients)
+        apply(with_policy, gradients)
         return values, priority
 
     if compile and whole and not skip_nonfinite:
@@ -111,7 +112,7 @@ def make_update(
         tensors = (values, *(g for g in gradients if g is not None))
         if not all(bool(tensor.isfinite().all()) for tensor in tensors):
             return None
-        apply(gradients)
+        apply(with_policy, gradients)
         return values, priority
 
     return checked_update
@@ -186,7 +187,7 @@ class ReplayUpdate:
         """One update, which sets the batch's priorities as well.
 
         Args:
-            with_policy (bool): whether the policy is updated too.
+            with_policy (bool): whether the policy is updated too, and the target networks with it.
 
         Returns:
             tuple: as the function that :func:`make_update` returns.

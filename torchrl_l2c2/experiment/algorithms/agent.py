@@ -28,7 +28,8 @@ class Agent:
         policy: acts; shares its parameters with ``loss``, so it is always the current one, or is
             a copy on the CPU (:meth:`act_on_cpu`).
         optimizer: of all of the loss's parameters.
-        target_updater: moves the target networks after every update; ``None`` without any.
+        target_updater: moves the target networks when the policy is updated, as in TD3; ``None``
+            without any.
         advantage: estimates advantages of an episode, for on-policy learning.
         max_grad_norm: norm that gradients are scaled down to; ``None`` leaves them.
         policy_terms: the algorithm's own terms that train the policy; a regularizer's loss knows

@@ -34,7 +34,9 @@ class TD3Config(OffPolicyConfig):
     )
     noise_clip: float = Field(default=0.5, ge=0, description="largest such noise, likewise")
     policy_delay: int = Field(
-        default=2, ge=1, description="updates of the value per update of the policy"
+        default=2,
+        ge=1,
+        description="updates of the value per update of the policy and of the target networks",
     )
     hidden: Layers = Field(
         default=(256, 256), description="neurons of the hidden layers of all networks"
