@@ -37,13 +37,21 @@ PENDULUM = [
     "replay.batch_size=32",
 ]
 REPLAYED = ["algorithm.hidden=[32,32]", "algorithm.random_frames=60"]
+# With SAC and PPO as well.
+PAPERS = [
+    "regularizer=l2c2",
+    "regularizer.policy_distance=hellinger",
+    "regularizer.lambda_min=0.01",
+    "regularizer.lambda_max=1.0",
+    "regularizer.beta=0.1",
+]
 RUNS = {
     "ppo_rpe": [*SWINGUP, "regularizer=none"],
     "ppo_rpe, CAPS": [*SWINGUP, "regularizer=caps"],
     "ppo_rpe, L2C2": [*SWINGUP, "regularizer=l2c2"],
-    "sac, L2C2": [*PENDULUM, "regularizer=l2c2", "algorithm=sac", *REPLAYED],
-    "td3, L2C2": [*PENDULUM, "regularizer=l2c2", "algorithm=td3", *REPLAYED],
-    "ppo, L2C2": [*PENDULUM, "regularizer=l2c2", "algorithm=ppo", "algorithm.frames=150"],
+    "sac, L2C2": [*PENDULUM, *PAPERS, "algorithm=sac", *REPLAYED],
+    "td3, L2C2": [*PENDULUM, *PAPERS, "algorithm=td3", *REPLAYED],
+    "ppo, L2C2": [*PENDULUM, *PAPERS, "algorithm=ppo", "algorithm.frames=150"],
 }
 
 

@@ -22,10 +22,10 @@ from torchrl_l2c2.experiment import (
     SACConfig,
     TaskConfig,
 )
-from torchrl_l2c2.experiment.command import CONF, check_preset, register
+from torchrl_l2c2.experiment.command import CONF, check_preset, register, tell_tuned
 from torchrl_l2c2.experiment.config import GROUPS
 from torchrl_l2c2.experiment.manual import manual, page
-from torchrl_l2c2.experiment.regularizers import REGULARIZERS
+from torchrl_l2c2.experiment.regularizers import REGULARIZERS, TUNED
 from torchrl_l2c2.experiment.settings import SettingError, describe
 from torchrl_l2c2.experiment.tasks import FIELD_TASKS, PAPER_TASKS
 
@@ -158,6 +158,24 @@ def test_a_preset_without_settings_of_a_task_is_refused():
     """And not left at the defaults."""
     with pytest.raises(SettingError, match="preset must have settings of task=swingup with algo"):
         check_preset(composed("preset=rl_zoo", "algorithm=ppo"), "rl_zoo")
+
+
+@pytest.mark.parametrize("algorithm", TUNED)
+def test_l2c2_begins_from_what_was_found_for_the_algorithm(algorithm, capsys):
+    """What is given goes before; a run says what it has; l2c2_paper is the paper's."""
+    chosen = [f"algorithm={algorithm}", "regularizer=l2c2"]
+    config = ExperimentConfig.from_dict(composed(*chosen))
+    assert config.regularizer == TUNED[algorithm] != L2C2Config()
+    tell_tuned(config)
+    told = capsys.readouterr().out
+    assert f"lambda_min={TUNED[algorithm].lambda_min}, " in told and f"for {algorithm}" in told
+    other = ExperimentConfig.from_dict(composed(*chosen, "regularizer.beta=0.5"))
+    assert other.regularizer == dataclasses.replace(TUNED[algorithm], beta=0.5)
+    paper = ExperimentConfig.from_dict(composed(chosen[0], "regularizer=l2c2_paper"))
+    assert dataclasses.replace(paper.regularizer, name="l2c2") == L2C2Config()
+    for config in (paper, ExperimentConfig()):
+        tell_tuned(config)
+    assert not capsys.readouterr().out
 
 
 @pytest.mark.parametrize("task", PAPER_TASKS)

@@ -28,6 +28,7 @@ from torchrl_l2c2.experiment.config import GROUPS, ExperimentConfig, OtherRunErr
 from torchrl_l2c2.experiment.manual import manual
 from torchrl_l2c2.experiment.naming import run_name
 from torchrl_l2c2.experiment.progress import log
+from torchrl_l2c2.experiment.regularizers import TUNED
 from torchrl_l2c2.experiment.settings import SettingError, describe
 from torchrl_l2c2.experiment.signals import (
     Interrupted,
@@ -67,6 +68,8 @@ def register() -> None:
     for group, choices in GROUPS.items():
         for name, chosen in choices.items():
             store.store(group=group, name=name, node=_node(chosen))
+    for algorithm, tuned in TUNED.items():
+        store.store(group="tuned", name=f"l2c2_{algorithm}", node={"regularizer": _changes(tuned)})
     unknown = dict.fromkeys(("env_id", "noise_scale", "max_steps", "solved_at"))
     any_task = {"name": "${task.env_id}", **unknown}
     store.store(
@@ -86,6 +89,12 @@ def _node(chosen: Any) -> dict[str, Any]:
         {"override /optimizer@_global_.optimizer": chosen.usual_optimizer},
     ]
     return {"defaults": [*usual, "_self_"], **values}
+
+
+def _changes(tuned: Any) -> dict[str, Any]:
+    """The settings that are not those of its choice's name."""
+    usual = vars(GROUPS["regularizer"][tuned.name])
+    return {name: value for name, value in vars(tuned).items() if value != usual[name]}
 
 
 def check_launcher(arguments: Sequence[str]) -> None:
@@ -226,6 +235,7 @@ def run(values: dict[str, Any], standing: str = "", patience: float = 0.0) -> Fi
     chosen = (config.task, config.algorithm, config.regularizer)
     named = f"{', '.join(group.name for group in chosen)}, seed {config.seed}: {folder}"
     print(f"{standing}: {named}" if standing else named, flush=True)
+    tell_tuned(config)
     wait_for_folder(folder, patience)
     finished = finished_run(folder, config.to_dict())
     if finished is None:
@@ -263,6 +273,17 @@ def check_preset(values: dict[str, Any], name: str | None) -> None:
         f"must have settings of task={task} with algorithm={algorithm}, and {name} has those of "
         f"{known}: choose one of these, or preset=none.",
     )
+
+
+def tell_tuned(config: ExperimentConfig) -> None:
+    """Says where L2C2's settings begin with the algorithm, where that is not as in the paper."""
+    chosen, tuned = config.regularizer, TUNED.get(config.algorithm.name)
+    if chosen.name == "l2c2" and tuned is not None:
+        settings = ", ".join(f"{name}={getattr(chosen, name)}" for name in _changes(tuned))
+        where = (
+            f"found for {config.algorithm.name}, or given; regularizer=l2c2_paper is the paper's"
+        )
+        print(f"regularizer=l2c2: {settings} ({where})", flush=True)
 
 
 @contextmanager

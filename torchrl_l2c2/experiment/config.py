@@ -12,7 +12,7 @@ from pydantic import Field
 
 from torchrl_l2c2.experiment.algorithms import ALGORITHMS, AlgorithmConfig, PPORPEConfig
 from torchrl_l2c2.experiment.optimizers import OPTIMIZERS, OptimizerConfig
-from torchrl_l2c2.experiment.regularizers import REGULARIZERS, L2C2Config, RegularizerConfig
+from torchrl_l2c2.experiment.regularizers import REGULARIZERS, TUNED, RegularizerConfig
 from torchrl_l2c2.experiment.replay import REPLAYS, ReplayConfig
 from torchrl_l2c2.experiment.settings import SettingError, read, settings
 from torchrl_l2c2.experiment.tasks import TASKS, TaskConfig
@@ -55,7 +55,8 @@ STEERING = {"outputs", "experiment", "preset", "resume", "allow_other_versions"}
 class ExperimentConfig:
     """Everything one run depends on; the defaults are those of ``python train.py``.
 
-    Left at ``None``, ``replay`` and ``optimizer`` are the algorithm's usual ones.
+    Left at ``None``, ``replay`` and ``optimizer`` are the algorithm's usual ones, and
+    ``regularizer`` is L2C2 with what was found for the algorithm, or else the paper's.
 
     Raises:
         SettingError: a setting that is not known or lies outside its range.
@@ -68,8 +69,8 @@ class ExperimentConfig:
 
     task: TaskConfig = dataclasses.field(default_factory=lambda: TASKS["swingup"])
     algorithm: AlgorithmConfig = dataclasses.field(default_factory=PPORPEConfig)
-    regularizer: RegularizerConfig = dataclasses.field(default_factory=L2C2Config)
     # Made of None below.
+    regularizer: RegularizerConfig = None  # type: ignore[assignment]
     replay: ReplayConfig = None  # type: ignore[assignment]
     optimizer: OptimizerConfig = None  # type: ignore[assignment]
     logger: LoggerConfig = dataclasses.field(default_factory=LoggerConfig)
@@ -135,6 +136,9 @@ class ExperimentConfig:
 
     def __post_init__(self) -> None:
         # Frozen: this is how a default that depends on another field is set.
+        if self.regularizer is None:
+            tuned = TUNED.get(self.algorithm.name, REGULARIZERS["l2c2"])
+            object.__setattr__(self, "regularizer", tuned)
         if self.replay is None:
             object.__setattr__(self, "replay", REPLAYS[self.algorithm.usual_replay])
         if self.optimizer is None:

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from torchrl_l2c2.experiment.config import GROUPS, ExperimentConfig
+from torchrl_l2c2.experiment.regularizers import TUNED
 from torchrl_l2c2.experiment.settings import describe
 
 HEAD = """\
@@ -58,10 +59,18 @@ def _by_kind(choices: Any) -> Iterator[tuple[str, Any, Any]]:
 
 def _about(name: str, chosen: Any, first: Any) -> str:
     if chosen is first:
-        return (chosen.__doc__ or "").splitlines()[0]
-    names = [n for n in describe(type(chosen)) if getattr(chosen, n) != getattr(first, n)]
-    differing = ", ".join(f"{n}={_written(getattr(chosen, n))}" for n in names)
+        found = TUNED if name == "l2c2" else {}
+        begins = (
+            f" With algorithm={a} it begins from {_differing(t, chosen)}." for a, t in found.items()
+        )
+        return (chosen.__doc__ or "").splitlines()[0] + "".join(begins)
+    differing = _differing(chosen, first)
     return f"{first.name} with {differing}" if differing else (chosen.__doc__ or "")
+
+
+def _differing(chosen: Any, first: Any) -> str:
+    names = [n for n in describe(type(chosen)) if getattr(chosen, n) != getattr(first, n)]
+    return ", ".join(f"{n}={_written(getattr(chosen, n))}" for n in names)
 
 
 def _entries(group: Any, prefix: str, width: int) -> Iterator[str]:

@@ -12,6 +12,7 @@ from torchrl_l2c2.experiment.regularizers.sr2l import SR2LConfig
 
 __all__ = [
     "REGULARIZERS",
+    "TUNED",
     "ASAPConfig",
     "CAPSConfig",
     "CATSConfig",
@@ -24,6 +25,12 @@ __all__ = [
     "SR2LConfig",
 ]
 
+# By algorithm: where `regularizer=l2c2` begins, and what `ExperimentConfig` has by default, as runs
+# in results/ were smoother with it. With other algorithms, and as l2c2_paper, it is the paper's.
+TUNED: dict[str, L2C2Config] = {
+    "sac": L2C2Config(policy_distance="mean", lambda_min=10.0, lambda_max=1000.0, beta=0.0),
+}
+
 REGULARIZERS: dict[str, RegularizerConfig] = {
     "none": NoRegularizerConfig(),
     "caps": CAPSConfig(),
@@ -33,6 +40,7 @@ REGULARIZERS: dict[str, RegularizerConfig] = {
     "sr2l": SR2LConfig(),
     "lcp": LCPConfig(),
     "l2c2": L2C2Config(),
+    "l2c2_paper": L2C2Config(name="l2c2_paper"),
     # The paper's ablation: the policy alone is regularized.
     "l2c2_policy": L2C2Config(name="l2c2_policy", beta=0.0),
     # For policies of any scale, and where little is to be lost early.
