@@ -434,6 +434,7 @@ class TestSettings:
             {
                 "task": {"name": "Pendulum-v1", "env_id": "Pendulum-v1", "noise_scale": 0.05},
                 "algorithm": {"name": "sac"},
+                "regularizer": {"name": "l2c2"},
                 "replay": {"name": "prioritized", "alpha": 0.5},
             }
         )
