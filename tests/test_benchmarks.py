@@ -12,6 +12,7 @@ import torch
 
 from benchmarks.setups import matrix_products
 from benchmarks.timing import Row, alternate, to_markdown
+from benchmarks.zoo import arguments
 
 REPOSITORY = Path(__file__).parent.parent
 WHERE = {
@@ -96,3 +97,30 @@ def test_a_table_has_its_command_and_its_commit():
     """So that it can be made again, and with the same code."""
     head = to_markdown([], WHERE, "python -m benchmarks.speed").splitlines()[2]
     assert head == "`python -m benchmarks.speed`, commit abc1234"
+
+
+def test_a_preset_goes_to_stable_baselines_as_the_zoo_has_it():
+    """Hopper's settings by the names of the zoo's own file; Pendulum is not normalized."""
+    hopper = arguments("hopper_v5")
+    assert hopper["ppo"] == {
+        "learning_rate": 9.80828e-05,
+        "n_steps": 512,
+        "batch_size": 32,
+        "n_epochs": 5,
+        "gamma": 0.999,
+        "gae_lambda": 0.99,
+        "clip_range": 0.2,
+        "ent_coef": 0.00229519,
+        "vf_coef": 0.835671,
+        "max_grad_norm": 0.7,
+    }
+    assert hopper["policy"] == {
+        "net_arch": {"pi": [256, 256], "vf": [256, 256]},
+        "log_std_init": -2.0,
+        "ortho_init": False,
+        "activation_fn": "ReLU",
+    }
+    assert hopper["normalize"] == {"norm_obs": True, "norm_reward": True}
+    pendulum = arguments("pendulum")
+    assert (pendulum["num_envs"], pendulum["ppo"]["n_steps"]) == (4, 1024)
+    assert pendulum["normalize"] is None
