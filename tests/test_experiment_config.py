@@ -165,12 +165,13 @@ def test_l2c2_begins_from_what_was_found_for_the_algorithm(algorithm, capsys):
     """What is given goes before; a run says what it has; l2c2_paper is the paper's."""
     chosen = [f"algorithm={algorithm}", "regularizer=l2c2"]
     config = ExperimentConfig.from_dict(composed(*chosen))
-    assert config.regularizer == TUNED[algorithm] != L2C2Config()
+    found = L2C2Config(**TUNED[algorithm])
+    assert config.regularizer == found != L2C2Config()
     tell_tuned(config)
     told = capsys.readouterr().out
-    assert f"lambda_min={TUNED[algorithm].lambda_min}, " in told and f"for {algorithm}" in told
+    assert f"lambda_min={found.lambda_min}, " in told and f"for {algorithm}" in told
     other = ExperimentConfig.from_dict(composed(*chosen, "regularizer.beta=0.5"))
-    assert other.regularizer == dataclasses.replace(TUNED[algorithm], beta=0.5)
+    assert other.regularizer == dataclasses.replace(found, beta=0.5)
     paper = ExperimentConfig.from_dict(composed(chosen[0], "regularizer=l2c2_paper"))
     assert dataclasses.replace(paper.regularizer, name="l2c2") == L2C2Config()
     for config in (paper, ExperimentConfig()):

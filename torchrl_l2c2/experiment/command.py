@@ -69,7 +69,7 @@ def register() -> None:
         for name, chosen in choices.items():
             store.store(group=group, name=name, node=_node(chosen))
     for algorithm, tuned in TUNED.items():
-        store.store(group="tuned", name=f"l2c2_{algorithm}", node={"regularizer": _changes(tuned)})
+        store.store(group="tuned", name=f"l2c2_{algorithm}", node={"regularizer": tuned})
     unknown = dict.fromkeys(("env_id", "noise_scale", "max_steps", "solved_at"))
     any_task = {"name": "${task.env_id}", **unknown}
     store.store(
@@ -89,12 +89,6 @@ def _node(chosen: Any) -> dict[str, Any]:
         {"override /optimizer@_global_.optimizer": chosen.usual_optimizer},
     ]
     return {"defaults": [*usual, "_self_"], **values}
-
-
-def _changes(tuned: Any) -> dict[str, Any]:
-    """The settings that are not those of its choice's name."""
-    usual = vars(GROUPS["regularizer"][tuned.name])
-    return {name: value for name, value in vars(tuned).items() if value != usual[name]}
 
 
 def check_launcher(arguments: Sequence[str]) -> None:
@@ -277,13 +271,11 @@ def check_preset(values: dict[str, Any], name: str | None) -> None:
 
 def tell_tuned(config: ExperimentConfig) -> None:
     """Says where L2C2's settings begin with the algorithm, where that is not as in the paper."""
-    chosen, tuned = config.regularizer, TUNED.get(config.algorithm.name)
-    if chosen.name == "l2c2" and tuned is not None:
-        settings = ", ".join(f"{name}={getattr(chosen, name)}" for name in _changes(tuned))
-        where = (
-            f"found for {config.algorithm.name}, or given; regularizer=l2c2_paper is the paper's"
-        )
-        print(f"regularizer=l2c2: {settings} ({where})", flush=True)
+    regularizer, algorithm = config.regularizer, config.algorithm.name
+    if regularizer.name == "l2c2" and algorithm in TUNED:
+        chosen = ", ".join(f"{name}={getattr(regularizer, name)}" for name in TUNED[algorithm])
+        where = f"found for {algorithm}, or given; regularizer=l2c2_paper is the paper's"
+        print(f"regularizer=l2c2: {chosen} ({where})", flush=True)
 
 
 @contextmanager

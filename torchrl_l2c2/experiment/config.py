@@ -12,7 +12,12 @@ from pydantic import Field
 
 from torchrl_l2c2.experiment.algorithms import ALGORITHMS, AlgorithmConfig, PPORPEConfig
 from torchrl_l2c2.experiment.optimizers import OPTIMIZERS, OptimizerConfig
-from torchrl_l2c2.experiment.regularizers import REGULARIZERS, TUNED, RegularizerConfig
+from torchrl_l2c2.experiment.regularizers import (
+    REGULARIZERS,
+    TUNED,
+    L2C2Config,
+    RegularizerConfig,
+)
 from torchrl_l2c2.experiment.replay import REPLAYS, ReplayConfig
 from torchrl_l2c2.experiment.settings import SettingError, read, settings
 from torchrl_l2c2.experiment.tasks import TASKS, TaskConfig
@@ -137,8 +142,8 @@ class ExperimentConfig:
     def __post_init__(self) -> None:
         # Frozen: this is how a default that depends on another field is set.
         if self.regularizer is None:
-            tuned = TUNED.get(self.algorithm.name, REGULARIZERS["l2c2"])
-            object.__setattr__(self, "regularizer", tuned)
+            tuned = TUNED.get(self.algorithm.name, {})
+            object.__setattr__(self, "regularizer", L2C2Config(**tuned))
         if self.replay is None:
             object.__setattr__(self, "replay", REPLAYS[self.algorithm.usual_replay])
         if self.optimizer is None:

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from torchrl_l2c2.experiment.config import GROUPS, ExperimentConfig
@@ -59,18 +59,16 @@ def _by_kind(choices: Any) -> Iterator[tuple[str, Any, Any]]:
 
 def _about(name: str, chosen: Any, first: Any) -> str:
     if chosen is first:
-        found = TUNED if name == "l2c2" else {}
-        begins = (
-            f" With algorithm={a} it begins from {_differing(t, chosen)}." for a, t in found.items()
-        )
+        tuned = TUNED.items() if name == "l2c2" else ()
+        begins = (f" With algorithm={a} it begins from {_together(values)}." for a, values in tuned)
         return (chosen.__doc__ or "").splitlines()[0] + "".join(begins)
-    differing = _differing(chosen, first)
+    names = [n for n in describe(type(chosen)) if getattr(chosen, n) != getattr(first, n)]
+    differing = _together({name: getattr(chosen, name) for name in names})
     return f"{first.name} with {differing}" if differing else (chosen.__doc__ or "")
 
 
-def _differing(chosen: Any, first: Any) -> str:
-    names = [n for n in describe(type(chosen)) if getattr(chosen, n) != getattr(first, n)]
-    return ", ".join(f"{n}={_written(getattr(chosen, n))}" for n in names)
+def _together(values: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name}={_written(value)}" for name, value in values.items())
 
 
 def _entries(group: Any, prefix: str, width: int) -> Iterator[str]:

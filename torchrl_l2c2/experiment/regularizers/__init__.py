@@ -1,5 +1,7 @@
 """What is added to the loss: a file for each regularizer, and a line here for each choice."""
 
+from typing import Any
+
 from torchrl_l2c2.experiment.regularizers.asap import ASAPConfig
 from torchrl_l2c2.experiment.regularizers.base import GainConfig, RegularizerConfig
 from torchrl_l2c2.experiment.regularizers.caps import CAPSConfig
@@ -25,10 +27,10 @@ __all__ = [
     "SR2LConfig",
 ]
 
-# By algorithm: where `regularizer=l2c2` begins, and what `ExperimentConfig` has by default, as runs
-# in results/ were smoother with it. With other algorithms, and as l2c2_paper, it is the paper's.
-TUNED: dict[str, L2C2Config] = {
-    "sac": L2C2Config(policy_distance="mean", lambda_min=10.0, lambda_max=1000.0, beta=0.0),
+# By algorithm: the settings that `regularizer=l2c2` begins from, as runs in results/ were smoother
+# with them. With other algorithms, and as l2c2_paper, it is the paper's.
+TUNED: dict[str, dict[str, Any]] = {
+    "sac": {"policy_distance": "mean", "lambda_min": 10.0, "lambda_max": 1000.0, "beta": 0.0},
 }
 
 REGULARIZERS: dict[str, RegularizerConfig] = {
