@@ -15,6 +15,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from importlib.util import find_spec
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -53,6 +54,8 @@ LAUNCHERS = {
     "ray_cluster": ("hydra_plugins.hydra_ray_launcher", "ray"),
     "slurm_cluster": ("hydra_plugins.hydra_submitit_launcher", "slurm"),
 }
+# The regularizers that begin from what was found for the algorithm.
+BEGIN_TUNED = ("l2c2", "l2c2_ramp")
 HINTS: dict[type[Exception], str] = {
     SettingError: "--help lists every setting.",
     OtherRunError: "In a shell: outputs=FOLDER, allow_other_versions=true, task.episodes=N.",
@@ -68,8 +71,8 @@ def register() -> None:
     for group, choices in GROUPS.items():
         for name, chosen in choices.items():
             store.store(group=group, name=name, node=_node(chosen))
-    for algorithm, tuned in TUNED.items():
-        store.store(group="tuned", name=f"l2c2_{algorithm}", node={"regularizer": tuned})
+    for name, (algorithm, tuned) in product(BEGIN_TUNED, TUNED.items()):
+        store.store(group="tuned", name=f"{name}_{algorithm}", node={"regularizer": tuned})
     unknown = dict.fromkeys(("env_id", "noise_scale", "max_steps", "solved_at"))
     any_task = {"name": "${task.env_id}", **unknown}
     store.store(
@@ -272,10 +275,10 @@ def check_preset(values: dict[str, Any], name: str | None) -> None:
 def tell_tuned(config: ExperimentConfig) -> None:
     """Says where L2C2's settings begin with the algorithm, where that is not as in the paper."""
     regularizer, algorithm = config.regularizer, config.algorithm.name
-    if regularizer.name == "l2c2" and algorithm in TUNED:
+    if regularizer.name in BEGIN_TUNED and algorithm in TUNED:
         chosen = ", ".join(f"{name}={getattr(regularizer, name)}" for name in TUNED[algorithm])
         where = f"found for {algorithm}, or given; regularizer=l2c2_paper is the paper's"
-        print(f"regularizer=l2c2: {chosen} ({where})", flush=True)
+        print(f"regularizer={regularizer.name}: {chosen} ({where})", flush=True)
 
 
 @contextmanager

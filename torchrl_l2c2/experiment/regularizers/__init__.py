@@ -28,8 +28,15 @@ __all__ = [
 ]
 
 # By algorithm: the settings that `regularizer=l2c2` begins from, as runs in results/ were smoother
-# with them. With other algorithms, and as l2c2_paper, it is the paper's.
+# with them, and l2c2_ramp as well. With other algorithms, and as l2c2_paper, it is the paper's.
 TUNED: dict[str, dict[str, Any]] = {
+    "ppo": {
+        "policy_distance": "mean",
+        "shared": True,
+        "lambda_min": 1.0,
+        "lambda_max": 100.0,
+        "beta": 0.0,
+    },
     "sac": {"policy_distance": "mean", "lambda_min": 10.0, "lambda_max": 1000.0, "beta": 0.0},
 }
 
