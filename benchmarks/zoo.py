@@ -45,14 +45,11 @@ def arguments(task: str) -> dict[str, Any]:
     config = ExperimentConfig.from_dict(values)
     ppo: Any = config.algorithm
     adam: Any = config.optimizer
-    normalizes = ppo.normalize_observations or ppo.normalize_rewards
     return {
         "env_id": config.task.env_id,
         "frames": config.task.frames,
         "num_envs": ppo.num_envs,
-        "normalize": {"norm_obs": ppo.normalize_observations, "norm_reward": ppo.normalize_rewards}
-        if normalizes
-        else None,
+        "normalize": {"norm_obs": ppo.normalize_observations, "norm_reward": ppo.normalize_rewards},
         "linear": adam.linear,
         "test_episodes": config.test_episodes,
         "ppo": {

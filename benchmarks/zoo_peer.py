@@ -17,17 +17,14 @@ os.environ["OMP_NUM_THREADS"] = "1"
 
 def train(given: dict[str, Any]) -> Any:
     """A model, with its normalization, after its frames."""
-    import gymnasium
     import torch
     from stable_baselines3 import PPO
-    from stable_baselines3.common.monitor import Monitor
-    from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+    from stable_baselines3.common.env_util import make_vec_env
+    from stable_baselines3.common.vec_env import VecNormalize
 
     torch.set_num_threads(1)
-    one = [lambda: Monitor(gymnasium.make(given["env_id"]))]
-    env: Any = DummyVecEnv(one * given["num_envs"])
-    env.seed(given["seed"])
-    if given["normalize"] is not None:
+    env = make_vec_env(given["env_id"], given["num_envs"], seed=given["seed"])
+    if any(given["normalize"].values()):
         env = VecNormalize(env, gamma=given["ppo"]["gamma"], **given["normalize"])
     rate = given["ppo"]["learning_rate"]
     if given["linear"]:

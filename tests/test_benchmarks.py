@@ -123,4 +123,4 @@ def test_a_preset_goes_to_stable_baselines_as_the_zoo_has_it():
     assert hopper["normalize"] == {"norm_obs": True, "norm_reward": True}
     pendulum = arguments("pendulum")
     assert (pendulum["num_envs"], pendulum["ppo"]["n_steps"]) == (4, 1024)
-    assert pendulum["normalize"] is None
+    assert not any(pendulum["normalize"].values())

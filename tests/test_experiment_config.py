@@ -25,7 +25,7 @@ from torchrl_l2c2.experiment import (
 from torchrl_l2c2.experiment.command import CONF, check_preset, register, tell_tuned
 from torchrl_l2c2.experiment.config import GROUPS
 from torchrl_l2c2.experiment.manual import manual, page
-from torchrl_l2c2.experiment.regularizers import REGULARIZERS, TUNED
+from torchrl_l2c2.experiment.regularizers import BEGIN_TUNED, REGULARIZERS, TUNED
 from torchrl_l2c2.experiment.settings import SettingError, describe
 from torchrl_l2c2.experiment.tasks import FIELD_TASKS, PAPER_TASKS
 
@@ -161,12 +161,13 @@ def test_a_preset_without_settings_of_a_task_is_refused():
 
 
 @pytest.mark.parametrize("algorithm", TUNED)
-def test_l2c2_begins_from_what_was_found_for_the_algorithm(algorithm, capsys):
+@pytest.mark.parametrize("name", BEGIN_TUNED)
+def test_l2c2_begins_from_what_was_found_for_the_algorithm(name, algorithm, capsys):
     """What is given goes before; a run says what it has; l2c2_paper is the paper's."""
-    chosen = [f"algorithm={algorithm}", "regularizer=l2c2"]
+    chosen = [f"algorithm={algorithm}", f"regularizer={name}"]
     config = ExperimentConfig.from_dict(composed(*chosen))
-    found = L2C2Config(**TUNED[algorithm])
-    assert config.regularizer == found != L2C2Config()
+    found = dataclasses.replace(REGULARIZERS[name], **TUNED[algorithm])
+    assert config.regularizer == found != REGULARIZERS[name]
     tell_tuned(config)
     told = capsys.readouterr().out
     assert f"lambda_min={found.lambda_min}, " in told and f"for {algorithm}" in told

@@ -642,6 +642,12 @@ class TestReport:
         main(["--from", file, "--score"])
         assert capsys.readouterr().out.count("| reacher | task.episodes=20 | 0-4 |") == 2
         assert not (forty / "report").exists()
+        parts = [str(tmp_path / f"{task}.csv") for task in ("swingup", "reacher")]
+        for part in parts:
+            main([str(forty / Path(part).stem), "--csv", part])
+        capsys.readouterr()
+        main(["--from", *parts])
+        assert capsys.readouterr().out.strip() == tables
 
     def test_the_report_lies_in_the_runs_folder(self, tmp_path, capsys):
         """Where no other is named; the same command reads past it."""

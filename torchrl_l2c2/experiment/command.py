@@ -29,7 +29,7 @@ from torchrl_l2c2.experiment.config import GROUPS, ExperimentConfig, OtherRunErr
 from torchrl_l2c2.experiment.manual import manual
 from torchrl_l2c2.experiment.naming import run_name
 from torchrl_l2c2.experiment.progress import log
-from torchrl_l2c2.experiment.regularizers import TUNED
+from torchrl_l2c2.experiment.regularizers import BEGIN_TUNED, TUNED
 from torchrl_l2c2.experiment.settings import SettingError, describe
 from torchrl_l2c2.experiment.signals import (
     Interrupted,
@@ -54,8 +54,6 @@ LAUNCHERS = {
     "ray_cluster": ("hydra_plugins.hydra_ray_launcher", "ray"),
     "slurm_cluster": ("hydra_plugins.hydra_submitit_launcher", "slurm"),
 }
-# The regularizers that begin from what was found for the algorithm.
-BEGIN_TUNED = ("l2c2", "l2c2_ramp")
 HINTS: dict[type[Exception], str] = {
     SettingError: "--help lists every setting.",
     OtherRunError: "In a shell: outputs=FOLDER, allow_other_versions=true, task.episodes=N.",

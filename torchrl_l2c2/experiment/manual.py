@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from torchrl_l2c2.experiment.config import GROUPS, ExperimentConfig
-from torchrl_l2c2.experiment.regularizers import TUNED
+from torchrl_l2c2.experiment.regularizers import BEGIN_TUNED, TUNED
 from torchrl_l2c2.experiment.settings import describe
 
 HEAD = """\
@@ -58,13 +58,12 @@ def _by_kind(choices: Any) -> Iterator[tuple[str, Any, Any]]:
 
 
 def _about(name: str, chosen: Any, first: Any) -> str:
-    if chosen is first:
-        tuned = TUNED.items() if name == "l2c2" else ()
-        begins = (f" With algorithm={a} it begins from {_together(values)}." for a, values in tuned)
-        return (chosen.__doc__ or "").splitlines()[0] + "".join(begins)
     names = [n for n in describe(type(chosen)) if getattr(chosen, n) != getattr(first, n)]
     differing = _together({name: getattr(chosen, name) for name in names})
-    return f"{first.name} with {differing}" if differing else (chosen.__doc__ or "")
+    doc = (chosen.__doc__ or "").splitlines()[0]
+    tuned = TUNED.items() if name in BEGIN_TUNED else ()
+    begins = (f" (With algorithm={a} from {_together(values)}.)" for a, values in tuned)
+    return (f"{first.name} with {differing}" if differing else doc) + "".join(begins)
 
 
 def _together(values: Mapping[str, Any]) -> str:

@@ -13,6 +13,7 @@ from torchrl_l2c2.experiment.regularizers.none import NoRegularizerConfig
 from torchrl_l2c2.experiment.regularizers.sr2l import SR2LConfig
 
 __all__ = [
+    "BEGIN_TUNED",
     "REGULARIZERS",
     "TUNED",
     "ASAPConfig",
@@ -27,8 +28,9 @@ __all__ = [
     "SR2LConfig",
 ]
 
-# By algorithm: the settings that `regularizer=l2c2` begins from, as runs in results/ were smoother
-# with them, and l2c2_ramp as well. With other algorithms, and as l2c2_paper, it is the paper's.
+# What begins from settings that were found for the algorithm; l2c2_paper is the paper's with any.
+BEGIN_TUNED = ("l2c2", "l2c2_ramp")
+# These settings, by algorithm, of runs in results/; with others there are none.
 TUNED: dict[str, dict[str, Any]] = {
     "ppo": {
         "policy_distance": "mean",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterable, Sequence
+from itertools import chain
 from pathlib import Path
 
 from torchrl_l2c2.experiment.reports.choice import choice_table
@@ -35,7 +36,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
     parser = _parser()
     chosen = parser.parse_args(None if arguments is None else list(arguments))
     if bool(chosen.folders) == bool(chosen.records):
-        parser.error("name folders of runs, or a file of records with --from")
+        parser.error("name folders of runs, or files of records with --from")
     if chosen.records and chosen.length:
         parser.error("--length needs the runs' folders: records have the end of training alone")
     if min(chosen.length or [1]) < 1:
@@ -57,7 +58,13 @@ def _parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add("folders", nargs="*", metavar="FOLDER", help="of runs, at any depth, e.g. outputs/swingup")
-    add("--from", dest="records", metavar="CSV", help="records of runs instead of their folders")
+    add(
+        "--from",
+        dest="records",
+        nargs="+",
+        metavar="CSV",
+        help="records of runs instead of their folders",
+    )
     add(
         "--output",
         metavar="FOLDER",
@@ -103,9 +110,10 @@ def _read(
     chosen: argparse.Namespace,
 ) -> tuple[Sequence[Record], Sequence[FinishedRun], Sequence[str]]:
     if chosen.records:
-        if not Path(chosen.records).exists():
-            raise FileNotFoundError(f"there is no file {chosen.records!r}; make it with --csv.")
-        return read_records(chosen.records), [], []
+        for file in chosen.records:
+            if not Path(file).exists():
+                raise FileNotFoundError(f"there is no file {file!r}; make it with --csv.")
+        return merge([], chain.from_iterable(map(read_records, chosen.records))), [], []
     found = find_runs(chosen.folders)
     if not found.runs:
         named = ", ".join(map(repr, chosen.folders))
