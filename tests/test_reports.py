@@ -168,7 +168,9 @@ class TestFieldTable:
                 content["summary"] |= {"sm_asap_mean": 0.4 + 0.2 * seed}
                 path.write_text(json.dumps(content))
         make_run(tmp_path / "paper", make_config(), 10.0, 0.1)
-        table = field_table(read_runs(tmp_path))
+        records = [run.record for run in read_runs(tmp_path)]
+        write_records(tmp_path / "runs.csv", records)
+        table = field_table(read_records(tmp_path / "runs.csv"))
         assert cells(table, "hopper_v5", "ppo", "CAPS") == [
             "0, 1",
             "120.0 [120.0, 120.0]",
@@ -183,7 +185,7 @@ class TestFieldTable:
         assert len(table.rows) == 8  # CAPS once, as it was run
         assert {row[0] for row in table.rows} == {"hopper_v5"}
         assert "2440" in sweep_summary([tmp_path])
-        assert field_table(read_runs(tmp_path / "paper")) is None
+        assert field_table([run.record for run in read_runs(tmp_path / "paper")]) is None
 
 
 class TestChoiceTable:
@@ -211,7 +213,7 @@ class TestChoiceTable:
                     off = 10.0 * seed - 5.0 if seed < 2 else 1000.0
                     content["summary"] |= {"return_mean": total + off, "sm_asap_mean": sm}
                     path.write_text(json.dumps(content))
-        table = choice_table(read_runs(tmp_path))
+        table = choice_table([run.record for run in read_runs(tmp_path)])
         assert table.rows == [
             ["ppo", f"L2C2, gain_target={share}", "pendulum, lunarlander", "0, 1", *cells]
             for share, cells in {
@@ -226,7 +228,7 @@ class TestChoiceTable:
         make_run(tmp_path / "a", make_config(task="pendulum", algorithm=PPOConfig()), 1.0, 0.1)
         make_run(tmp_path / "b", make_config(regularizer="none"), 1.0, 0.1)
         make_run(tmp_path / "c", make_config(), 1.0, 0.1)
-        assert choice_table(read_runs(tmp_path)) is None
+        assert choice_table([run.record for run in read_runs(tmp_path)]) is None
 
 
 class TestGroups:

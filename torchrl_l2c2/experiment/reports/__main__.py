@@ -8,15 +8,14 @@ from collections.abc import Iterable, Sequence
 from itertools import chain
 from pathlib import Path
 
-from torchrl_l2c2.experiment.reports.choice import choice_table
-from torchrl_l2c2.experiment.reports.field import field_table
 from torchrl_l2c2.experiment.reports.groups import group_records
 from torchrl_l2c2.experiment.reports.page import write_report
 from torchrl_l2c2.experiment.reports.readme import fill_readme
 from torchrl_l2c2.experiment.reports.records import Record, merge, read_records, write_records
+from torchrl_l2c2.experiment.reports.results import printed_tables
 from torchrl_l2c2.experiment.reports.runs import FinishedRun, Found, find_runs
 from torchrl_l2c2.experiment.reports.score import readings
-from torchrl_l2c2.experiment.reports.tables import results_tables, score_table
+from torchrl_l2c2.experiment.reports.tables import score_table
 
 DESCRIPTION = """\
 Reads every finished run below folders, prints their tables beside the paper's numbers, and writes a
@@ -98,10 +97,8 @@ def _report(chosen: argparse.Namespace) -> None:
     if chosen.output or alone:
         folder = Path(chosen.output or Path(chosen.folders[0]) / "report")
         written.append(f"report: {write_report(folder, records, runs, notes)}")
-    groups = group_records(records)
-    tables = [score_table(readings(groups))] if chosen.score else results_tables(groups)
-    if not chosen.score:
-        tables += [t for t in (field_table(runs), choice_table(runs)) if t is not None]
+    scores = [score_table(readings(group_records(records)))] if chosen.score else None
+    tables = scores or printed_tables(records)
     # Last: who reads but the first lines of it has the files all the same.
     print("\n\n".join([*(table.markdown() for table in tables), *notes, *written]))
 

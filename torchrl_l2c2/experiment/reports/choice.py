@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from torchrl_l2c2.experiment.reports.field import PUBLISHED
-from torchrl_l2c2.experiment.reports.groups import Group, baseline_of, group_records
-from torchrl_l2c2.experiment.reports.runs import FinishedRun
+from torchrl_l2c2.experiment.reports.field import field_groups
+from torchrl_l2c2.experiment.reports.groups import Group, baseline_of
+from torchrl_l2c2.experiment.reports.records import Record
 from torchrl_l2c2.experiment.reports.tables import Table, number_range
 
 LEGEND = (
@@ -30,22 +30,20 @@ class Beside(NamedTuple):
     seeds: list[int]
 
 
-def choice_table(runs: Sequence[FinishedRun]) -> Table | None:
+def choice_table(records: Sequence[Record]) -> Table | None:
     """A row for every setting of a regularizer that ran beside vanilla, over the field's tasks.
 
     Args:
-        runs (sequence of FinishedRun): of any tasks; others are passed over.
+        records (sequence of Record): of any tasks; others are passed over.
 
     Returns:
         Table: ``None`` where nothing is to be compared.
     """
-    ours = [run for run in runs if (run.task, run.algorithm, "none") in PUBLISHED]
-    summaries = {run.record.identity: run.evaluation.get("summary", {}) for run in ours}
     settings: dict[tuple[str, ...], list[Beside]] = defaultdict(list)
-    groups = group_records(run.record for run in ours)
+    groups = field_groups(records)
     for group in groups:
         vanilla = baseline_of(group, groups)
-        beside = None if vanilla is None else _beside(group, vanilla, summaries)
+        beside = None if vanilla is None else _beside(group, vanilla)
         if beside is not None:
             settings[group.first.algorithm, group.name].append(beside)
     if not settings:
@@ -62,24 +60,16 @@ def choice_table(runs: Sequence[FinishedRun]) -> Table | None:
     return Table("In order over tasks", columns, rows, [LEGEND])
 
 
-def _beside(
-    group: Group, vanilla: Group, summaries: Mapping[tuple[str | int, ...], Mapping[str, float]]
-) -> Beside | None:
-    def figures(of: Group) -> dict[int, np.ndarray]:
-        read = {record.seed: summaries[record.identity] for record in of.records}
-        pairs = {
-            seed: np.array([summary.get(name, np.nan) for name in ("return_mean", "sm_asap_mean")])
-            for seed, summary in read.items()
-        }
-        return {seed: pair for seed, pair in pairs.items() if not np.isnan(pair).any()}
-
-    ours, theirs = figures(group), figures(vanilla)
-    seeds = sorted(ours.keys() & theirs.keys())
+def _beside(group: Group, vanilla: Group) -> Beside | None:
+    figures = [
+        side.by_seed("last_mean", quantity)
+        for quantity in ("return", "sm_asap")
+        for side in (group, vanilla)
+    ]
+    seeds = sorted(set.intersection(*map(set, figures)))
     if not seeds:
         return None
-    (total, sm), (their_total, their_sm) = (
-        np.mean([side[seed] for seed in seeds], axis=0) for side in (ours, theirs)
-    )
+    total, their_total, sm, their_sm = (np.mean([f[seed] for seed in seeds]) for f in figures)
     gained = float((total - their_total) / abs(their_total))
     return Beside(group.first.task, gained, float(sm / their_sm), seeds)
 

@@ -6,11 +6,9 @@ from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
-import numpy as np
-
 from torchrl_l2c2.experiment.reports.comparison import Estimate
 from torchrl_l2c2.experiment.reports.groups import Group, group_records
-from torchrl_l2c2.experiment.reports.runs import FinishedRun
+from torchrl_l2c2.experiment.reports.records import Record
 from torchrl_l2c2.experiment.reports.statistics import mean
 from torchrl_l2c2.experiment.reports.tables import Table, number, number_range
 from torchrl_l2c2.experiment.tasks import FIELD_TASKS
@@ -55,12 +53,7 @@ NAMES = {
     "asap": "ASAP",
     "lipsnet++": "LipsNet++",
 }
-# As evaluation.json names them: how they are told, and the quantity whose digits they have.
-MEASURES = {
-    "return": ("return", "return"),
-    "sm_asap": ("Sm", "sm"),
-    "action_variation": ("action variation", "action_variation"),
-}
+MEASURES = {"return": "return", "sm_asap": "Sm", "action_variation": "action variation"}
 LEGEND = (
     "Means over seeds of the last policy's test episodes with its mean actions, 95% intervals of "
     "the bootstrap over seeds in brackets. Sm as the published one: `(2 / N) sum_i f_i |FFT_i|` at "
@@ -70,38 +63,38 @@ LEGEND = (
 )
 
 
-def field_table(runs: Sequence[FinishedRun]) -> Table | None:
+def field_table(records: Sequence[Record]) -> Table | None:
     """A row for every group of runs on these tasks, then what else was published of them.
 
     Args:
-        runs (sequence of FinishedRun): of any tasks; others are passed over.
+        records (sequence of Record): of any tasks; others are passed over.
 
     Returns:
         Table: ``None`` where no run is of such a task with PPO or SAC.
     """
-    ours = [run for run in runs if (run.task, run.algorithm, "none") in PUBLISHED]
-    if not ours:
+    groups = field_groups(records)
+    if not groups:
         return None
-    summaries = {run.record.identity: run.evaluation.get("summary", {}) for run in ours}
-    groups = group_records(run.record for run in ours)
     rows = []
     for task, algorithm in dict.fromkeys((g.first.task, g.first.algorithm) for g in groups):
         together = [g for g in groups if (g.first.task, g.first.algorithm) == (task, algorithm)]
-        rows += [_row(group, summaries) for group in together]
+        rows += [_row(group) for group in together]
         rows += _others(task, algorithm, {g.first.method for g in together})
-    columns = ["task", "algorithm", "method", "seeds", *(name for name, _ in MEASURES.values())]
+    columns = ["task", "algorithm", "method", "seeds", *MEASURES.values()]
     columns += ["published: return", "published: Sm"]
     return Table("Beside the published table", columns, rows, [LEGEND])
 
 
-def _row(group: Group, summaries: dict[tuple[str | int, ...], dict[str, float]]) -> list[str]:
+def field_groups(records: Sequence[Record]) -> list[Group]:
+    """Groups of those records that are of these tasks, with PPO or SAC."""
+    return group_records(r for r in records if (r.task, r.algorithm, "none") in PUBLISHED)
+
+
+def _row(group: Group) -> list[str]:
     first = group.first
     cells = [first.task, first.algorithm, group.name, number_range(group.seeds)]
-    own = [summaries[record.identity] for record in group.records]
-    for name, (_, quantity) in MEASURES.items():
-        found = (each.get(f"{name}_mean") for each in own)
-        values = [value for value in found if value is not None and not np.isnan(value)]
-        center = Estimate.of(mean, np.array(values).reshape(-1, 1))
+    for quantity in MEASURES:
+        center = Estimate.of(mean, group.scores("last_mean", quantity))
         if center is None:
             cells.append("-")
         else:

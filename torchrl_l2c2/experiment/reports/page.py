@@ -58,8 +58,8 @@ def write_report(
     folder = make_folder(folder)
     tables, groups = all_tables(records), group_records(records)
     # Before every run by itself.
-    of_runs = (field_table(runs), choice_table(runs), measures_table(runs))
-    tables[-1:-1] = [table for table in of_runs if table is not None]
+    more = (field_table(records), choice_table(records), measures_table(runs))
+    tables[-1:-1] = [table for table in more if table is not None]
     pictures = _draw(folder, records, runs)
     text = "\n\n".join(
         [

@@ -39,6 +39,7 @@ class Record:
         late_mean_return: mean over the last tenth's policies of a test episode with mean actions.
         late_sampled_return: mean over the training episodes of the same policies.
         last_mean_return: mean over the last policy's test episodes with mean actions.
+        last_mean_sm_asap: of the same, as :func:`~torchrl_l2c2.metrics.spectral_smoothness` has it.
         last_sampled_return: the same with sampled actions.
         policy_scale: of the late policies.
         seconds: of training: frames over the frames a second of the last call.
@@ -60,6 +61,7 @@ class Record:
     late_sampled_action_variation: float
     last_mean_return: float
     last_mean_action_variation: float
+    last_mean_sm_asap: float
     last_sampled_return: float
     last_sampled_action_variation: float
     policy_scale: float
@@ -86,7 +88,7 @@ class Record:
         return (task, self.task, *method, *settings, unit, int(amount), self.seed)
 
     def figure(self, figure: str, quantity: str) -> float:
-        """One of the eight figures, by the names of ``FIGURES`` and ``QUANTITIES``."""
+        """By the names of ``FIGURES`` and ``QUANTITIES``; ``last_mean`` has ``sm_asap`` too."""
         value: float = getattr(self, f"{figure}_{quantity}")
         return value
 

@@ -10,9 +10,9 @@ from torchrl_l2c2.experiment.reports.choice import choice_table
 from torchrl_l2c2.experiment.reports.field import field_table
 from torchrl_l2c2.experiment.reports.figures import draw_learning_curves
 from torchrl_l2c2.experiment.reports.groups import group_records
-from torchrl_l2c2.experiment.reports.records import QUANTITIES
+from torchrl_l2c2.experiment.reports.records import QUANTITIES, Record
 from torchrl_l2c2.experiment.reports.runs import FinishedRun, find_runs, write_evaluation
-from torchrl_l2c2.experiment.reports.tables import results_tables
+from torchrl_l2c2.experiment.reports.tables import Table, results_tables
 
 if TYPE_CHECKING:
     from torchrl_l2c2.experiment.config import ExperimentConfig
@@ -53,6 +53,15 @@ def compare_with_paper(run: FinishedRun) -> str:
     return "\n".join(lines)
 
 
+def printed_tables(records: Sequence[Record]) -> list[Table]:
+    """What is told of runs without a report: results, and those of the field's tasks in order."""
+    of_field = (field_table(records), choice_table(records))
+    return [
+        *results_tables(group_records(records)),
+        *(table for table in of_field if table is not None),
+    ]
+
+
 def sweep_summary(folders: Sequence[str | Path]) -> str:
     """The end of a sweep: tables of all runs below its folders, and what did not finish.
 
@@ -63,8 +72,7 @@ def sweep_summary(folders: Sequence[str | Path]) -> str:
         str: Markdown; no error where nothing finished.
     """
     found = find_runs(folders)
-    tables = results_tables(group_records(run.record for run in found.runs)) if found.runs else []
-    tables += [t for t in (field_table(found.runs), choice_table(found.runs)) if t is not None]
+    tables = printed_tables([run.record for run in found.runs]) if found.runs else []
     none = [] if found.runs else [f"No finished run below {', '.join(map(str, folders))}."]
     return "\n\n".join([*(table.markdown() for table in tables), *none, *found.notes])
 

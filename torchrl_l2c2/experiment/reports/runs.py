@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from torchrl_l2c2.experiment.folder import write_json
 from torchrl_l2c2.experiment.reports.differences import differences, fingerprint, write_differences
-from torchrl_l2c2.experiment.reports.records import Record
+from torchrl_l2c2.experiment.reports.records import QUANTITIES, Record
 
 if TYPE_CHECKING:
     from torchrl_l2c2.experiment.config import ExperimentConfig
@@ -80,8 +80,8 @@ class FinishedRun:
         end = self.metrics[-1]
         frames, speed = int(end["frames"]), self.column("frames_per_second")[-1]
         numbers = {
-            **self._last("mean", self.evaluation.get("summary")),
-            **self._last("sampled", (self.evaluation.get("sampled") or {}).get("summary")),
+            **self._last("mean", self.evaluation, *QUANTITIES, "sm_asap"),
+            **self._last("sampled", self.evaluation.get("sampled") or {}, *QUANTITIES),
             **self._late(),
             "seconds": frames / speed if speed > 0.0 else math.nan,
         }
@@ -128,11 +128,10 @@ class FinishedRun:
         frames = self.config["task"].get("frames")
         return f"{len(self.metrics)} episodes" if frames is None else f"{frames:.0f} frames"
 
-    def _last(self, acting: str, summary: dict[str, float] | None) -> dict[str, float]:
-        names = {"return": "return_mean", "action_variation": "action_variation_mean"}
+    def _last(self, acting: str, test: dict[str, Any], *quantities: str) -> dict[str, float]:
+        summary = test.get("summary", {})
         return {
-            f"last_{acting}_{quantity}": (summary or {}).get(name, math.nan)
-            for quantity, name in names.items()
+            f"last_{acting}_{name}": summary.get(f"{name}_mean", math.nan) for name in quantities
         }
 
     def _late(self) -> dict[str, float]:
