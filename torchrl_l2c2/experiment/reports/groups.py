@@ -77,31 +77,45 @@ def baseline_of(group: Group, groups: Iterable[Group]) -> Group | None:
 
 
 def differing_lengths(groups: Sequence[Group]) -> list[str]:
-    """A line for every kind of run that was trained for different lengths, which is not pooled."""
+    """What was trained for different lengths, which is not pooled."""
     lengths: dict[tuple[str, ...], list[Group]] = defaultdict(list)
     for group in groups:
         # A run's identity without its length and seed.
         lengths[tuple(map(str, group.first.identity[:-2]))].append(group)
-    return [
-        f"{same[0].first.task}, {same[0].first.algorithm}, {method_name(same[0].first.method)}: "
-        f"runs of {' and of '.join(group.first.length for group in same)} are rows of their own"
+    several = [
+        (" and of ".join(group.first.length for group in same), same[0])
         for same in lengths.values()
         if len(same) > 1
     ]
+    return _told(
+        (f"runs of {found} are rows of their own", group, method_name(group.first.method))
+        for found, group in several
+    )
 
 
 def differing_versions(groups: Sequence[Group]) -> list[str]:
-    """A line for every group whose runs were made by several versions, which are pooled."""
-    lines = []
-    for group in groups:
-        for name in ("torch", "torchrl", "commit"):
-            found = sorted({str(getattr(r, name)) or "unknown" for r in group.records})
-            if len(found) > 1:
-                what = f"{group.first.task}, {group.first.algorithm}, {group.name}"
-                lines.append(
-                    f"{what}: runs of more than one {name} ({', '.join(found)}) are pooled"
-                )
-    return lines
+    """What was run by several versions, which are pooled."""
+    found = (
+        (name, sorted({str(getattr(r, name)) or "unknown" for r in group.records}), group)
+        for name in ("torch", "torchrl", "commit")
+        for group in groups
+    )
+    return _told(
+        (f"runs of more than one {name} ({', '.join(versions)}) are pooled", group, group.name)
+        for name, versions, group in found
+        if len(versions) > 1
+    )
+
+
+def _told(said: Iterable[tuple[str, Group, str]]) -> list[str]:
+    """A line for each that is said, of all rows of a task and an algorithm together."""
+    rows: dict[tuple[str, str, str], list[str]] = defaultdict(list)
+    for sentence, group, name in said:
+        rows[group.first.task, group.first.algorithm, sentence].append(name)
+    return [
+        f"{task}, {algorithm}, {'; '.join(names)}: {sentence}"
+        for (task, algorithm, sentence), names in rows.items()
+    ]
 
 
 def common_settings(groups: Sequence[Group]) -> dict[str, str]:
