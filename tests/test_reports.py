@@ -157,9 +157,9 @@ class TestMeasures:
 
 class TestFieldTable:
     def test_it_has_what_was_published_beside_the_means_over_seeds(self, tmp_path):
-        """Of those tasks with PPO and SAC alone; an interval from two runs on."""
+        """Of those tasks with PPO and SAC alone; an interval from two runs on; ties are halves."""
         preset = {"task": "hopper_v5", "algorithm": PPOConfig()}
-        for method, seeds in (("caps", 2), ("l2c2_ramp", 1)):
+        for method, seeds in (("none", 1), ("caps", 2), ("l2c2_ramp", 1)):
             for seed in range(seeds):
                 folder = tmp_path / method / str(seed)
                 make_run(folder, make_config(regularizer=method, seed=seed, **preset), 100.0, 0.1)
@@ -176,13 +176,15 @@ class TestFieldTable:
             "120.0 [120.0, 120.0]",
             "0.500 [0.400, 0.600]",
             "0.120 [0.120, 0.120]",
+            "0.50 [0.50, 0.50]",
+            "0.25 [0.00, 0.50]",
             "2440",
             "0.471",
         ]
-        alone = ["0", "120.0", "0.400", "0.120", "", ""]
+        alone = ["0", "120.0", "0.400", "0.120", "0.50", "0.50", "", ""]
         assert cells(table, "hopper_v5", "ppo", "L2C2, means, ramp") == alone
-        assert cells(table, "hopper_v5", "ppo", "LipsNet++") == [*[""] * 4, "1878", "0.543"]
-        assert len(table.rows) == 8  # CAPS once, as it was run
+        assert cells(table, "hopper_v5", "ppo", "LipsNet++") == [*[""] * 6, "1878", "0.543"]
+        assert len(table.rows) == 8  # CAPS and vanilla once, as they were run
         assert {row[0] for row in table.rows} == {"hopper_v5"}
         assert "2440" in sweep_summary([tmp_path])
         assert field_table([run.record for run in read_runs(tmp_path / "paper")]) is None
@@ -214,11 +216,12 @@ class TestChoiceTable:
                     content["summary"] |= {"return_mean": total + off, "sm_asap_mean": sm}
                     path.write_text(json.dumps(content))
         table = choice_table([run.record for run in read_runs(tmp_path)])
-        assert table.rows == [
+        # Of all pairs of runs: returns of .1 win 3.5 of 6 and none, of .3 2 and 3.5 of 6.
+        assert [[*row[:-2], *(cell.split()[0] for cell in row[-2:])] for row in table.rows] == [
             ["ppo", f"L2C2, gain_target={share}", "pendulum, lunarlander", "0, 1", *cells]
             for share, cells in {
-                0.3: ["+5%", "+0% pendulum", "0.80", "0.80 pendulum"],
-                0.1: ["-8%", "-25% lunarlander", "1.00", "2.00 lunarlander"],
+                0.3: ["+5%", "+0% pendulum", "0.80", "0.80 pendulum", "0.46", "1.00"],
+                0.1: ["-8%", "-25% lunarlander", "1.00", "2.00 lunarlander", "0.29", "0.50"],
             }.items()
         ]
         assert "-25% lunarlander" in sweep_summary([tmp_path])

@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchrl_l2c2.experiment.reports.field import field_groups
+from torchrl_l2c2.experiment.reports.comparison import improvement, probability
+from torchrl_l2c2.experiment.reports.field import BETTER, field_groups
 from torchrl_l2c2.experiment.reports.groups import Group, baseline_of
 from torchrl_l2c2.experiment.reports.records import Record
 from torchrl_l2c2.experiment.reports.tables import Table, number_range
@@ -17,17 +18,24 @@ LEGEND = (
     "Beside vanilla's runs of the same seeds and other settings, smoothest first; tests of the "
     "last policy with its mean actions. Return: the difference of the means over seeds, in parts "
     "of vanilla's size, mean over tasks. Sm: the ratio of the means over seeds, geometric mean "
-    "over tasks; 1 is no smoother."
+    "over tasks; 1 is no smoother. P: how probable it is that a run is better than one of vanilla, "
+    "of all pairs of runs, ties halved, mean over tasks."
 )
 
 
 class Beside(NamedTuple):
     """A setting beside vanilla, on one task."""
 
-    task: str
+    group: Group
+    vanilla: Group
     gained: float
     sm: float
     seeds: list[int]
+
+    @property
+    def task(self) -> str:
+        """What both ran on."""
+        return self.group.first.task
 
 
 def choice_table(records: Sequence[Record]) -> Table | None:
@@ -57,6 +65,7 @@ def choice_table(records: Sequence[Record]) -> Table | None:
     ]
     columns = ["algorithm", "method", "tasks", "seeds"]
     columns += [f"{what}{where}" for what in ("return", "Sm") for where in ("", ", worst task")]
+    columns += BETTER.values()
     return Table("In order over tasks", columns, rows, [LEGEND])
 
 
@@ -71,7 +80,7 @@ def _beside(group: Group, vanilla: Group) -> Beside | None:
         return None
     total, their_total, sm, their_sm = (np.mean([f[seed] for seed in seeds]) for f in figures)
     gained = float((total - their_total) / abs(their_total))
-    return Beside(group.first.task, gained, float(sm / their_sm), seeds)
+    return Beside(group, vanilla, gained, float(sm / their_sm), seeds)
 
 
 def _sm(tasks: Sequence[Beside]) -> float:
@@ -79,6 +88,7 @@ def _sm(tasks: Sequence[Beside]) -> float:
 
 
 def _cells(tasks: Sequence[Beside]) -> list[str]:
+    ours, theirs = ([getattr(each, side) for each in tasks] for side in ("group", "vanilla"))
     least, roughest = min(tasks, key=lambda t: t.gained), max(tasks, key=lambda t: t.sm)
     return [
         ", ".join(each.task for each in tasks),
@@ -87,4 +97,5 @@ def _cells(tasks: Sequence[Beside]) -> list[str]:
         f"{least.gained:+.0%} {least.task}",
         f"{_sm(tasks):.2f}",
         f"{roughest.sm:.2f} {roughest.task}",
+        *(probability(improvement(ours, theirs, "last_mean", quantity)) for quantity in BETTER),
     ]

@@ -21,8 +21,8 @@ from torchrl_l2c2.experiment.reports.statistics import (
 )
 from torchrl_l2c2.experiment.reports.tables import Table, number
 
-# What is better: a larger return, a smaller action variation.
-SIGNS = {"return": 1.0, "action_variation": -1.0}
+# What is better: a larger return, less of the others.
+SIGNS = {"return": 1.0, "action_variation": -1.0, "sm_asap": -1.0}
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def improvement(
         groups (sequence of Group): one of each task; runs count whose seed every task has.
         baselines (sequence of Group): vanilla of the same tasks.
         figure (str): one of ``FIGURES``.
-        quantity (str): one of ``QUANTITIES``; a smaller action variation is better.
+        quantity (str): one of ``SIGNS``.
 
     Returns:
         Estimate: ``None`` where there are no such runs.
@@ -98,7 +98,7 @@ def _statistics_row(figure: str, group: Group, baseline: Group | None) -> list[s
             cells += ["-", ""]
         else:
             write = partial(number, quantity=quantity, beside=center.value)
-            cells += [center.text(write), _probability(better)]
+            cells += [center.text(write), probability(better)]
     return cells
 
 
@@ -115,7 +115,7 @@ def _across_tasks(figure: str, groups: Sequence[Group]) -> list[list[str]]:
         if len(pairs) < 2:
             continue
         ours, theirs = zip(*pairs, strict=True)
-        better = [_probability(improvement(ours, theirs, figure, q)) for q in QUANTITIES]
+        better = [probability(improvement(ours, theirs, figure, q)) for q in QUANTITIES]
         runs = str(len(_matrix(ours, figure, "return")))
         rows.append([f"{len(pairs)} tasks", algorithm, name, runs, "", better[0], "", better[1]])
     return rows
@@ -169,5 +169,6 @@ def _matrix(groups: Sequence[Group], figure: str, quantity: str) -> Scores:
     return matrix.reshape(len(seeds), len(groups))
 
 
-def _probability(estimate: Estimate | None) -> str:
+def probability(estimate: Estimate | None) -> str:
+    """Of an improvement, with its interval; empty where there is none."""
     return "" if estimate is None else estimate.text(lambda value: f"{value:.2f}")

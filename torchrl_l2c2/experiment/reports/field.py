@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
-from torchrl_l2c2.experiment.reports.comparison import Estimate
-from torchrl_l2c2.experiment.reports.groups import Group, group_records
+from torchrl_l2c2.experiment.reports.comparison import Estimate, improvement, probability
+from torchrl_l2c2.experiment.reports.groups import Group, baseline_of, group_records
 from torchrl_l2c2.experiment.reports.records import Record
 from torchrl_l2c2.experiment.reports.statistics import mean
 from torchrl_l2c2.experiment.reports.tables import Table, number, number_range
@@ -54,12 +54,16 @@ NAMES = {
     "lipsnet++": "LipsNet++",
 }
 MEASURES = {"return": "return", "sm_asap": "Sm", "action_variation": "action variation"}
+# How probable a method's run is better by each than one of vanilla.
+BETTER = {"return": "P(larger return)", "sm_asap": "P(smaller Sm)"}
 LEGEND = (
     "Means over seeds of the last policy's test episodes with its mean actions, 95% intervals of "
     "the bootstrap over seeds in brackets. Sm as the published one: `(2 / N) sum_i f_i |FFT_i|` at "
     "one action per unit of time, the mean over the action's dimensions; it grows with the length "
-    "N of an episode, the action variation does not. Published: CATS (arXiv 2610.07910), ten seeds "
-    "by ten episodes; its L2C2 is that of ASAP's code, which does not follow the paper's equations."
+    "N of an episode, the action variation does not. P: how probable it is that a run is better "
+    "than one of vanilla with the same other settings, ties halved. Published: CATS (arXiv "
+    "2610.07910), ten seeds by ten episodes; its L2C2 is that of ASAP's code, which does not "
+    "follow the paper's equations."
 )
 
 
@@ -78,10 +82,10 @@ def field_table(records: Sequence[Record]) -> Table | None:
     rows = []
     for task, algorithm in dict.fromkeys((g.first.task, g.first.algorithm) for g in groups):
         together = [g for g in groups if (g.first.task, g.first.algorithm) == (task, algorithm)]
-        rows += [_row(group) for group in together]
+        rows += [_row(group, baseline_of(group, groups)) for group in together]
         rows += _others(task, algorithm, {g.first.method for g in together})
     columns = ["task", "algorithm", "method", "seeds", *MEASURES.values()]
-    columns += ["published: return", "published: Sm"]
+    columns += [*BETTER.values(), "published: return", "published: Sm"]
     return Table("Beside the published table", columns, rows, [LEGEND])
 
 
@@ -90,7 +94,7 @@ def field_groups(records: Sequence[Record]) -> list[Group]:
     return group_records(r for r in records if (r.task, r.algorithm, "none") in PUBLISHED)
 
 
-def _row(group: Group) -> list[str]:
+def _row(group: Group, vanilla: Group | None) -> list[str]:
     first = group.first
     cells = [first.task, first.algorithm, group.name, number_range(group.seeds)]
     for quantity in MEASURES:
@@ -100,13 +104,17 @@ def _row(group: Group) -> list[str]:
         else:
             write = partial(number, quantity=quantity, beside=center.value)
             cells.append(center.text(write))
+    if vanilla is None:
+        cells += [""] * len(BETTER)
+    else:
+        cells += [probability(improvement([group], [vanilla], "last_mean", q)) for q in BETTER]
     return [*cells, *_published(PUBLISHED.get((first.task, first.algorithm, first.method)))]
 
 
 def _others(task: str, algorithm: str, methods: set[str]) -> list[list[str]]:
     """What was published, and what no run here is of."""
     return [
-        [task, algorithm, name, "", "", "", "", *_published(PUBLISHED[task, algorithm, method])]
+        [task, algorithm, name, *[""] * 6, *_published(PUBLISHED[task, algorithm, method])]
         for method, name in NAMES.items()
         if method not in methods
     ]
