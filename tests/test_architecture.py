@@ -58,8 +58,8 @@ experiment.reports.runs experiment.reports.groups
 experiment.reports.score
 experiment.reports.tables
 experiment.reports.comparison experiment.reports.measures
-experiment.reports.front
-experiment.reports.figures experiment.reports.field
+experiment.reports.front experiment.reports.field
+experiment.reports.figures
 experiment.reports.choice
 experiment.reports.page experiment.reports.readme experiment.reports.results
 experiment.reports.__init__

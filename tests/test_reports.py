@@ -187,6 +187,11 @@ class TestFieldTable:
         assert len(table.rows) == 8  # CAPS and vanilla once, as they were run
         assert {row[0] for row in table.rows} == {"hopper_v5"}
         assert "2440" in sweep_summary([tmp_path])
+        write_report(tmp_path / "report", records)
+        picture = (tmp_path / "report" / "plane_field.svg").read_text()
+        # Vanilla's and CAPS's, of which something was published; caps of intervals are lines.
+        hollow = picture.count("fill: #ffffff; fill-opacity: 0.8")
+        assert ">Sm<" in picture and hollow == 2
         assert field_table([run.record for run in read_runs(tmp_path / "paper")]) is None
 
 

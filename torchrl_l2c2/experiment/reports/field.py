@@ -89,6 +89,12 @@ def field_table(records: Sequence[Record]) -> Table | None:
     return Table("Beside the published table", columns, rows, [LEGEND])
 
 
+def published_of(group: Group) -> PublishedCell | None:
+    """What was published of its method, with its authors' gains; ``None`` where nothing was."""
+    first = group.first
+    return PUBLISHED.get((first.task, first.algorithm, first.method))
+
+
 def field_groups(records: Sequence[Record]) -> list[Group]:
     """Groups of those records that are of these tasks, with PPO or SAC."""
     return group_records(r for r in records if (r.task, r.algorithm, "none") in PUBLISHED)
@@ -108,7 +114,7 @@ def _row(group: Group, vanilla: Group | None) -> list[str]:
         cells += [""] * len(BETTER)
     else:
         cells += [probability(improvement([group], [vanilla], "last_mean", q)) for q in BETTER]
-    return [*cells, *_published(PUBLISHED.get((first.task, first.algorithm, first.method)))]
+    return [*cells, *_published(published_of(group))]
 
 
 def _others(task: str, algorithm: str, methods: set[str]) -> list[list[str]]:

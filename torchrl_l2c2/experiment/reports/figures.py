@@ -12,6 +12,7 @@ import numpy as np
 
 from torchrl_l2c2.experiment.folder import write_atomically
 from torchrl_l2c2.experiment.reports.comparison import Estimate
+from torchrl_l2c2.experiment.reports.field import MEASURES, published_of
 from torchrl_l2c2.experiment.reports.front import means, pareto_front
 from torchrl_l2c2.experiment.reports.groups import Group, group_records
 from torchrl_l2c2.experiment.reports.paper import METHODS
@@ -59,16 +60,20 @@ def draw_learning_curves(runs: Sequence[FinishedRun], path: str | Path) -> None:
     finish(figure, axes, title, path)
 
 
-def draw_plane(groups: Sequence[Group], figure: str, path: str | Path) -> None:
-    """Draws return against action variation: up and to the left is better and smoother.
+def draw_plane(
+    groups: Sequence[Group], figure: str, path: str | Path, measure: str = "action_variation"
+) -> None:
+    """Draws return against smoothness: up and to the left is better and smoother.
 
     A dot for each group, the mean over its seeds with 95% bootstrap intervals; a hollow diamond
-    for the paper's mean with its standard deviation, dotted.
+    for what was published: of the paper with its standard deviation, dotted.
 
     Args:
         groups (sequence of Group): a panel is drawn for each task and algorithm.
         figure (str): one of ``FIGURES``, such as ``"late_mean"``.
         path (str or Path): of the file; its ending, ``.png`` or ``.svg``, decides what it is.
+        measure (str): ``"action_variation"``, as the paper has it, or ``"sm_asap"``, as the
+            published table of the field's tasks does.
     """
     panels = list(dict.fromkeys((group.first.task, group.first.algorithm) for group in groups))
     across = min(4, len(panels))
@@ -78,13 +83,14 @@ def draw_plane(groups: Sequence[Group], figure: str, path: str | Path) -> None:
         together = [g for g in groups if (g.first.task, g.first.algorithm) == (task, algorithm)]
         looks = styles(together)
         for group in together:
-            _draw_point(axis, group, figure, looks[group.name])
+            _draw_point(axis, group, figure, measure, looks[group.name])
         axis.set_title(f"{task}, {algorithm}", fontsize=10)
-        axis.set_xlabel("action variation")
+        axis.set_xlabel(MEASURES[measure])
         axis.set_ylabel("return")
     for axis in axes[len(panels) :]:
         axis.set_visible(False)
-    finish(picture, axes, f"{FIGURES[figure]}; hollow: the paper", path)
+    source = "the paper" if measure == "action_variation" else "published"
+    finish(picture, axes, f"{FIGURES[figure]}; hollow: {source}", path)
 
 
 def draw_front(groups: Sequence[Group], figure: str, path: str | Path) -> None:
@@ -146,29 +152,21 @@ def _moving_average(values: Scores, window: int) -> Scores:
     return averages
 
 
-def _draw_point(axis: Any, group: Group, figure: str, style: dict[str, str]) -> None:
+def _draw_point(axis: Any, group: Group, figure: str, measure: str, style: dict[str, str]) -> None:
     color = style["color"]
-    estimates = [
-        Estimate.of(mean, group.scores(figure, name)) for name in ("action_variation", "return")
-    ]
+    estimates = [Estimate.of(mean, group.scores(figure, name)) for name in (measure, "return")]
     if None not in estimates:
         (x, x_bars), (y, y_bars) = ((e.value, _bars(e)) for e in estimates if e is not None)
         shape = {"fmt": style["marker"], "markersize": 6, "elinewidth": 1.6, "capsize": 3}
         axis.errorbar([x], [y], y_bars, x_bars, label=group.name, color=color, **shape)
-    paper = group.first.paper
-    if paper is not None:
-        center = (paper.action_variation_mean, paper.return_mean)
-        bars = axis.errorbar(
-            *([value] for value in center),
-            xerr=paper.action_variation_std,
-            yerr=paper.return_std,
-            fmt="D",
-            markersize=5,
-            markerfacecolor="white",
-            color=color,
-            elinewidth=0.9,
-            alpha=0.8,
-        )
+    hollow = {"fmt": "D", "markersize": 5, "markerfacecolor": "white", "color": color, "alpha": 0.8}
+    published, paper = published_of(group), group.first.paper
+    if measure == "sm_asap" and published is not None:
+        axis.errorbar([published.sm], [published.total], **hollow)
+    if measure == "action_variation" and paper is not None:
+        center = ([paper.action_variation_mean], [paper.return_mean])
+        deviations = {"xerr": paper.action_variation_std, "yerr": paper.return_std}
+        bars = axis.errorbar(*center, **deviations, elinewidth=0.9, **hollow)
         for line in bars[2]:
             line.set_linestyle(":")
 

@@ -10,7 +10,7 @@ from torchrl_l2c2.experiment.folder import make_folder, write_atomically, write_
 from torchrl_l2c2.experiment.reports.choice import choice_table
 from torchrl_l2c2.experiment.reports.comparison import statistics_tables, summary
 from torchrl_l2c2.experiment.reports.document import picture, whole_page
-from torchrl_l2c2.experiment.reports.field import field_table
+from torchrl_l2c2.experiment.reports.field import field_groups, field_table
 from torchrl_l2c2.experiment.reports.figures import draw_front, draw_learning_curves, draw_plane
 from torchrl_l2c2.experiment.reports.front import front_table, searched
 from torchrl_l2c2.experiment.reports.groups import group_records
@@ -87,6 +87,9 @@ def _draw(folder: Path, records: Sequence[Record], runs: Sequence[FinishedRun]) 
         if groups:
             paths.append(folder / f"plane_{figure}.svg")
             draw_plane(groups, figure, paths[-1])
+    if of_field := field_groups(records):
+        paths.append(folder / "plane_field.svg")
+        draw_plane(of_field, "last_mean", paths[-1], "sm_asap")
     for number, found in enumerate(searched(group_records(records)), 1):
         paths.append(folder / f"front_{number}_{found[0].first.task.replace('/', '_')}.svg")
         draw_front(found, FRONT, paths[-1])
