@@ -612,6 +612,13 @@ class TestPictures:
             assert first == second and "<dc:date>" not in first
             assert all(name in first for name in METHODS)
 
+    @pytest.mark.filterwarnings("error:constrained_layout not applied")
+    def test_a_long_legend_leaves_room_for_the_axes(self, records, tmp_path):
+        """Of many settings with long names; it was a warning, and an empty picture."""
+        (group, *_) = group_records(records)
+        many = [replace(group, name=f"L2C2, gain_target={i}, " + "long " * 8) for i in range(20)]
+        draw_plane(many, "late_mean", tmp_path / "plane.svg")
+
     def test_a_single_run_is_drawn_as_png(self, forty, tmp_path):
         """As every run's folder has it."""
         draw_learning_curves(read_runs(forty)[:1], tmp_path / "curves.png")

@@ -21,8 +21,8 @@ from torchrl_l2c2.experiment.reports.statistics import (
 )
 from torchrl_l2c2.experiment.reports.tables import Table, number
 
-# What is better: a larger return, less of the others.
-SIGNS = {"return": 1.0, "action_variation": -1.0, "sm_asap": -1.0}
+# What is better: a larger return, a smaller action variation.
+SIGNS = {"return": 1.0, "action_variation": -1.0}
 
 
 @dataclass(frozen=True)
@@ -58,15 +58,14 @@ def improvement(
         groups (sequence of Group): one of each task; runs count whose seed every task has.
         baselines (sequence of Group): vanilla of the same tasks.
         figure (str): one of ``FIGURES``.
-        quantity (str): one of ``SIGNS``.
+        quantity (str): ``"return"``, or a measure of which less is better.
 
     Returns:
         Estimate: ``None`` where there are no such runs.
     """
-    matrices = [_matrix(side, figure, quantity) for side in (groups, baselines)]
-    return Estimate.of(
-        probability_of_improvement, *(SIGNS[quantity] * matrix for matrix in matrices)
-    )
+    sign = SIGNS.get(quantity, -1.0)
+    matrices = [sign * _matrix(side, figure, quantity) for side in (groups, baselines)]
+    return Estimate.of(probability_of_improvement, *matrices)
 
 
 def statistics_tables(groups: Sequence[Group]) -> list[Table]:

@@ -233,6 +233,9 @@ def finish(figure: Any, axes: Sequence[Any], title: str, path: str | Path) -> No
         # A longer name, at some 14 letters an inch, leaves fewer beside one another.
         width = figure.get_figwidth() / (0.7 + max(map(len, named)) / 14)
         columns = max(1, min(len(named), int(width)))
+        # Long legends would leave nothing to the axes.
+        lines = -(-len(named) // columns)
+        figure.set_figheight(figure.get_figheight() + 0.22 * max(0, lines - 2))
         legend = {"loc": "outside lower center", "frameon": False, "ncols": columns}
         figure.legend(named.values(), named.keys(), **legend)
     save(figure, path)
