@@ -320,6 +320,20 @@ class TestGroups:
         _, last = results_tables(groups)
         assert any("runs of 10 episodes and of 20 episodes are rows" in note for note in last.notes)
 
+    def test_settings_that_no_name_tells_are_told_below(self, tmp_path):
+        """Those of every row, and those of all rows of a method."""
+        algorithm = PPORPEConfig(replay_ratio=5)
+        for name, method in (("vanilla", "none"), ("ramp", L2C2Config(gain="ramp"))):
+            config = make_config(regularizer=method, algorithm=algorithm)
+            make_run(tmp_path / name, config, 1.0, 0.1)
+        groups = group_records(run.record for run in read_runs(tmp_path))
+        assert [group.name for group in groups] == ["vanilla", "L2C2"]
+        notes = results_tables(groups)[-1].notes
+        assert [note.removeprefix("swingup, ppo_rpe, ") for note in notes[1:]] == [
+            "other than the defaults in every row: `algorithm.replay_ratio=5`, `task.episodes=20`.",
+            "L2C2, other than the defaults: `regularizer.gain=ramp`.",
+        ]
+
     def test_a_run_can_be_read_as_if_it_had_ended_earlier(self, tmp_path):
         """Its own episodes up to there; what only its end was tested for is unknown."""
         make_run(tmp_path / "run", make_config(), 1.0, 0.1)
@@ -726,6 +740,13 @@ class TestReadme:
         assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
         assert "| swingup | ppo_rpe | L2C2 | 0-4 | 214.0 (1.6) |" in text
         assert (tmp_path / "docs" / "results.svg").exists()
+        # Where a task has runs as long as it is trained by default, they stand for it.
+        usual = replace(records[0], length=f"{TASKS['swingup'].episodes} episodes")
+        write_records(file, [*records, usual])
+        main(["--from", str(file), "--readme", str(readme)])
+        told = [line for line in readme.read_text().splitlines() if line.startswith("| swingup")]
+        assert [line.split(" | ")[2:4] for line in told] == [["vanilla", "0"]] * 2
+        assert "| reacher | ppo_rpe | L2C2 | 0-4 |" in readme.read_text()
         write_records(file, [])
         main(["--from", str(file), "--readme", str(readme)])
         assert readme.read_text() == f"before\n{START}\nNo runs are recorded yet.\n{END}\nafter\n"

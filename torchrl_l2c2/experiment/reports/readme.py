@@ -8,20 +8,25 @@ from pathlib import Path
 
 from torchrl_l2c2.experiment.folder import write_atomically
 from torchrl_l2c2.experiment.reports.figures import draw_plane
-from torchrl_l2c2.experiment.reports.groups import group_records
+from torchrl_l2c2.experiment.reports.groups import Group, group_records
 from torchrl_l2c2.experiment.reports.records import Record
 from torchrl_l2c2.experiment.reports.tables import results_tables
+from torchrl_l2c2.experiment.tasks import TASKS
 
 START, END = "<!-- results: start -->", "<!-- results: end -->"
 PICTURE = Path("docs") / "results.svg"
 
 
 def results_text(records: Sequence[Record]) -> str:
-    """What stands between the marks: a picture and both tables, or that there are no runs yet."""
-    if not records:
+    """What stands between the marks: a picture and both tables, or that there are no runs yet.
+
+    Where a task has runs of its default length, others are not told: they compare lengths.
+    """
+    groups = _groups(records)
+    if not groups:
         return "No runs are recorded yet."
     picture = f"![Return against action variation of every method]({PICTURE.as_posix()})"
-    return "\n\n".join([picture, *(t.markdown() for t in results_tables(group_records(records)))])
+    return "\n\n".join([picture, *(table.markdown() for table in results_tables(groups))])
 
 
 def fill(text: str, records: Sequence[Record]) -> str:
@@ -45,6 +50,16 @@ def fill_readme(path: str | Path, records: Sequence[Record]) -> None:
     """
     path = Path(path)
     text = fill(path.read_text(), records)
-    if records:
-        draw_plane(group_records(records), "late_sampled", path.parent / PICTURE)
+    if groups := _groups(records):
+        draw_plane(groups, "late_sampled", path.parent / PICTURE)
     write_atomically(path, text.encode())
+
+
+def _groups(records: Sequence[Record]) -> list[Group]:
+    as_usual = {r.task for r in records if _is_as_long_as_usual(r)}
+    return group_records(r for r in records if _is_as_long_as_usual(r) or r.task not in as_usual)
+
+
+def _is_as_long_as_usual(record: Record) -> bool:
+    task = TASKS.get(record.task)
+    return task is not None and record.length == f"{task.episodes} episodes"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from torchrl_l2c2.experiment.reports.groups import (
@@ -106,10 +106,21 @@ def settings_notes(groups: Sequence[Group]) -> list[str]:
         together = [g for g in groups if (g.first.task, g.first.algorithm) == (task, algorithm)]
         shared = common_settings(together)
         if shared:
-            settings = ", ".join(f"`{name}={value}`" for name, value in shared.items())
-            notes.append(f"{task}, {algorithm}, other than the defaults in every row: {settings}.")
+            which = f"{task}, {algorithm}, other than the defaults in every row"
+            notes.append(_settings_note(which, shared))
+        for method in dict.fromkeys(group.first.method for group in together):
+            common = common_settings([g for g in together if g.first.method == method])
+            # What all of a method's rows have is not in their names.
+            own = {k: v for k, v in common.items() if k.startswith("regularizer.")}
+            if own := {k: v for k, v in own.items() if k not in shared}:
+                which = f"{task}, {algorithm}, {method_name(method)}, other than the defaults"
+                notes.append(_settings_note(which, own))
     told = [*differing_lengths(groups), *differing_versions(groups)]
     return notes + [f"{line}." for line in told]
+
+
+def _settings_note(which: str, settings: Mapping[str, str]) -> str:
+    return f"{which}: {', '.join(f'`{name}={value}`' for name, value in settings.items())}."
 
 
 def runs_table(records: Sequence[Record]) -> Table:
