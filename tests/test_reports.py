@@ -721,6 +721,14 @@ class TestReport:
         assert "name folders of runs" in capsys.readouterr().err
 
 
+def test_the_fields_page_is_that_of_its_records():
+    """python -m torchrl_l2c2.experiment.reports --from results/field.csv"""
+    records = read_records(ROOT / "results" / "field.csv")
+    page = (ROOT / "results" / "field.md").read_text()
+    for table in (field_table(records), choice_table(records)):
+        assert table.markdown() in page
+
+
 class TestReadme:
     def test_its_results_are_those_of_the_records(self):
         """python -m torchrl_l2c2.experiment.reports --from results/runs.csv --readme README.md"""
