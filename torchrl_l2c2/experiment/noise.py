@@ -106,14 +106,13 @@ def play_with_noise(
         raise ValueError(f"levels must be finite and at least 0, got {bad[0]}.")
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}.")
-    scales = {
-        task: _visited_scale(
-            [run for run in runs if run.config["task"]["env_id"] == task], episodes
-        )
-        for task in dict.fromkeys(run.config["task"]["env_id"] for run in runs)
-    }
+    bar = partial(tqdm, unit="run", disable=None if progress else True, leave=False)
+    scales = {}
+    for task in dict.fromkeys(run.config["task"]["env_id"] for run in runs):
+        together = [run for run in runs if run.config["task"]["env_id"] == task]
+        scales[task] = _visited_scale(bar(together, f"states of {task}"), episodes)
     played = []
-    for run in tqdm(runs, "noise", unit="run", disable=None if progress else True, leave=False):
+    for run in bar(runs, "noise"):
         scale = scales[run.config["task"]["env_id"]]
         summaries = {level: _test(run, level * scale, episodes) for level in levels}
         played.append(Played(run, summaries))
@@ -192,7 +191,7 @@ def write_noise(folder: str | Path, played: Sequence[Played]) -> list[Path]:
     return [table, folder / "noise.json", *pictures]
 
 
-def _visited_scale(runs: Sequence[FinishedRun], episodes: int) -> Tensor:
+def _visited_scale(runs: Iterable[FinishedRun], episodes: int) -> Tensor:
     """Standard deviation of each feature over the states that runs visit without noise."""
     states = []
     for run in runs:
