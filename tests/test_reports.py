@@ -33,7 +33,7 @@ from torchrl_l2c2.experiment.reports.choice import choice_table
 from torchrl_l2c2.experiment.reports.comparison import statistics_tables
 from torchrl_l2c2.experiment.reports.differences import differences, fingerprint
 from torchrl_l2c2.experiment.reports.field import field_table
-from torchrl_l2c2.experiment.reports.groups import group_records
+from torchrl_l2c2.experiment.reports.groups import baseline_of, group_records
 from torchrl_l2c2.experiment.reports.measures import measures_table
 from torchrl_l2c2.experiment.reports.readme import END, START, fill
 from torchrl_l2c2.experiment.reports.records import FIGURES, merge
@@ -319,6 +319,15 @@ class TestGroups:
         }
         _, last = results_tables(groups)
         assert any("runs of 10 episodes and of 20 episodes are rows" in note for note in last.notes)
+
+    def test_vanilla_of_as_many_frames_is_compared(self, records):
+        """Whatever their numbers of episodes, which are defaults of then and now."""
+        vanilla, caps = (next(r for r in records if r.method == name) for name in ("none", "caps"))
+        before, frames = "task.episodes=400 ", "task.frames=500"
+        vanilla = replace(vanilla, differences=before + frames, length="500 frames")
+        caps = replace(caps, differences=frames, length="500 frames")
+        baseline, group = group_records([vanilla, caps])
+        assert baseline_of(group, [baseline, group]) == baseline
 
     def test_settings_that_no_name_tells_are_told_below(self, tmp_path):
         """Those of every row, and those of all rows of a method."""

@@ -42,7 +42,8 @@ class Group:
     @property
     def reading(self) -> tuple[Any, ...]:
         """Every setting but the regularizer's: what is compared with it has the same."""
-        others = _without(self.first, "regularizer.")
+        # A run of so many frames has a number of episodes, too, which says nothing.
+        others = _without(self.first, "regularizer.", *BUDGETS)
         return (self.first.task, self.first.algorithm, self.first.length, *sorted(others.items()))
 
     def by_seed(self, figure: str, quantity: str) -> dict[int, float]:
