@@ -730,12 +730,12 @@ class TestReport:
         assert "name folders of runs" in capsys.readouterr().err
 
 
-def test_the_fields_page_is_that_of_its_records():
+def test_the_fields_pages_are_those_of_their_records():
     """python -m torchrl_l2c2.experiment.reports --from results/field.csv"""
-    records = read_records(ROOT / "results" / "field.csv")
-    page = (ROOT / "results" / "field.md").read_text()
-    for table in (field_table(records), choice_table(records)):
-        assert table.markdown() in page
+    for name, tables in (("field", (field_table, choice_table)), ("field_gains", (choice_table,))):
+        records = read_records(ROOT / "results" / f"{name}.csv")
+        page = (ROOT / "results" / f"{name}.md").read_text()
+        assert all(table(records).markdown() in page for table in tables)
 
 
 class TestReadme:
