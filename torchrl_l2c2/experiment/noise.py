@@ -26,6 +26,7 @@ from torchrl_l2c2.experiment.folder import make_folder, write_atomically, write_
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.reports import FinishedRun, find_runs
 from torchrl_l2c2.experiment.reports.comparison import Estimate
+from torchrl_l2c2.experiment.reports.field import MEASURES
 from torchrl_l2c2.experiment.reports.figures import finish, styles, subplots
 from torchrl_l2c2.experiment.reports.groups import Group, group_records
 from torchrl_l2c2.experiment.reports.statistics import mean
@@ -34,12 +35,6 @@ from torchrl_l2c2.experiment.trained import load_policy
 from torchrl_l2c2.transforms import ObservationNoise
 
 LEVELS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
-# As a test's summary names them: how they are told, and the quantity whose digits they have.
-MEASURES = {
-    "return_mean": ("return", "return"),
-    "sm_asap_mean": ("Sm", "sm"),
-    "action_variation_mean": ("action variation", "action_variation"),
-}
 LEGEND = (
     "Uniform noise on every feature of the observation, up to the level times the feature's "
     "standard deviation either way, new at every step and in the place of the task's own; the "
@@ -126,10 +121,10 @@ def noise_table(played: Sequence[Played]) -> Table:
     rows = [
         [
             *(group.first.task, group.first.algorithm, group.name, number_range(group.seeds), name),
-            *(_cell(group, summaries, level, measure, quantity) for level in levels),
+            *(_cell(group, summaries, level, quantity) for level in levels),
         ]
         for group in groups
-        for measure, (name, quantity) in MEASURES.items()
+        for quantity, name in MEASURES.items()
     ]
     columns = ["task", "algorithm", "method", "seeds", "measure", *(f"{x:g}" for x in levels)]
     return Table("Noise on the observations", columns, rows, [LEGEND])
@@ -145,9 +140,9 @@ def draw_noise(played: Sequence[Played], path: str | Path) -> None:
     groups, summaries = _grouped(played)
     looks, levels = styles(groups), list(played[0].summaries)
     figure, axes = subplots(len(MEASURES), 1, (3.4 * len(MEASURES) + 0.6, 3.6))
-    for axis, (measure, (name, _)) in zip(axes, MEASURES.items(), strict=True):
+    for axis, (quantity, name) in zip(axes, MEASURES.items(), strict=True):
         for group in groups:
-            found = [_estimate(group, summaries, level, measure) for level in levels]
+            found = [_estimate(group, summaries, level, quantity) for level in levels]
             known = [(x, each) for x, each in zip(levels, found, strict=True) if each is not None]
             places, look = [x for x, _ in known], looks[group.name]
             axis.plot(places, [each.value for _, each in known], label=group.name, **look)
@@ -225,14 +220,15 @@ def _grouped(played: Sequence[Played]) -> tuple[list[Group], Summaries]:
     return groups, {each.run.record.identity: each.summaries for each in played}
 
 
-def _estimate(group: Group, summaries: Summaries, level: float, measure: str) -> Estimate | None:
-    found = [summaries[record.identity][level].get(measure, np.nan) for record in group.records]
+def _estimate(group: Group, summaries: Summaries, level: float, quantity: str) -> Estimate | None:
+    name = f"{quantity}_mean"
+    found = [summaries[record.identity][level].get(name, np.nan) for record in group.records]
     values = [value for value in found if not np.isnan(value)]
     return Estimate.of(mean, np.array(values).reshape(-1, 1))
 
 
-def _cell(group: Group, summaries: Summaries, level: float, measure: str, quantity: str) -> str:
-    estimate = _estimate(group, summaries, level, measure)
+def _cell(group: Group, summaries: Summaries, level: float, quantity: str) -> str:
+    estimate = _estimate(group, summaries, level, quantity)
     if estimate is None:
         return "-"
     return estimate.text(partial(number, quantity=quantity, beside=estimate.value))

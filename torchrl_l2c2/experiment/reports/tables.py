@@ -111,8 +111,8 @@ def settings_notes(groups: Sequence[Group]) -> list[str]:
         for method in dict.fromkeys(group.first.method for group in together):
             common = common_settings([g for g in together if g.first.method == method])
             # What all of a method's rows have is not in their names.
-            own = {k: v for k, v in common.items() if k.startswith("regularizer.")}
-            if own := {k: v for k, v in own.items() if k not in shared}:
+            own = {k: common[k] for k in common if k.startswith("regularizer.") and k not in shared}
+            if own:
                 which = f"{task}, {algorithm}, {method_name(method)}, other than the defaults"
                 notes.append(_settings_note(which, own))
     told = [*differing_lengths(groups), *differing_versions(groups)]
