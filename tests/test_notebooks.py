@@ -64,6 +64,19 @@ def test_what_has_sliders_is_a_picture_first(
     assert with_sliders and all(pictures(code[n - 1]) for n in with_sliders)
 
 
+def test_the_pages_of_results_are_shown_with_their_pictures(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As many as the pages name; the other cells are left out."""
+    notebook = nbformat.read(FOLDER / "results.ipynb", as_version=4)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    notebook.cells = [code[0], code[-1]]
+    run(notebook, monkeypatch, timeout=120)
+    pages = "".join(page.read_text() for page in (FOLDER.parent / "results").glob("*.md"))
+    shown = ["image/svg+xml" in output.get("data", {}) for output in outputs(notebook)]
+    assert sum(shown) == pages.count("![") > 0
+
+
 @pytest.mark.slow
 def test_runs_and_draws(notebook: nbformat.NotebookNode, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every cell as it stands, without an error, and pictures come out."""
