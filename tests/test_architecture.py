@@ -1,11 +1,13 @@
 """The layout: files that can be seen whole, and imports that point one way."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).parent.parent / "torchrl_l2c2"
+ROOT = Path(__file__).parent.parent
+PACKAGE = ROOT / "torchrl_l2c2"
 MODULES = {
     ".".join(path.relative_to(PACKAGE).with_suffix("").parts): path
     for path in PACKAGE.rglob("*.py")
@@ -126,3 +128,17 @@ def test_only_the_experiment_needs_its_extra():
         if not module.startswith("experiment.") and module != "trainers":
             found = [line for line in path.read_text().splitlines() if "import" in line.split()[:3]]
             assert not [line for line in found if any(name in line for name in foreign)], module
+
+
+def test_paths_that_are_written_down_lead_somewhere():
+    """Comments, pages and settings name files and folders that are there."""
+    folders = "benchmarks|conf|docs|examples|notebooks|results|tests|torchrl_l2c2"
+    written = re.compile(rf"(?<![\w/.])(?:{folders})/[\w./-]*\w")
+    files = [
+        *(path for name in folders.split("|") for path in (ROOT / name).rglob("*")),
+        *ROOT.glob("*.md"),
+    ]
+    read = [path for path in files if path.suffix in {".md", ".py", ".yaml"}]
+    found = {(name, path.name) for path in read for name in written.findall(path.read_text())}
+    assert len(found) > 50
+    assert not {(name, where) for name, where in found if not (ROOT / name).exists()}

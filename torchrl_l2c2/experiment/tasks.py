@@ -118,7 +118,7 @@ PAPER_TASKS: dict[str, TaskConfig] = {
     "hopper": TaskConfig("hopper", _bullet("Hopper"), 0.001, 1500, 1000, 2500.0),
     "ant": TaskConfig("ant", _bullet("Ant"), 0.001, 1500, 1000, 2500.0),
 }
-# Those of the methods after it, without noise; conf/experiment/field/ says how long they train.
+# Those of the methods after it, without noise; conf/preset/rl_zoo/ says how long they train.
 FIELD_TASKS: dict[str, TaskConfig] = {
     "pendulum": TaskConfig("pendulum", "Pendulum-v1"),
     "lunarlander": TaskConfig("lunarlander", "LunarLanderContinuous-v3"),
