@@ -9,7 +9,6 @@ from __future__ import annotations
 import statistics
 import tempfile
 import time
-from pathlib import Path
 
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig, PPORPEConfig, TaskConfig
 
@@ -29,7 +28,8 @@ def main() -> None:
             start = time.perf_counter()
             path = experiment.save()
             times.append(time.perf_counter() - start)
-        median, size = statistics.median(times), Path(path).stat().st_size
+        assert path is not None
+        median, size = statistics.median(times), path.stat().st_size
     share = median / config.checkpoint_interval
     print(
         f"a checkpoint of {size / 1e6:.1f} MB takes {1e3 * median:.0f} ms (median of "

@@ -28,7 +28,7 @@ from torchrl_l2c2.modules import make_actor
 def collection_rows(effort: Effort) -> Iterable[Row]:
     """Frames with noise, stored as batches, against the simulator's with the same policy."""
     for name, task in PAPER_TASKS.items():
-        task = dataclasses.replace(task, max_steps=min(task.max_steps, effort.steps))
+        task = dataclasses.replace(task, max_steps=min(task.time_limit, effort.steps))
         env = make_env(task, seed=0)
         actor = make_actor(env.observation_spec["observation"].shape[-1], env.action_spec)
         collector = EpisodeCollector(
@@ -40,7 +40,7 @@ def collection_rows(effort: Effort) -> Iterable[Row]:
         )
         times = alternate(
             {
-                "collector": lambda collector=collector: collector.rollout().numel(),
+                "collector": partial(_rollout, collector),
                 "simulator": _simulation(
                     task, on_tensors(actor, ["action"], effort.compile), collector.frames_per_batch
                 ),
@@ -65,19 +65,19 @@ def worker_rows(effort: Effort) -> Iterable[Row]:
         env = make_env(task, seed=0)
         actor = make_actor(env.observation_spec["observation"].shape[-1], env.action_spec)
         one = EpisodeCollector(
-            env, actor, frames_per_batch=task.max_steps, compile_policy=effort.compile
+            env, actor, frames_per_batch=task.time_limit, compile_policy=effort.compile
         )
         two = MultiEpisodeCollector(
             partial(make_env, task, 0),
             actor,
             num_workers=2,
-            max_steps=task.max_steps,
+            max_steps=task.time_limit,
             compile_policy=effort.compile,
         )
         times = alternate(
             {
-                "one": lambda one=one: one.rollout().numel(),
-                "two": lambda two=two: sum(episode.numel() for episode in two.rollout()),
+                "one": partial(_rollout, one),
+                "two": partial(_rollout, two),
             },
             repeats=effort.rounds,
         )
@@ -90,6 +90,13 @@ def worker_rows(effort: Effort) -> Iterable[Row]:
             fps["two"] / fps["one"],
             parts={"two frames/s": fps["two"], "one frames/s": fps["one"]},
         )
+
+
+def _rollout(collector: EpisodeCollector | MultiEpisodeCollector) -> int:
+    """Plays what a collector plays at once, and counts its frames."""
+    played = collector.rollout()
+    episodes = played if isinstance(played, list) else [played]
+    return sum(episode.numel() for episode in episodes)
 
 
 def _simulation(

@@ -27,7 +27,7 @@ def peer_rows(effort: Effort) -> Iterable[Row]:
         "turn": 4 * steps,
         "compile": effort.compile,
     }
-    how = {"rounds": max(1, effort.rounds // 3), "python": effort.peer_python}
+    how: dict[str, Any] = {"rounds": max(1, effort.rounds // 3), "python": effort.peer_python}
     for layer, batch in ((100, 32), (256, 256)):
         same = {**settings, "layers": [layer, layer], "batch": batch}
         what = f"SAC here / SBX SAC, layers of {layer}, batch {batch}"

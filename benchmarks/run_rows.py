@@ -32,16 +32,16 @@ def run_rows(effort: Effort) -> Iterable[Row]:
         draw = learner.draw()
         priority = torch.rand(len(draw.rows))
         episode = parts.player.collector.rollout()
-        frames = config.task.max_steps
-        summed = {
-            "collect": lambda: parts.player.collector.rollout().numel(),
-            "store": lambda: parts.learner.remember(episode) or frames,
+        frames = config.task.time_limit
+        summed: dict[str, Callable[[], object]] = {
+            "collect": partial(_of_episode, parts.player.collector.rollout, frames),
+            "store": partial(_of_episode, lambda: parts.learner.remember(episode), frames),
             "learn": partial(_repeat, lambda: learner(True), frames),
-            "log": lambda: log.write(row) or frames,
-            "checkpoint": lambda: parts.save() and frames,
+            "log": partial(_of_episode, lambda: log.write(row), frames),
+            "checkpoint": partial(_of_episode, parts.save, frames),
         }
         # What learning is made of: shown, but a loop of one of them alone flatters it.
-        detail = {
+        detail: dict[str, Callable[[], object]] = {
             "draw": partial(_repeat, learner.draw, frames),
             "update": partial(_repeat, lambda: learner.update(True, *draw), frames),
             "prioritize": partial(_repeat, lambda: learner.prioritize(draw.rows, priority), frames),
@@ -107,13 +107,13 @@ def process_rows(effort: Effort) -> Iterable[Row]:
     workers = []
     for _ in range(2):
         worker = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, cwd=ROOT)
-        worker.stdout.readline()
+        _answer(worker)
         workers.append(worker)
 
-    def play(*chosen: subprocess.Popen) -> int:
+    def play(*chosen: subprocess.Popen[str]) -> int:
         for worker in chosen:
             print("go", file=worker.stdin, flush=True)
-        return sum(int(worker.stdout.readline()) for worker in chosen)
+        return sum(int(_answer(worker)) for worker in chosen)
 
     times = alternate(
         {
@@ -174,6 +174,16 @@ def _import_seconds(before: str, statement: str) -> float:
     )
     command = [sys.executable, "-c", code]
     return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+
+
+def _answer(worker: subprocess.Popen[str]) -> str:
+    assert worker.stdout is not None
+    return worker.stdout.readline()
+
+
+def _of_episode(action: Callable[[], object], frames: int) -> int:
+    action()
+    return frames
 
 
 def _repeat(action: Callable[[], object], times: int) -> int:

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -68,7 +69,7 @@ def play_episode(experiment: Experiment) -> Callable[[], int]:
 
 def updates(
     effort: Effort, size: int, regularizer: str, compile: bool, device: str = "cpu"
-) -> Callable[[], Tensor]:
+) -> Callable[[], object]:
     """Updates of a new agent with one batch."""
     config = dataclasses.replace(
         paper_config(effort),
@@ -118,8 +119,11 @@ class _Recorder(TorchDispatchMode):
         super().__init__()
         self.factors: list[tuple[Tensor, Tensor]] = []
 
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: Any = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
         aten = torch.ops.aten
         if func.overloadpacket in (aten.mm, aten.bmm, aten.addmm, aten.baddbmm):
-            self.factors.append(tuple(factor.detach().clone() for factor in args[-2:]))
+            left, right = args[-2:]
+            self.factors.append((left.detach().clone(), right.detach().clone()))
         return func(*args, **(kwargs or {}))

@@ -55,11 +55,11 @@ class Row:
     @property
     def met(self) -> bool | None:
         """Whether the value is fast enough; ``None`` without a value or a limit."""
-        if self.value is None or (self.at_least is None and self.at_most is None):
+        if self.value is None:
             return None
         if self.at_least is not None:
             return self.value >= self.at_least
-        return self.value <= self.at_most
+        return None if self.at_most is None else self.value <= self.at_most
 
     def to_dict(self) -> dict[str, Any]:
         """All of it, for JSON."""

@@ -55,6 +55,7 @@ def play(model: Any, given: dict[str, Any]) -> dict[str, list[Any]]:
     import numpy as np
 
     env = gymnasium.make(given["env_id"])
+    assert isinstance(env.action_space, gymnasium.spaces.Box)
     low, high = env.action_space.low, env.action_space.high
     normalization = model.get_vec_normalize_env()
     played: dict[str, list[Any]] = {"returns": [], "actions": []}

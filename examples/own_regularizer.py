@@ -17,6 +17,7 @@ from torchrl.modules import MLP, ValueOperator
 from torchrl.objectives import LossModule, SACLoss, SoftUpdate
 
 from torchrl_l2c2 import RegularizedLoss, action_variation, make_actor
+from torchrl_l2c2.policy_distances import policy_mean
 
 FRAMES = 200
 FRAMES_PER_BATCH = 50
@@ -34,9 +35,9 @@ class ActionStepLoss(RegularizedLoss):
         terms = super().policy_regularizer(tensordict)
         # States to compare with the batch's have one more dimension in front: [1, *B].
         later = tensordict["next"].select("observation").unsqueeze(0)
-        here, there = self.policies_at(tensordict, later)
-        step = here.deterministic_sample - there.deterministic_sample
-        excess = (step.abs() - self.step_tolerance).clamp_min(0.0)
+        policies = self.policies_at(tensordict, later)
+        here, there = (policy_mean(policy, squashed=True) for policy in policies)
+        excess = ((here - there).abs() - self.step_tolerance).clamp_min(0.0)
         cost = 0.5 * excess.square().sum(-1).mean(0)
         return terms.set("loss_action_step", self.reduce_term(cost, tensordict))
 

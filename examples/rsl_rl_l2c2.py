@@ -8,23 +8,26 @@ from __future__ import annotations
 
 import contextlib
 import sys
+from collections.abc import Callable
+from typing import Any
 
 import torch
 from rsl_rl.runners import OnPolicyRunner
 from rsl_rl_points import NoisyPoints
+from torch import Tensor
 
 from torchrl_l2c2 import action_variation
 
 SEEDS = range(5)
 STUDENT = 2.776  # of five: half of a 95 % interval, in standard errors
 GAINS = {"lambda_min": 1.0, "lambda_max": 100.0}
-METHODS = {
+METHODS: dict[str, dict[str, Any]] = {
     "PPO": {"class_name": "PPO"},
     "with L2C2": {"class_name": "torchrl_l2c2.rsl_rl:L2C2PPO", "regularizer_cfg": GAINS},
 }
 
 
-def train(algorithm: dict, seed: int, iterations: int) -> tuple[float, float]:
+def train(algorithm: dict[str, Any], seed: int, iterations: int) -> tuple[float, float]:
     torch.manual_seed(seed)
     network = {"class_name": "MLPModel", "hidden_dims": [64, 64], "activation": "tanh"}
     config = {
@@ -43,9 +46,10 @@ def train(algorithm: dict, seed: int, iterations: int) -> tuple[float, float]:
 
 
 @torch.no_grad()
-def test(policy, env: NoisyPoints) -> tuple[float, float]:
+def test(policy: Callable[[Any], Tensor], env: NoisyPoints) -> tuple[float, float]:
     """Return and variation of the mean actions, over each point's first episode."""
-    plays, rewards, actions, mask = torch.ones(env.num_envs, dtype=torch.bool), 0.0, [], []
+    plays, rewards = torch.ones(env.num_envs, dtype=torch.bool), torch.zeros(env.num_envs)
+    actions, mask = [], []
     for _ in range(env.max_episode_length):
         actions.append(policy(env.get_observations()).clamp(-1, 1))
         mask.append(plays)

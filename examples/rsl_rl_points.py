@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, ClassVar
+
 import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
@@ -15,7 +17,8 @@ class NoisyPoints(VecEnv):
     a standard deviation of 0.1; the action is the acceleration, in [-1, 1].
     """
 
-    num_actions, max_episode_length, cfg = 1, 100, {}
+    num_actions, max_episode_length = 1, 100
+    cfg: ClassVar[dict[str, Any]] = {}
 
     def __init__(self, num_envs: int) -> None:
         self.num_envs, self.device = num_envs, "cpu"
