@@ -60,7 +60,7 @@ experiment.reports.runs experiment.reports.groups
 experiment.reports.score
 experiment.reports.tables
 experiment.reports.comparison experiment.reports.measures
-experiment.reports.front experiment.reports.field
+experiment.reports.front experiment.reports.field experiment.reports.paper_table
 experiment.reports.figures
 experiment.reports.choice
 experiment.reports.page experiment.reports.readme experiment.reports.results

@@ -15,6 +15,7 @@ from torchrl_l2c2.experiment.reports.figures import draw_front, draw_learning_cu
 from torchrl_l2c2.experiment.reports.front import front_table, searched
 from torchrl_l2c2.experiment.reports.groups import group_records
 from torchrl_l2c2.experiment.reports.measures import measures_table
+from torchrl_l2c2.experiment.reports.paper_table import paper_table
 from torchrl_l2c2.experiment.reports.records import FIGURES, Record
 from torchrl_l2c2.experiment.reports.runs import FinishedRun
 from torchrl_l2c2.experiment.reports.score import readings
@@ -27,8 +28,9 @@ FRONT = "late_mean"
 def all_tables(records: Sequence[Record]) -> list[Table]:
     """Every table that can be made of these records, the readings' score where there are any."""
     groups = group_records(records)
-    scored = readings(groups)
+    scored, of_paper = readings(groups), paper_table(groups)
     return [
+        *([of_paper] if of_paper else []),
         *results_tables(groups),
         *statistics_tables(groups),
         *(front_table(found, FRONT) for found in searched(groups)),
@@ -100,7 +102,7 @@ def _page(tables: Sequence[Table], pictures: Sequence[Path], notes: Sequence[str
     drawn = "\n".join(
         f"<p>{picture(path.stem.replace('_', ' '), path.read_bytes())}</p>" for path in pictures
     )
-    results, others = tables[:2], tables[2:]
+    results, others = tables[:3], tables[3:]
     parts = [
         "<h1>Runs</h1>",
         *(f"<p>{html.escape(note)}</p>" for note in notes),

@@ -1,4 +1,4 @@
-"""The part of a README that is made from records: results' tables and picture."""
+"""The part of a README that is made from records: the paper's table and its picture."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from pathlib import Path
 from torchrl_l2c2.experiment.folder import write_atomically
 from torchrl_l2c2.experiment.reports.figures import draw_plane
 from torchrl_l2c2.experiment.reports.groups import Group, group_records
+from torchrl_l2c2.experiment.reports.paper_table import paper_table
 from torchrl_l2c2.experiment.reports.records import Record
-from torchrl_l2c2.experiment.reports.tables import results_tables
+from torchrl_l2c2.experiment.reports.tables import settings_notes
 from torchrl_l2c2.experiment.tasks import TASKS
 
 START, END = "<!-- results: start -->", "<!-- results: end -->"
@@ -18,15 +19,16 @@ PICTURE = Path("docs") / "results.svg"
 
 
 def results_text(records: Sequence[Record]) -> str:
-    """What stands between the marks: a picture and both tables, or that there are no runs yet.
+    """What stands between the marks: a picture and the paper's table, if there are such runs.
 
     Where a task has runs of its default length, others are not told: they compare lengths.
     """
     groups = _groups(records)
-    if not groups:
+    table = paper_table(groups)
+    if table is None:
         return "No runs are recorded yet."
     picture = f"![Return against action variation of every method]({PICTURE.as_posix()})"
-    return "\n\n".join([picture, *(table.markdown() for table in results_tables(groups))])
+    return "\n\n".join([picture, table.markdown(), *settings_notes(groups)])
 
 
 def fill(text: str, records: Sequence[Record]) -> str:

@@ -1,4 +1,4 @@
-"""Tables of groups of runs, beside the paper's numbers."""
+"""Tables of groups of runs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from torchrl_l2c2.experiment.reports.score import COMPARED, Reading
 from torchrl_l2c2.experiment.reports.statistics import mean_and_deviation
 
 LEGEND = (
-    "Means over seeds, standard deviations over seeds in brackets; the paper's are of 18 seeds. "
+    "Means over seeds, standard deviations over seeds in brackets. "
     "Late policies are those of the last tenth of training: one test episode of each with its mean "
     "actions, and the training's own episodes, with sampled ones. The action variation is that of "
     "the policy's mean in either case; smaller is smoother."
@@ -86,12 +86,10 @@ def _results(title: str, figures: Sequence[str], groups: Sequence[Group]) -> Tab
     columns += [
         f"{QUANTITIES[q]}, {FIGURES[f].split(', ')[1]}" for q in QUANTITIES for f in figures
     ]
-    columns += [f"paper: {name}" for name in QUANTITIES.values()]
     rows = [
         [
             *(group.first.task, group.first.algorithm, group.name, number_range(group.seeds)),
             *(pooled(group, figure, quantity) for quantity in QUANTITIES for figure in figures),
-            *(_published(group.first, quantity) for quantity in QUANTITIES),
         ]
         for group in groups
         if any(len(group.scores(figure, "return")) for figure in figures)
@@ -211,14 +209,6 @@ def pooled(group: Group, figure: str, quantity: str) -> str:
         cell += f" ({number(deviation.item(), quantity, center.item())})"
     missing = len(group.records) - len(scores)
     return f"{cell}, of {len(scores)} runs" if missing else cell
-
-
-def _published(record: Record, quantity: str) -> str:
-    paper = record.paper
-    if paper is None:
-        return ""
-    center, deviation = getattr(paper, f"{quantity}_mean"), getattr(paper, f"{quantity}_std")
-    return f"{number(center, quantity)} ({number(deviation, quantity, center)})"
 
 
 def _or_dash(value: float, spec: str) -> str:

@@ -1,0 +1,62 @@
+"""The paper's table with what runs gave, and how probably each method is better than vanilla."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torchrl_l2c2.experiment.reports.comparison import improvement, probability
+from torchrl_l2c2.experiment.reports.groups import Group, baseline_of
+from torchrl_l2c2.experiment.reports.paper import Published, paper_of
+from torchrl_l2c2.experiment.reports.records import QUANTITIES
+from torchrl_l2c2.experiment.reports.tables import Table, number, number_range, pooled
+
+LEGEND = (
+    "Means, standard deviations over seeds in brackets; the paper's are of 18 seeds. Actions are "
+    "sampled, as in training, and the action variation is that of the policy's mean: smaller is "
+    "smoother. The first column of each is of the late policies, training's own episodes of its "
+    "last tenth, and P of the same: how probable it is that a run is better than one of vanilla "
+    "with the same other settings, ties halved, with the 95% interval of the stratified bootstrap."
+)
+# Late policies in the first column, as they are steadier than the paper's test of the last one.
+FIRST, SECOND = "late_sampled", "last_sampled"
+BETTER = ("P(larger return)", "P(smoother)")
+
+
+def paper_table(groups: Sequence[Group]) -> Table | None:
+    """A row for every group of runs of the paper's tasks by its algorithm, beside its numbers.
+
+    Args:
+        groups (sequence of Group): of any tasks; others are passed over.
+
+    Returns:
+        Table: ``None`` where no run is of such a task.
+    """
+    columns = ["task", "method", "seeds"]
+    for name, better in zip(QUANTITIES.values(), BETTER, strict=True):
+        columns += [name, "the paper's", "last policy", better]
+    rows = [_row(group, baseline_of(group, groups)) for group in groups if _is_of_paper(group)]
+    return Table("Beside the paper's table", columns, rows, [LEGEND]) if rows else None
+
+
+def _is_of_paper(group: Group) -> bool:
+    return paper_of(group.first.task, group.first.algorithm, "none") is not None
+
+
+def _row(group: Group, vanilla: Group | None) -> list[str]:
+    cells = [group.first.task, group.name, number_range(group.seeds)]
+    for quantity in QUANTITIES:
+        better = improvement([group], [vanilla], FIRST, quantity) if vanilla else None
+        cells += [
+            pooled(group, FIRST, quantity),
+            _published(group.first.paper, quantity),
+            pooled(group, SECOND, quantity),
+            probability(better),
+        ]
+    return cells
+
+
+def _published(paper: Published | None, quantity: str) -> str:
+    if paper is None:
+        return ""
+    center, deviation = getattr(paper, f"{quantity}_mean"), getattr(paper, f"{quantity}_std")
+    return f"{number(center, quantity)} ({number(deviation, quantity, center)})"
