@@ -783,9 +783,13 @@ class TestReadme:
         told = [line for line in readme.read_text().splitlines() if line.startswith("| swingup")]
         assert [line.split(" | ")[1:3] for line in told] == [["vanilla", "0"]]
         assert "| reacher | L2C2 | 0-4 |" in readme.read_text()
-        write_records(file, [])
-        main(["--from", str(file), "--readme", str(readme)])
-        assert readme.read_text() == f"before\n{START}\nNo runs are recorded yet.\n{END}\nafter\n"
+        (tmp_path / "docs" / "results.svg").unlink()
+        for none in ([], [replace(records[0], task="pendulum", algorithm="sac")]):
+            write_records(file, none)
+            main(["--from", str(file), "--readme", str(readme)])
+            empty = f"before\n{START}\nNo runs are recorded yet.\n{END}\nafter\n"
+            assert readme.read_text() == empty
+            assert not (tmp_path / "docs" / "results.svg").exists()
 
     def test_a_text_without_the_marks_is_refused(self, records):
         """Rather than changed somewhere."""

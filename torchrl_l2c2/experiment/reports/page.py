@@ -13,7 +13,7 @@ from torchrl_l2c2.experiment.reports.document import picture, whole_page
 from torchrl_l2c2.experiment.reports.field import field_groups, field_table
 from torchrl_l2c2.experiment.reports.figures import draw_front, draw_learning_curves, draw_plane
 from torchrl_l2c2.experiment.reports.front import front_table, searched
-from torchrl_l2c2.experiment.reports.groups import group_records
+from torchrl_l2c2.experiment.reports.groups import Group, group_records
 from torchrl_l2c2.experiment.reports.measures import measures_table
 from torchrl_l2c2.experiment.reports.paper_table import paper_table
 from torchrl_l2c2.experiment.reports.records import FIGURES, Record
@@ -25,16 +25,22 @@ from torchrl_l2c2.experiment.reports.tables import Table, results_tables, runs_t
 FRONT = "late_mean"
 
 
-def all_tables(records: Sequence[Record]) -> list[Table]:
-    """Every table that can be made of these records, the readings' score where there are any."""
+def _results(groups: Sequence[Group]) -> list[Table]:
+    """What stands before the pictures."""
+    of_paper = paper_table(groups)
+    return [*([of_paper] if of_paper else []), *results_tables(groups)]
+
+
+def _others(records: Sequence[Record], runs: Sequence[FinishedRun]) -> list[Table]:
+    """What stands behind them: every other table that can be made, every run by itself at last."""
     groups = group_records(records)
-    scored, of_paper = readings(groups), paper_table(groups)
+    scored = readings(groups)
+    more = (field_table(records), choice_table(records), measures_table(runs))
     return [
-        *([of_paper] if of_paper else []),
-        *results_tables(groups),
         *statistics_tables(groups),
         *(front_table(found, FRONT) for found in searched(groups)),
         *([score_table(scored)] if scored else []),
+        *(table for table in more if table is not None),
         runs_table(records),
     ]
 
@@ -58,23 +64,21 @@ def write_report(
         Path: of the page; it has its pictures in it and needs no other file.
     """
     folder = make_folder(folder)
-    tables, groups = all_tables(records), group_records(records)
-    # Before every run by itself.
-    more = (field_table(records), choice_table(records), measures_table(runs))
-    tables[-1:-1] = [table for table in more if table is not None]
+    groups = group_records(records)
+    results, others = _results(groups), _others(records, runs)
     pictures = _draw(folder, records, runs)
     text = "\n\n".join(
         [
             "# Runs",
             *notes,
-            *(table.markdown() for table in tables),
+            *(table.markdown() for table in (*results, *others)),
             *(f"![{path.stem.replace('_', ' ')}]({path.name})" for path in pictures),
         ]
     )
     write_atomically(folder / "report.md", f"{text}\n".encode())
     write_json(folder / "report.json", {"groups": summary(groups), "notes": list(notes)})
     page = folder / "report.html"
-    write_atomically(page, _page(tables, pictures, notes).encode())
+    write_atomically(page, _page(results, others, pictures, notes).encode())
     return page
 
 
@@ -98,11 +102,15 @@ def _draw(folder: Path, records: Sequence[Record], runs: Sequence[FinishedRun]) 
     return paths
 
 
-def _page(tables: Sequence[Table], pictures: Sequence[Path], notes: Sequence[str]) -> str:
+def _page(
+    results: Sequence[Table],
+    others: Sequence[Table],
+    pictures: Sequence[Path],
+    notes: Sequence[str],
+) -> str:
     drawn = "\n".join(
         f"<p>{picture(path.stem.replace('_', ' '), path.read_bytes())}</p>" for path in pictures
     )
-    results, others = tables[:3], tables[3:]
     parts = [
         "<h1>Runs</h1>",
         *(f"<p>{html.escape(note)}</p>" for note in notes),

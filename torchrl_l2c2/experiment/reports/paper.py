@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from torchrl_l2c2.experiment.tasks import TASKS
-
 
 class Published(NamedTuple):
     """Mean and (over 18 seeds) standard deviation of a cell of the paper's Table III."""
@@ -64,6 +62,9 @@ def method_order(method: str) -> tuple[int, str]:
 
 def paper_of(task: str, algorithm: str, method: str) -> Published | None:
     """The paper's results of a task and a method, with its algorithm; ``None`` for all others."""
-    if task not in TASKS or algorithm != "ppo_rpe":
-        return None
-    return PAPER.get((task, method))
+    return PAPER.get((task, method)) if is_of_paper(task, algorithm) else None
+
+
+def is_of_paper(task: str, algorithm: str) -> bool:
+    """Whether it is one of the paper's tasks with its algorithm, by whatever method."""
+    return algorithm == "ppo_rpe" and (task, "none") in PAPER

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from torchrl_l2c2.experiment.reports.comparison import improvement, probability
 from torchrl_l2c2.experiment.reports.groups import Group, baseline_of
-from torchrl_l2c2.experiment.reports.paper import Published, paper_of
+from torchrl_l2c2.experiment.reports.paper import Published, is_of_paper
 from torchrl_l2c2.experiment.reports.records import QUANTITIES
 from torchrl_l2c2.experiment.reports.tables import Table, number, number_range, pooled
 
@@ -34,12 +34,12 @@ def paper_table(groups: Sequence[Group]) -> Table | None:
     columns = ["task", "method", "seeds"]
     for name, better in zip(QUANTITIES.values(), BETTER, strict=True):
         columns += [name, "the paper's", "last policy", better]
-    rows = [_row(group, baseline_of(group, groups)) for group in groups if _is_of_paper(group)]
+    rows = [
+        _row(group, baseline_of(group, groups))
+        for group in groups
+        if is_of_paper(group.first.task, group.first.algorithm)
+    ]
     return Table("Beside the paper's table", columns, rows, [LEGEND]) if rows else None
-
-
-def _is_of_paper(group: Group) -> bool:
-    return paper_of(group.first.task, group.first.algorithm, "none") is not None
 
 
 def _row(group: Group, vanilla: Group | None) -> list[str]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from torchrl_l2c2.experiment.folder import write_atomically
 from torchrl_l2c2.experiment.reports.figures import draw_plane
 from torchrl_l2c2.experiment.reports.groups import Group, group_records
+from torchrl_l2c2.experiment.reports.paper import is_of_paper
 from torchrl_l2c2.experiment.reports.paper_table import paper_table
 from torchrl_l2c2.experiment.reports.records import Record
 from torchrl_l2c2.experiment.reports.tables import settings_notes
@@ -58,6 +59,7 @@ def fill_readme(path: str | Path, records: Sequence[Record]) -> None:
 
 
 def _groups(records: Sequence[Record]) -> list[Group]:
+    records = [r for r in records if is_of_paper(r.task, r.algorithm)]
     as_usual = {r.task for r in records if _is_as_long_as_usual(r)}
     return group_records(r for r in records if _is_as_long_as_usual(r) or r.task not in as_usual)
 
