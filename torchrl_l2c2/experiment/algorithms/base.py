@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from torchrl_l2c2.experiment.settings import SettingError
+from torchrl_l2c2.experiment.settings import SettingError, settings
 
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
@@ -90,3 +90,31 @@ class OffPolicyConfig(AlgorithmConfig):
         # A fraction of an update is made up for later.
         each = self.replay_ratio / batch_size
         return int(each * last_frame) - int(each * (last_frame - frames))
+
+
+@settings
+class PerStepConfig(OffPolicyConfig):
+    """One that makes an update after every step, with target networks that follow."""
+
+    name: str = ""
+    gamma: float = Field(default=0.99, ge=0, lt=1, description="discount")
+    tau: float = Field(default=0.005, gt=0, le=1, description="pace of the target networks")
+    random_frames: int = Field(
+        default=1000, ge=0, description="frames with random actions, before learning starts"
+    )
+    reward_scale: float | None = Field(
+        default=1.0, description="factor on rewards while learning; null: 1 - gamma"
+    )
+    schedule: Literal["step", "episode"] = Field(default="step", description="when updates happen")
+    replay_ratio: float | None = Field(
+        default=None,
+        gt=0,
+        description="times that a transition is drawn on average, instead of updates: "
+        "ratio * frames / batch_size of them",
+    )
+    updates: int | None = Field(
+        default=1,
+        ge=1,
+        description="per step, or per episode; null: by the replay ratio, else one, or one pass "
+        "over the buffer",
+    )

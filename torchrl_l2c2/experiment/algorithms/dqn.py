@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from torchrl_l2c2.experiment.algorithms.base import Layers, OffPolicyConfig
+from torchrl_l2c2.experiment.algorithms.base import Layers, PerStepConfig
 from torchrl_l2c2.experiment.settings import settings
 
 if TYPE_CHECKING:
@@ -18,36 +18,15 @@ if TYPE_CHECKING:
 
 
 @settings
-class DQNConfig(OffPolicyConfig):
+class DQNConfig(PerStepConfig):
     """Double deep Q-learning, for discrete actions."""
 
     name: str = "dqn"
-    gamma: float = Field(default=0.99, ge=0, lt=1, description="discount")
-    tau: float = Field(default=0.005, gt=0, le=1, description="pace of the target network")
     epsilon_end: float = Field(default=0.05, ge=0, le=1, description="last share of random actions")
     epsilon_frames: int = Field(
         default=10_000, ge=1, description="frames until that share is reached"
     )
     hidden: Layers = Field(default=(120, 84), description="neurons of the hidden layers")
-    random_frames: int = Field(
-        default=1000, ge=0, description="frames with random actions, before learning starts"
-    )
-    reward_scale: float | None = Field(
-        default=1.0, description="factor on rewards while learning; null: 1 - gamma"
-    )
-    schedule: Literal["step", "episode"] = Field(default="step", description="when updates happen")
-    replay_ratio: float | None = Field(
-        default=None,
-        gt=0,
-        description="times that a transition is drawn on average, instead of updates: "
-        "ratio * frames / batch_size of them",
-    )
-    updates: int | None = Field(
-        default=1,
-        ge=1,
-        description="per step, or per episode; null: by the replay ratio, else one, or one pass "
-        "over the buffer",
-    )
 
     def make_agent(
         self, env: EnvBase, regularizer: RegularizerConfig, optimizer: OptimizerConfig

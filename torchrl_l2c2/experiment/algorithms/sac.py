@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
-from torchrl_l2c2.experiment.algorithms.base import Layers, OffPolicyConfig
+from torchrl_l2c2.experiment.algorithms.base import Layers, PerStepConfig
 from torchrl_l2c2.experiment.settings import settings
 
 if TYPE_CHECKING:
@@ -18,12 +18,10 @@ if TYPE_CHECKING:
 
 
 @settings
-class SACConfig(OffPolicyConfig):
+class SACConfig(PerStepConfig):
     """Soft actor-critic with a learned temperature."""
 
     name: str = "sac"
-    gamma: float = Field(default=0.99, ge=0, lt=1, description="discount")
-    tau: float = Field(default=0.005, gt=0, le=1, description="pace of the target networks")
     alpha_init: float = Field(default=1.0, gt=0, description="first temperature; it is learned")
     target_entropy: float | None = Field(
         default=None,
@@ -36,25 +34,6 @@ class SACConfig(OffPolicyConfig):
     scale_mapping: Literal["softplus", "exp"] = Field(
         default="softplus",
         description="from the network's output to the policy's scale; exp: cut to e^-20 and e^2",
-    )
-    random_frames: int = Field(
-        default=1000, ge=0, description="frames with random actions, before learning starts"
-    )
-    reward_scale: float | None = Field(
-        default=1.0, description="factor on rewards while learning; null: 1 - gamma"
-    )
-    schedule: Literal["step", "episode"] = Field(default="step", description="when updates happen")
-    replay_ratio: float | None = Field(
-        default=None,
-        gt=0,
-        description="times that a transition is drawn on average, instead of updates: "
-        "ratio * frames / batch_size of them",
-    )
-    updates: int | None = Field(
-        default=1,
-        ge=1,
-        description="per step, or per episode; null: by the replay ratio, else one, or one pass "
-        "over the buffer",
     )
 
     def make_agent(

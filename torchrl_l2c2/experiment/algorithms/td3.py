@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from torchrl_l2c2.experiment.algorithms.base import Layers, OffPolicyConfig
+from torchrl_l2c2.experiment.algorithms.base import Layers, PerStepConfig
 from torchrl_l2c2.experiment.settings import settings
 
 if TYPE_CHECKING:
@@ -18,12 +18,10 @@ if TYPE_CHECKING:
 
 
 @settings
-class TD3Config(OffPolicyConfig):
+class TD3Config(PerStepConfig):
     """Twin delayed DDPG: a deterministic policy."""
 
     name: str = "td3"
-    gamma: float = Field(default=0.99, ge=0, lt=1, description="discount")
-    tau: float = Field(default=0.005, gt=0, le=1, description="pace of the target networks")
     exploration_noise: float = Field(
         default=0.1,
         ge=0,
@@ -40,25 +38,6 @@ class TD3Config(OffPolicyConfig):
     )
     hidden: Layers = Field(
         default=(256, 256), description="neurons of the hidden layers of all networks"
-    )
-    random_frames: int = Field(
-        default=1000, ge=0, description="frames with random actions, before learning starts"
-    )
-    reward_scale: float | None = Field(
-        default=1.0, description="factor on rewards while learning; null: 1 - gamma"
-    )
-    schedule: Literal["step", "episode"] = Field(default="step", description="when updates happen")
-    replay_ratio: float | None = Field(
-        default=None,
-        gt=0,
-        description="times that a transition is drawn on average, instead of updates: "
-        "ratio * frames / batch_size of them",
-    )
-    updates: int | None = Field(
-        default=1,
-        ge=1,
-        description="per step, or per episode; null: by the replay ratio, else one, or one pass "
-        "over the buffer",
     )
 
     def make_agent(
