@@ -21,7 +21,8 @@ policy_distances
 optim.__init__ metrics.policy metrics.spectrum
 metrics.__init__
 objectives.precision
-objectives.specialization objectives.evaluation objectives.shared_evaluation
+objectives.specialization objectives.wiring objectives.shared_evaluation
+objectives.declarations objectives.evaluation
 objectives.transitions objectives.relative_pearson
 objectives.regularized objectives.neighbors
 objectives.l2c2 objectives.caps objectives.cats objectives.lcp objectives.sr2l

@@ -130,6 +130,19 @@ def test_batches_broadcast():
     assert squared_hellinger(p, q, num_samples=4).shape == (5, 3)
 
 
+@pytest.mark.parametrize("samples", [None, 20_000])
+def test_batches_of_fewer_dimensions_broadcast(samples):
+    """As tensors do, from the right, whichever policy has the fewer; composite ones as well."""
+    few = torch.randn(4, 2), torch.ones(4, 2), torch.randn(4, 3)
+    many = torch.randn(3, 4, 2), torch.ones(3, 4, 2), torch.randn(3, 4, 3)
+    rows = [composite(*row) for row in zip(*many, strict=True)]
+    few, many = composite(*few), composite(*many)
+    expected = torch.stack([squared_hellinger(few, row) for row in rows])
+    for pair in ((few, many), (many, few)):
+        found = squared_hellinger(*pair, num_samples=samples)
+        torch.testing.assert_close(found, expected, atol=0.03 if samples else 1e-5, rtol=0)
+
+
 @pytest.mark.parametrize(
     "transforms",
     [
@@ -206,7 +219,7 @@ def test_different_lists_of_actions_are_told_apart():
 
 def composite(loc, scale, logits):
     params = TensorDict(
-        {"move": {"loc": loc, "scale": scale}, "hand": {"grip": {"logits": logits}}}, loc.shape[:1]
+        {"move": {"loc": loc, "scale": scale}, "hand": {"grip": {"logits": logits}}}, loc.shape[:-1]
     )
     return CompositeDistribution(params, {"move": d.Normal, ("hand", "grip"): d.Categorical})
 

@@ -182,6 +182,14 @@ def test_the_highest_frequency_is_left_out_of_sm_and_kept_in_roughness():
     assert roughness(actions).item() == pytest.approx((1 / 6 + 2 / 2) / 3)
 
 
+@pytest.mark.parametrize("measure", [roughness, previous_action_gain])
+@pytest.mark.parametrize("value", [0.1, 0.3, 0.7, 1.0])
+@pytest.mark.parametrize("steps", [100, 150, 1000])
+def test_what_never_changes_has_none(measure, value, steps):
+    """NaN, and no rounding noise: that of a policy that keeps still."""
+    assert measure(torch.full((steps, 1), value)).isnan()
+
+
 def test_roughness_is_free_of_amplitude_offset_and_length():
     """White noise has .25, whatever its size; a slow sine less the slower it is."""
     torch.manual_seed(0)

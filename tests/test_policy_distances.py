@@ -127,6 +127,44 @@ class TestKLDivergence:
         ]
         torch.testing.assert_close(kl_divergence(p, q), sum(parts))
 
+    @pytest.mark.parametrize("kind", ["masked", "masked one-hot", "logits", "independent"])
+    def test_impossible_actions_have_no_part_in_the_value_or_the_gradient(self, kind):
+        """That of the two that are possible: .5 ln(.5/.25) + .5 ln(.5/.75), by hand."""
+        mask = torch.tensor([[True, True, False]])
+
+        def policy(logits):
+            if kind.startswith("masked"):
+                kinds = {
+                    "masked": rl.MaskedCategorical,
+                    "masked one-hot": rl.MaskedOneHotCategorical,
+                }
+                return kinds[kind](logits=logits, mask=mask)
+            discrete = d.Categorical(logits=logits.masked_fill(~mask, -math.inf))
+            return discrete if kind == "logits" else d.Independent(discrete, 1)
+
+        even = torch.zeros(1, 3, requires_grad=True)
+        skewed = torch.tensor([[0.0, math.log(3.0), 5.0]], requires_grad=True)
+        found = kl_divergence(policy(even), policy(skewed)).sum()
+        assert found.item() == pytest.approx(0.5 * math.log(2.0) + 0.5 * math.log(2 / 3))
+        found.backward()
+        # Of q's logits, its probabilities minus p's.
+        torch.testing.assert_close(skewed.grad, torch.tensor([[0.25 - 0.5, 0.75 - 0.5, 0.0]]))
+        assert even.grad.isfinite().all() and even.grad[0, 2] == 0
+
+    def test_composites_of_other_batch_shapes_broadcast(self):
+        """One policy of a batch beside three; the closed form and the estimate."""
+        p, q = (
+            CompositeDistribution(
+                TensorDict({"a": {"loc": loc, "scale": torch.ones_like(loc)}}, loc.shape[:-1]),
+                {"a": rl.IndependentNormal},
+            )
+            for loc in (torch.randn(4, 2), torch.randn(3, 4, 2))
+        )
+        expected = kl_divergence(p.dists["a"], q.dists["a"])
+        assert expected.shape == (3, 4)
+        torch.testing.assert_close(kl_divergence(p, q), expected)
+        torch.testing.assert_close(kl_divergence(q, p), expected)
+
     @pytest.fixture
     def truncated(self):
         """Two policies without a closed form, as many times as there are to be estimates."""

@@ -1,5 +1,6 @@
 """PPO-RPE against hand-computed numbers, its stationary point, and the rules of a TorchRL loss."""
 
+import copy
 import math
 
 import pytest
@@ -10,6 +11,7 @@ from torch import nn
 from torchrl.modules import IndependentNormal, NormalParamExtractor, ProbabilisticActor
 
 from torchrl_l2c2 import PPORPELoss, TSoftUpdate, make_actor, make_critic
+from torchrl_l2c2.objectives.relative_pearson import of_each_transition
 
 
 class Heads(nn.Module):
@@ -131,6 +133,40 @@ def test_the_ema_reading_averages_the_mean_deviation():
     loss = make_loss(decay=0.5, delta_min=0.1, kappa=0.5, threshold="ema")
     terms = loss(make_batch(loss, [1.0, 3.0], [0.0, 0.0]))
     assert terms["ratio_threshold"].item() == pytest.approx(0.5 * (0.5 * 0.1 + 0.5 * 0.25))
+
+
+@pytest.mark.parametrize("threshold", ["max", "ema"])
+@pytest.mark.parametrize("importance", ["max", "mean"])
+def test_masked_transitions_have_no_part_in_anything(importance, threshold):
+    """The numbers, and what is kept for later batches, are those of the batch without them."""
+    settings = {"importance": importance, "threshold": threshold, "decay": 0.5}
+    found = []
+    for count in (3, 5):
+        loss = make_loss(**settings)
+        ratios, rewards = [1.5, 0.7, 1.1, 50.0, 0.1], [0.3, -2.0, 1.0, 9.0, 9.0]
+        batch = make_batch(make_loss(**settings), ratios, rewards)[:count]
+        batch["action_log_prob"][:] = make_batch(loss, ratios, rewards)["action_log_prob"][:count]
+        batch["priority_weight"] = torch.tensor([2.0, 1.0, 0.5, 8.0, 9.0])[:count]
+        batch["collector", "mask"] = torch.arange(count) < 3
+        found.append({**loss(batch), "delta": loss.delta})
+    for key, expected in found[0].items():
+        torch.testing.assert_close(found[1][key], expected, msg=key)
+
+
+def test_a_likelihood_of_each_action_is_no_likelihood():
+    """Of one action it is the same in another shape; of several it is refused, with what to do."""
+    base, found = make_loss(), []
+    batch = make_batch(base, [1.5, 0.7], [0.3, -2.0])
+    for distribution in (IndependentNormal, torch.distributions.Normal):
+        loss, own = copy.deepcopy(base), batch.clone()
+        loss.actor_network[-1].distribution_class = distribution
+        if distribution is torch.distributions.Normal:
+            own["action_log_prob"] = own["action_log_prob"].unsqueeze(-1)
+        found.append(loss(own))
+    for key in ("loss_actor", "loss_critic", "ratio_threshold"):
+        torch.testing.assert_close(found[1][key], found[0][key])
+    with pytest.raises(ValueError, match=r"shape \(2,\) in this batch, got \(2, 3\): use a"):
+        of_each_transition(torch.zeros(2, 3), torch.zeros(2))
 
 
 @pytest.mark.parametrize(("importance", "weights"), [("max", (1.0, 0.5)), ("mean", (4 / 3, 2 / 3))])

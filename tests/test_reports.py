@@ -152,9 +152,16 @@ class TestPaperTable:
         row = dict(zip(table.columns, table.rows[1], strict=True))
         assert row["P(larger return)"].split()[0] == "0.75"
         assert row["P(smoother)"].split()[0] == "0.75"
-        assert table.rows[1][3:6] == ["20.00 (7.07)", "693.8 (123.8)", "50.00 (7.07)"]
+        assert table.rows[1][3:6] == ["20.00 (7.07)†", "693.8 (123.8)", "50.00 (7.07)"]
         assert table.rows[0][6] == table.rows[0][-1] == ""
         assert paper_table([group for group in groups if group.first.algorithm == "sac"]) is None
+
+    @pytest.mark.parametrize(("total", "marks"), [(693.0 + 123.0, 0), (693.0 - 126.0, 1)])
+    def test_a_cell_beyond_the_papers_deviation_is_marked(self, tmp_path, total, marks):
+        """The paper's L2C2 on Swingup: 693.77 (123.78) at .075 (.012); .08 lies within."""
+        make_run(tmp_path / "run", make_config(regularizer="l2c2"), total, 0.08)
+        (row,) = paper_table(group_records(run.record for run in read_runs(tmp_path))).rows
+        assert "".join(row).count("†") == marks
 
 
 class TestMeasures:

@@ -21,7 +21,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.envs import CatFrames, GymEnv, TransformedEnv
-from torchrl.modules import Actor, IndependentNormal, ProbabilisticActor
+from torchrl.modules import Actor, IndependentNormal, NormalParamExtractor, ProbabilisticActor
 from torchrl.objectives import DDPGLoss, DQNLoss, PPOLoss
 
 from torchrl_l2c2 import ASAPLoss, CAPSLoss, CATSLoss, GradCAPSLoss, L2C2Loss, LCPLoss, SR2LLoss
@@ -50,6 +50,17 @@ from torchrl_l2c2.objectives.sr2l import ascend, jeffreys_divergence
 pytestmark = pytest.mark.filterwarnings("ignore")
 
 WEIGHT = torch.tensor([[1.0, -2.0, 0.5], [0.0, 1.0, 1.0]])
+
+
+class TwoHeads(nn.Module):
+    """An action, and behind it something else."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.act, self.hide = nn.Linear(3, 2), nn.Linear(3, 2)
+
+    def forward(self, observation):
+        return self.act(observation), self.hide(observation)
 
 
 def linear_base() -> DDPGLoss:
@@ -151,6 +162,19 @@ class TestGradCAPS:
         batch["before"] = batch.pop("frames")[:, :3]
         assert loss.policy_regularizer(batch)["loss_grad_caps"].equal(expected)
         assert "before" in loss.in_keys
+        loss.set_keys(reward="rew")
+        assert "before" in loss.in_keys and "frames" not in loss.in_keys
+        with pytest.raises(ValueError, match=r"of shape \(2, 3\), got \(2, 2\)"):
+            loss.policy_regularizer(batch.set("before", batch["before"][:, :2]))
+        with pytest.raises(KeyError, match="no 'before', which previous_key names"):
+            loss.policy_regularizer(batch.exclude("before"))
+
+    def test_what_it_asks_for_is_all_that_it_reads(self):
+        """A batch of the in_keys alone will do: frames are among them."""
+        loss = GradCAPSLoss(linear_base())
+        asked = self.batch().select(*loss.in_keys, strict=False)
+        expected = loss.policy_regularizer(self.batch())["loss_grad_caps"]
+        assert loss.policy_regularizer(asked)["loss_grad_caps"].equal(expected)
 
     def test_other_batches_are_refused_with_what_to_do(self):
         """Without frames, or with three."""
@@ -204,6 +228,18 @@ class TestASAP:
             trained, other = found if kind == "spatial" else reversed(found)
             assert other is None
             torch.testing.assert_close(trained, expected)
+
+    def test_what_else_the_policy_writes_is_no_action(self):
+        """The predictor's action is compared, wherever among its entries it stands."""
+        net = TensorDictModule(TwoHeads(), ["observation"], ["action", "hidden"])
+        loss, batch = ASAPLoss(DDPGLoss(net, qvalue()), previous_key="before"), self.batch()
+        batch["before"] = batch["observation"]
+        terms = loss.policy_regularizer(batch)
+        assert terms["loss_asap_spatial"] == terms["loss_asap_temporal"] == 0
+        terms["loss_grad_caps"].backward()
+        parameters = dict(loss.actor_network_params.flatten_keys(".").items())
+        assert parameters["module.act.weight"].grad is not None
+        assert parameters["module.hide.weight"].grad is None
 
     def test_grad_caps_is_the_third(self):
         """With its own numbers."""
@@ -313,6 +349,26 @@ class TestLCP:
         expected = (error @ WEIGHT / 0.5**2).square().sum(-1).mean()
         found = LCPLoss(linear_normal(), 0.002).policy_regularizer(batch)["loss_lcp"]
         torch.testing.assert_close(found, 0.002 * expected)
+
+    @pytest.mark.parametrize("regularizer", [LCPLoss, lambda base: SR2LLoss(base, steps=1)])
+    def test_successors_do_not_matter(self, regularizer):
+        """Goals count whether a successor of theirs is stored or not; none need be."""
+        torch.manual_seed(0)
+        net = nn.Sequential(nn.Linear(4, 4), NormalParamExtractor())
+        joint = TensorDictModule(
+            lambda s, goal: net(torch.cat((s, goal), -1)), ["observation", "goal"], ["loc", "scale"]
+        )
+        actor = ProbabilisticActor(
+            joint, in_keys=["loc", "scale"], distribution_class=IndependentNormal
+        )
+        loss, batch = regularizer(PPOLoss(actor, None)), transitions(8)
+        batch["goal"] = torch.randn(8, 1)
+        found = []
+        for successors in ([], ["observation"], ["observation", "goal"]):
+            batch["next"] = batch.select(*successors)
+            torch.manual_seed(1)
+            found += loss.policy_regularizer(batch).values()
+        assert found[0] > 0 and found[0] == found[1] == found[2]
 
     def test_its_gradient_is_that_of_the_penalty(self):
         """A second derivative, against differences."""

@@ -361,6 +361,16 @@ def test_what_cannot_be_regularized_is_refused(settings: dict[str, Any], said: s
         make(rsl.L2C2PPO, **settings)
 
 
+def test_the_groups_that_move_can_be_chosen() -> None:
+    """Privileged observations alone: the actor, which does not read them, has no term."""
+    cfg: dict[str, Any] = {"moved_keys": ["privileged"], "neighbor_key": "near"}
+    ppo = make(rsl.L2C2PPO, regularizer_cfg=cfg)
+    assert ppo.regularization.neighbors.in_keys == ["privileged"]
+    assert ppo.regularization.neighbors.out_key == "near"
+    with pytest.raises(ValueError, match=r"among the groups .*'policy', 'privileged'.*nonsense"):
+        make(rsl.L2C2PPO, regularizer_cfg={"moved_keys": ["nonsense"]})
+
+
 EXAMPLE = Path(__file__).parents[1] / "examples" / "rsl_rl_l2c2.py"
 
 

@@ -491,3 +491,17 @@ def test_drawing_and_placing_is_what_forward_does():
     assert uniform["b"].shape == (4, 2, 2, 2)
     found = transform.place(batch.clone(), uniform)["neighbor"]
     assert all(torch.equal(found[key], expected[key]) for key in ("a", "b", "distance"))
+
+
+@pytest.mark.parametrize(
+    "make",
+    [lambda g: NeighborTransform(NEAR, generator=g), lambda g: ObservationNoise(0.1, generator=g)],
+)
+def test_a_state_that_was_loaded_to_an_accelerator_is_restored(make, monkeypatch):
+    """Where ``map_location`` has put it; generators take it from the CPU alone."""
+    saved = make(generator(3)).get_extra_state()
+    loaded = torch.empty_like(saved, device="meta")
+    monkeypatch.setattr(torch.Tensor, "cpu", lambda self: saved if self is loaded else self)
+    transform = make(generator(4))
+    transform.set_extra_state(loaded)
+    assert transform.generator.get_state().equal(saved)

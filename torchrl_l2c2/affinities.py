@@ -182,5 +182,5 @@ def _composite(p: CompositeDistribution, q: CompositeDistribution) -> Tensor:
         part = log_affinity(entry, q.dists[name])
         if part is NotImplemented:
             return NotImplemented
-        parts.append(sum_to(part, len(p.batch_shape)))
+        parts.append(sum_to(part, max(len(p.batch_shape), len(q.batch_shape))))
     return functools.reduce(torch.add, parts)

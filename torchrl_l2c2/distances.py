@@ -166,16 +166,24 @@ def check_pair(p: Distribution, q: Distribution) -> None:
 
 def _monte_carlo(p: Distribution, q: Distribution, num_samples: int) -> Tensor:
     check_positive_int("num_samples", num_samples)
-    shape = torch.Size([num_samples])
     try:
         # Half of the draws from either policy: the mixture, without the noise of a coin.
-        halves = [_mixture_difference(p, q, source.sample(shape)) for source in (p, q)]
+        halves = [
+            _mixture_difference(p, q, source.sample(draws(source, other, num_samples)))
+            for source, other in ((p, q), (q, p))
+        ]
     except NotImplementedError as error:
         raise TypeError(
             f"{type(p).__name__} and {type(q).__name__} have no closed-form Hellinger distance "
             "and cannot be sampled and scored: register one with register_hellinger."
         ) from error
     return 0.5 * (halves[0] + halves[1])
+
+
+def draws(source: Distribution, other: Distribution, num_samples: int) -> torch.Size:
+    """The shape of draws from one policy that broadcast to another with more batch dimensions."""
+    missing = len(other.batch_shape) - len(source.batch_shape)
+    return torch.Size([num_samples, *[1] * missing])
 
 
 def _mixture_difference(p: Distribution, q: Distribution, sample: Any) -> Tensor:

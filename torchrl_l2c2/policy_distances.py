@@ -12,6 +12,7 @@ from torch.distributions import (
     Bernoulli,
     Categorical,
     Distribution,
+    Independent,
     OneHotCategorical,
     TransformedDistribution,
 )
@@ -24,6 +25,7 @@ from torchrl_l2c2.affinities import same_bounds, sum_to
 from torchrl_l2c2.distances import (
     MONTE_CARLO_SAMPLES,
     check_pair,
+    draws,
     log_prob_of,
     squared_error,
     squared_hellinger,
@@ -232,7 +234,14 @@ def kl_divergence(
             kl_divergence(head, q.dists[name], num_samples=num_samples)
             for name, head in p.dists.items()
         )
-        return functools.reduce(torch.add, (sum_to(head, len(p.batch_shape)) for head in heads))
+        ndim = max(len(p.batch_shape), len(q.batch_shape))
+        return functools.reduce(torch.add, (sum_to(head, ndim) for head in heads))
+    if isinstance(p, Independent) and isinstance(q, Independent):
+        base = kl_divergence(p.base_dist, q.base_dist, num_samples=num_samples)
+        return sum_to(base, base.ndim - p.reinterpreted_batch_ndims)
+    for kind in (Categorical, OneHotCategorical):
+        if isinstance(p, kind) and isinstance(q, kind):
+            return _categorical_kl(p, q)
     if isinstance(p, TanhNormal) and isinstance(q, TanhNormal):
         # Torch would compare the bounds, in a way that does not compile.
         same = same_bounds(p, q)
@@ -245,9 +254,19 @@ def kl_divergence(
     return _monte_carlo(p, q, num_samples)
 
 
+def _categorical_kl(
+    p: Categorical | OneHotCategorical, q: Categorical | OneHotCategorical
+) -> Tensor:
+    """Of torch's value, and with a gradient where actions are impossible, as under a mask."""
+    possible = p.probs > 0
+    log_p = torch.where(possible, p.logits, 0.0)
+    log_q = torch.where(possible, q.logits, 0.0)
+    return (p.probs * (log_p - log_q)).sum(-1)
+
+
 def _monte_carlo(p: Distribution, q: Distribution, num_samples: int) -> Tensor:
     try:
-        sample = p.sample(torch.Size([num_samples]))
+        sample = p.sample(draws(p, q, num_samples))
         log_p, log_q = log_prob_of(p, sample), log_prob_of(q, sample)
     except NotImplementedError as error:
         raise TypeError(

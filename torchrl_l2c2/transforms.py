@@ -123,7 +123,7 @@ class _RandomTransform(Transform):
                 f"{with_or_without[present]} one: build it as it was built then."
             )
         if self.generator is not None:
-            self.generator.set_state(state)
+            self.generator.set_state(state.cpu())  # Wherever a checkpoint was loaded to.
 
 
 class NeighborTransform(_RandomTransform):

@@ -61,7 +61,8 @@ class ExperimentConfig:
     """Everything one run depends on; the defaults are those of ``python train.py``.
 
     Left at ``None``, ``replay`` and ``optimizer`` are the algorithm's usual ones, and
-    ``regularizer`` is L2C2 with what was found for the algorithm, or else the paper's.
+    ``regularizer`` is L2C2 with what was found for the algorithm, or else the paper's; an
+    ``L2C2Config()`` that is given begins from the paper's with any.
 
     Raises:
         SettingError: a setting that is not known or lies outside its range.
@@ -156,7 +157,8 @@ class ExperimentConfig:
         """Reads nested mappings, such as a resolved Hydra configuration.
 
         Args:
-            values (Mapping): by group and name; ``outputs``, ``resume``, ``experiment`` and
+            values (Mapping): by group and name; what a group leaves out is the default of its name,
+                which for ``l2c2`` is the paper's; ``outputs``, ``resume``, ``experiment`` and
                 ``allow_other_versions``, which steer where, whether and how often runs happen, are
                 passed over.
 

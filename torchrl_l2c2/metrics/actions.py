@@ -164,7 +164,9 @@ def previous_action_gain(actions: Tensor) -> Tensor:
         tensor(-1.)
     """
     check_episodes("previous_action_gain", actions, 2)
-    centered = actions - actions.mean(-2, keepdim=True)
+    # Constant actions first become zeros, whose mean has no rounding error.
+    moved = actions - actions[..., :1, :]
+    centered = moved - moved.mean(-2, keepdim=True)
     before, after = centered[..., :-1, :], centered[..., 1:, :]
     return (after * before).sum((-2, -1)) / before.square().sum((-2, -1))
 

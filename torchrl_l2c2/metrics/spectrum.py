@@ -136,6 +136,8 @@ def roughness(actions: Tensor, sampling_rate: float = 1.0) -> Tensor:
         >>> roughness(torch.tensor([[1.0], [-1.0], [1.0], [-1.0]]))
         tensor(0.5000)
     """
-    frequencies, amplitudes = amplitude_spectrum(actions, sampling_rate)
+    # The constant part is taken off first: its rounding errors would move where nothing does.
+    moved = actions - actions[..., :1, :]
+    frequencies, amplitudes = amplitude_spectrum(moved, sampling_rate)
     moving, weights = amplitudes[..., 1:, :], frequencies[1:].unsqueeze(-1)
     return ((moving * weights).sum(-2) / (sampling_rate * moving.sum(-2))).mean(-1)

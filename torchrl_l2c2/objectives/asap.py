@@ -11,8 +11,8 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_l2c2.distances import squared_error
-from torchrl_l2c2.objectives.evaluation import POLICY_NETWORK
 from torchrl_l2c2.objectives.grad_caps import GradCAPSLoss
+from torchrl_l2c2.objectives.wiring import POLICY_NETWORK
 from torchrl_l2c2.policy_distances import policy_mean
 
 
@@ -119,7 +119,7 @@ class ASAPLoss(GradCAPSLoss):
         rows.update(self.states_around(tensordict)[0])
         squashed = self.grad_caps_mean == "action"
         if not self.has_stochastic_policy():
-            return policy_mean(predictor(rows)[predictor.out_keys[-1]], squashed=squashed)
+            return policy_mean(predictor(rows)[self.policy_action()], squashed=squashed)
         predicted = predictor.build_dist_from_params(predictor.get_dist_params(rows))
         return policy_mean(predicted, squashed=squashed)
 

@@ -7,28 +7,19 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
-from tensordict.nn import ProbabilisticTensorDictModule
-from torch import Tensor, nn
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor
 from torch.compiler import is_compiling
 from torch.distributions import Distribution
-from torch.nn.modules.batchnorm import _BatchNorm
-from torch.nn.modules.dropout import _DropoutNd
 from torchrl.envs.utils import set_exploration_type
-from torchrl.modules import Delta, GRUModule, LSTMModule, TanhDelta
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import _vmap_func
 
 from torchrl_l2c2.objectives.precision import autocast_at, in_full_precision
+from torchrl_l2c2.objectives.wiring import POLICY_NETWORK, Wiring, parameters_of, wiring_of
 
 Policy = Distribution | Tensor
 """A policy at some states: a distribution or, where it is deterministic, its actions."""
-
-POLICY_NETWORK = "actor_network"
-"""The name under which losses hold their policy."""
-
-VALUE_NETWORKS = ("critic_network", "qvalue_network", "value_network", "local_value_network")
-"""The names under which losses hold their value functions."""
 
 ONE_PASS_STATES = 256
 """Up to so many states, a batch and the other states share a pass over a network when compiled.
@@ -36,22 +27,6 @@ ONE_PASS_STATES = 256
 There a pass through a small network costs what calling it costs; in larger batches arithmetic
 decides, and two passes stay nearer to the caches.
 """
-
-# The vector of an ensemble, or of all actions, comes before the one number made of it.
-_VALUE_KEYS = ("value_heads", "state_action_value", "action_value", "value")
-
-
-@dataclass(frozen=True)
-class Wiring:
-    """What is to be known of a network to evaluate it at states of our own."""
-
-    inputs: tuple[NestedKey, ...]  # what the evaluation reads from the batch
-    states: tuple[NestedKey, ...]  # those inputs that are states
-    trunk: tuple[NestedKey, ...]  # inputs that are hidden outputs of the policy network
-    output: NestedKey | None  # a value function's value, a deterministic policy's action
-    stochastic: bool
-    has_buffers: bool
-    rowwise: bool  # an output depends on its own row alone, and on no random numbers
 
 
 @dataclass
@@ -81,9 +56,9 @@ class Evaluation:
 
     def wire(self, loss: LossModule, networks: Iterable[str]) -> None:
         """Finds out how these networks are evaluated; refuses those that cannot be."""
-        self.wiring = {name: _wiring(loss, name) for name in networks}
+        self.wiring = {name: wiring_of(loss, name) for name in networks}
         if any(wiring.trunk for wiring in self.wiring.values()):
-            self.wiring[POLICY_NETWORK] = _wiring(loss, POLICY_NETWORK)
+            self.wiring[POLICY_NETWORK] = wiring_of(loss, POLICY_NETWORK)
 
     def policies_at(
         self,
@@ -217,7 +192,7 @@ class Evaluation:
     def _evaluate(self, loss: LossModule, network: str, rows: TensorDictBase) -> TensorDictBase:
         net, wiring = getattr(loss, network), self.wiring[network]
         rows = rows.select(*net.in_keys, strict=False)
-        params = _parameters_of(loss, network)
+        params = parameters_of(loss, network)
         if wiring.has_buffers:
             # Running statistics are the loss's own: spare copies take the update.
             params = TensorDict.from_module(net) if params is None else params
@@ -239,12 +214,8 @@ class Evaluation:
 
 def is_ensemble(loss: LossModule, network: str) -> bool:
     """Whether the loss has expanded a network's parameters to those of several."""
-    params = _parameters_of(loss, network)
+    params = parameters_of(loss, network)
     return params is not None and params.ndim > 0
-
-
-def _parameters_of(loss: LossModule, network: str) -> TensorDictBase | None:
-    return getattr(loss, f"{network}_params", None) if loss.functional else None
 
 
 def at_rows(tensordict: TensorDictBase, rows: Tensor, dim: int = 0) -> TensorDictBase:
@@ -262,86 +233,3 @@ def _split(
         # Explicit sizes: an inferred one does not compile.
         out = out.unflatten(dim, (sum(parts), tensordict.batch_size[0]))
     return out.split(parts, dim)
-
-
-def _wiring(loss: LossModule, network: str) -> Wiring:
-    net, actor = getattr(loss, network), getattr(loss, POLICY_NETWORK, None)
-    _check_declares_keys(net, network)
-    _check_not_recurrent(net, network)
-    stochastic, actions, made = False, _action_keys(loss), set()
-    if actor is not None:
-        stochastic = _is_stochastic(actor)
-        made = set(actor.out_keys) - set(actor.in_keys)
-        if stochastic:
-            actions += actor.dist_sample_keys
-        elif not made & set(actions):
-            actions = actor.out_keys[-1:]
-    trunk = [key for key in net.in_keys if key in made - set(actions)]
-    inputs = dict.fromkeys([*net.in_keys, *(actor.in_keys if trunk and actor is not None else ())])
-    if network == POLICY_NETWORK:
-        output = next((key for key in actions if key in made), None)
-    else:
-        output = _value_key(loss, network)
-    return Wiring(
-        inputs=tuple(key for key in inputs if key not in trunk),
-        states=tuple(key for key in inputs if key not in made.union(actions)),
-        trunk=tuple(trunk),
-        output=output,
-        stochastic=stochastic,
-        has_buffers=_has_buffers(loss, network),
-        rowwise=not any(isinstance(m, _BatchNorm | _DropoutNd) for m in net.modules()),
-    )
-
-
-def _action_keys(loss: LossModule) -> list[NestedKey]:
-    keys = getattr(loss.tensor_keys, "action", [])
-    return [unravel_key(key) for key in (keys if isinstance(keys, list) else [keys])]
-
-
-def _value_key(loss: LossModule, network: str) -> NestedKey | None:
-    # A network's name does not tell what it is: a value_network is V, Q or a vector of Q.
-    keys = (getattr(loss.tensor_keys, name, None) for name in _VALUE_KEYS)
-    written = getattr(loss, network).out_keys
-    return next((key for key in keys if key and unravel_key(key) in written), None)
-
-
-def _has_buffers(loss: LossModule, network: str) -> bool:
-    params = _parameters_of(loss, network)
-    if params is None:
-        return any(True for _ in getattr(loss, network).buffers())
-    return not all(isinstance(p, nn.Parameter) for p in params.values(True, True))
-
-
-def _is_stochastic(actor: nn.Module) -> bool:
-    classes = {
-        module.distribution_class
-        for module in actor.modules()
-        if isinstance(module, ProbabilisticTensorDictModule)
-    }
-    if classes <= {Delta, TanhDelta}:
-        return False
-    if getattr(actor, "return_composite", False) or not hasattr(actor, "get_dist_params"):
-        raise TypeError(
-            "the policy must be a ProbabilisticTensorDictSequential, such as a ProbabilisticActor, "
-            f"with one distribution, got a {type(actor).__name__} with {len(classes)}: join "
-            "several heads in one CompositeDistribution."
-        )
-    return True
-
-
-def _check_declares_keys(net: nn.Module, name: str) -> None:
-    if not (hasattr(net, "in_keys") and hasattr(net, "out_keys")):
-        raise TypeError(
-            f"{name} is a {type(net).__name__}, which does not say what it reads and writes: make "
-            "it a TensorDictModule with in_keys and out_keys."
-        )
-
-
-def _check_not_recurrent(net: Any, name: str) -> None:
-    recurrent = any(isinstance(module, LSTMModule | GRUModule) for module in net.modules())
-    if recurrent or "is_init" in net.in_keys:
-        raise TypeError(
-            f"{name} is recurrent: its output depends on the states before, so that it has no "
-            "value at a state near the current one alone. Only feed-forward networks can be "
-            "regularized."
-        )

@@ -96,8 +96,7 @@ class GradCAPSLoss(RegularizedLoss):
         self.register_coefficient("grad_caps_lambda", lambda_temporal)
         self.declare_networks(self.policy_networks())
         self.declare_terms(policy=["loss_grad_caps"])
-        if previous_key is not None and self.in_keys:
-            self.in_keys = [*self.in_keys, previous_key]
+        self.declare_inputs([frames_key if previous_key is None else previous_key])
 
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
         terms = super().policy_regularizer(tensordict)
@@ -134,8 +133,7 @@ class GradCAPSLoss(RegularizedLoss):
 
     def _before(self, tensordict: TensorDictBase, key: NestedKey, state: Tensor) -> Tensor:
         if self.grad_caps_previous_key is not None:
-            previous: Tensor = tensordict.get(self.grad_caps_previous_key)
-            return previous
+            return self._previous(tensordict, self.grad_caps_previous_key, state)
         frames = tensordict.get(self.grad_caps_frames_key, None)
         if frames is None:
             raise KeyError(
@@ -150,6 +148,22 @@ class GradCAPSLoss(RegularizedLoss):
                 "with CatFrames(N=2, dim=-1)."
             )
         return frames[..., : state.shape[-1]]
+
+    def _previous(
+        self, tensordict: TensorDictBase, previous_key: NestedKey, state: Tensor
+    ) -> Tensor:
+        previous = tensordict.get(previous_key, None)
+        if previous is None:
+            raise KeyError(
+                f"the observation before each state is needed, and the batch has no "
+                f"{previous_key!r}, which previous_key names."
+            )
+        if previous.shape != state.shape:
+            raise ValueError(
+                f"{previous_key!r} must be the observation before each state, of shape "
+                f"{tuple(state.shape)}, got {tuple(previous.shape)}."
+            )
+        return previous
 
 
 def grad_caps_term(

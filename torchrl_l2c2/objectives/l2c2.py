@@ -15,7 +15,7 @@ from torchrl.objectives import DistributionalDQNLoss, LossModule
 from torchrl_l2c2._checks import check_choice, check_positive_int, check_real
 from torchrl_l2c2.distances import squared_error, squared_hellinger
 from torchrl_l2c2.neighborhood import Neighborhood
-from torchrl_l2c2.objectives.evaluation import VALUE_NETWORKS, at_rows
+from torchrl_l2c2.objectives.evaluation import at_rows
 from torchrl_l2c2.objectives.neighbors import (
     Neighbors,
     draw_rows,
@@ -25,6 +25,7 @@ from torchrl_l2c2.objectives.neighbors import (
 )
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
 from torchrl_l2c2.objectives.transitions import next_key
+from torchrl_l2c2.objectives.wiring import VALUE_NETWORKS
 from torchrl_l2c2.policy_distances import (
     PolicyDistance,
     choose_policy_distance,

@@ -46,7 +46,6 @@ class LCPLoss(RegularizedLoss):
         >>> from torchrl_l2c2 import LCPLoss, make_actor
         >>> loss = LCPLoss(PPOLoss(make_actor(3, 1, hidden=(8,)), None))
         >>> batch = TensorDict({"observation": torch.randn(32, 3)}, batch_size=[32])
-        >>> batch["next", "observation"] = batch["observation"]
         >>> batch["action"] = torch.zeros(32, 1)
         >>> bool(loss.policy_regularizer(batch)["loss_lcp"] > 0)
         True
@@ -66,9 +65,9 @@ class LCPLoss(RegularizedLoss):
 
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
         terms = super().policy_regularizer(tensordict)
-        transitions = self.transitions(tensordict, self.policy_networks())
+        read = self.policy_states(tensordict)
         with torch.enable_grad():
-            states = {k: s.unsqueeze(0).requires_grad_() for k, (s, _) in transitions.items()}
+            states = {key: state.unsqueeze(0).requires_grad_() for key, state in read.items()}
             others = TensorDict(states, batch_size=[1, *tensordict.batch_size])
             _, policy = self.policies_at(tensordict, others)
             assert isinstance(policy, Distribution)

@@ -21,6 +21,8 @@ from torchrl_l2c2._checks import check_choice, check_real
 from torchrl_l2c2.objectives.relative_pearson import (
     actor_loss,
     critic_loss,
+    importance_weight,
+    of_each_transition,
     relative_density_ratio,
     update_deviation,
 )
@@ -264,16 +266,19 @@ class PPORPELoss(SharedEvaluation):
         advantage = (target - value).detach().squeeze(-1)
         tensordict.set(self.tensor_keys.priority, advantage.abs())
 
-        ratio = self._log_ratio(tensordict).clamp(-MAX_LOG_RATIO, MAX_LOG_RATIO).exp()
+        log_ratio = of_each_transition(self._log_ratio(tensordict), advantage)
+        ratio = log_ratio.clamp(-MAX_LOG_RATIO, MAX_LOG_RATIO).exp()
         relative_ratio = relative_density_ratio(ratio.detach(), self.beta)
-        deviation, threshold = self._update_threshold(relative_ratio)
+        mask = self._mask(tensordict, relative_ratio)
+        deviation, threshold = self._update_threshold(relative_ratio, mask)
 
         loss_actor = actor_loss(advantage, ratio, threshold, self.beta)
         loss_critic = critic_loss(target, heads)
         if self.critic_weighting == "ratio":
             loss_critic = loss_critic * relative_ratio
 
-        weight = self._importance_weight(tensordict)
+        weight = self._maybe_get_priority_weight(tensordict)
+        weight = 1.0 if weight is None else importance_weight(weight, self.importance, mask)
         return TensorDict(
             {
                 "loss_actor": self._reduce_loss(weight * loss_actor, tensordict),
@@ -283,11 +288,11 @@ class PPORPELoss(SharedEvaluation):
             }
         )
 
-    def _importance_weight(self, tensordict: TensorDictBase) -> Tensor | float:
-        weight = self._maybe_get_priority_weight(tensordict)
-        if weight is None:
-            return 1.0
-        return weight / (weight.max() if self.importance == "max" else weight.mean())
+    def _mask(self, tensordict: TensorDictBase, like: Tensor) -> Tensor | None:
+        """Which transitions count, of the shape of a tensor; ``None``: all."""
+        if not any(tensordict.get(key, None) is not None for key in self._loss_mask_keys()):
+            return None
+        return self._reduce_loss(torch.ones_like(like), tensordict, reduction="none") > 0
 
     def evaluate_at_batch(self, network: str, tensordict: TensorDictBase) -> TensorDictBase:
         """What a network writes at the batch's own states; a regularizer reads it here as well."""
@@ -320,13 +325,16 @@ class PPORPELoss(SharedEvaluation):
             return log_prob - self.actor_network.get_dist(states).log_prob(action)
 
     @torch.no_grad()
-    def _update_threshold(self, relative_ratio: Tensor) -> tuple[Tensor, Tensor]:
+    def _update_threshold(
+        self, relative_ratio: Tensor, mask: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
         deviation, delta = update_deviation(
             self.delta,
             relative_ratio,
             decay=self.decay,
             floor=self.delta_min,
             reading=self.threshold,
+            mask=mask,
         )
         self.delta.copy_(delta)
         return deviation, self.kappa * self.delta

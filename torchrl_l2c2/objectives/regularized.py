@@ -5,33 +5,27 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
-import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import dispatch
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from torchrl_l2c2._checks import check_real
-from torchrl_l2c2.objectives.evaluation import (
-    POLICY_NETWORK,
-    VALUE_NETWORKS,
-    Evaluation,
-    ForwardPass,
-    Policy,
-    is_ensemble,
-)
+from torchrl_l2c2.objectives.declarations import DeclaredTerms
+from torchrl_l2c2.objectives.evaluation import Evaluation, ForwardPass, Policy, is_ensemble
 from torchrl_l2c2.objectives.shared_evaluation import SharedEvaluation
 from torchrl_l2c2.objectives.specialization import SpecializedLoss
 from torchrl_l2c2.objectives.transitions import (
     check_is_trained_on_transitions,
+    find_states,
     find_transitions,
     next_key,
 )
+from torchrl_l2c2.objectives.wiring import POLICY_NETWORK, VALUE_NETWORKS
 
 Made = TypeVar("Made")
 
 
-class RegularizedLoss(SpecializedLoss, SharedEvaluation):
+class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
     """A TorchRL loss with further terms: what every regularizer of this package builds on.
 
     ``Regularizer(loss, ...)`` returns an instance of ``Regularizer[type(loss)]``, a subclass of
@@ -95,9 +89,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         frozenset({'loss_stillness'})
     """
 
-    policy_terms: frozenset[str] = frozenset()
-    added_terms: frozenset[str] = frozenset()
-    _coefficients: frozenset[str] = frozenset()
+    _inputs: tuple[NestedKey, ...] = ()
 
     def __new__(cls, base_loss: LossModule, *args: Any, **kwargs: Any) -> RegularizedLoss:
         self = super().__new__(cls, base_loss)
@@ -105,18 +97,6 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         regularized = isinstance(base_loss, RegularizedLoss)
         self._evaluation = Evaluation(base_loss._evaluation.wiring if regularized else None)
         return self
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if name not in self._coefficients or isinstance(value, Tensor):
-            super().__setattr__(name, value)
-            return
-        check_real(name, value, at_least=0)
-        if name not in self._buffers:
-            raise ValueError(
-                f"{name} has nothing to scale: this {type(self).__name__} was made without "
-                "the term. Make it with a gain above 0, which can be set to 0 later."
-            )
-        self._buffers[name].fill_(value)
 
     def set_keys(self, **kwargs: NestedKey | None) -> None:
         """As for the loss itself; what the regularizer reads follows."""
@@ -171,48 +151,10 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         """
         self._wire([*self._evaluation.wiring, *networks])
 
-    def declare_terms(
-        self,
-        *,
-        policy: Iterable[str] = (),
-        value: Iterable[str] = (),
-        diagnostics: Iterable[str] = (),
-    ) -> None:
-        """Declares what the two methods return; adds it to ``out_keys``, in the order given.
-
-        Keyword Args:
-            policy: ``loss_*`` keys of terms that train the policy, for ``policy_terms``.
-            value: ``loss_*`` keys of terms that train value functions alone.
-            diagnostics: other keys, of entries that train nothing.
-
-        Raises:
-            ValueError: a key has the beginning of another kind.
-        """
-        policy, value, diagnostics = list(policy), list(value), list(diagnostics)
-        for keys, trains in ((policy, True), (value, True), (diagnostics, False)):
-            for key in keys:
-                if key.startswith("loss_") != trains:
-                    kind = "a term must start" if trains else "a diagnostic must not start"
-                    raise ValueError(f"{kind} with 'loss_', got {key!r}: rename it.")
-        self.out_keys = [*self.out_keys, *policy, *value, *diagnostics]
-        self.policy_terms = self.policy_terms.union(policy)
-        self.added_terms = self.added_terms.union(policy, value)
-
-    def register_coefficient(self, name: str, value: float, used: bool = True) -> None:
-        """Makes a gain, a buffer of shape ``[]`` that can be assigned to later on.
-
-        Not persistent: the ``state_dict`` is to keep the keys of the plain loss's.
-
-        Args:
-            name: the attribute.
-            value: a finite number of at least 0, now and whenever it is assigned to.
-            used: whether there is a term that it scales. If not, assigning to it is an error.
-        """
-        check_real(name, value, at_least=0)
-        self._coefficients = self._coefficients | {name}
-        if used:
-            gain = torch.tensor(float(value), device=self._default_device)
-            self.register_buffer(name, gain, persistent=False)
+    def declare_inputs(self, keys: Iterable[NestedKey]) -> None:
+        """Declares entries of the batch that are read beside states and their successors."""
+        self._inputs = (*self._inputs, *keys)
+        self._wire(self._evaluation.wiring)
 
     def policy_networks(self) -> list[str]:
         """The name of the loss's policy, where it has one."""
@@ -230,6 +172,10 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
     def has_stochastic_policy(self) -> bool:
         """Whether the policy, a declared network, is a distribution; otherwise it is an action."""
         return self._evaluation.wiring[POLICY_NETWORK].stochastic
+
+    def policy_action(self) -> NestedKey:
+        """The entry that is the action, where the policy, a declared network, is deterministic."""
+        return self._evaluation.wiring[POLICY_NETWORK].output
 
     def is_ensemble(self, network: str) -> bool:
         """Whether the loss has expanded a network's parameters to those of several."""
@@ -255,6 +201,20 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         """
         wiring = self._evaluation.wiring
         return find_transitions(tensordict, {name: wiring[name].states for name in networks})
+
+    def policy_states(self, tensordict: TensorDictBase) -> dict[NestedKey, Tensor]:
+        """The floating-point states that the policy reads, ``[*B, *F]`` by their keys.
+
+        Unlike :meth:`transitions`, also those without a successor, such as goals.
+
+        Args:
+            tensordict: the batch, ``[*B]``.
+
+        Raises:
+            TypeError: it reads none.
+        """
+        read = self._evaluation.wiring[POLICY_NETWORK].states
+        return find_states(tensordict, read, POLICY_NETWORK)
 
     def policies_at(
         self, tensordict: TensorDictBase, states: TensorDictBase, rows: Tensor | None = None
@@ -347,4 +307,4 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         if self.in_keys:
             wirings = self._evaluation.wiring.values()
             successors = (next_key(key) for wiring in wirings for key in wiring.states)
-            self.in_keys = list(dict.fromkeys([*self.in_keys, *successors]))
+            self.in_keys = list(dict.fromkeys([*self.in_keys, *successors, *self._inputs]))

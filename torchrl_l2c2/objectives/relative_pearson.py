@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import Literal
 
+import torch
 from torch import Tensor
 
 
@@ -108,6 +109,7 @@ def update_deviation(
     decay: float,
     floor: float,
     reading: Literal["max", "ema"],
+    mask: Tensor | None = None,  # shape: [*B]
 ) -> tuple[Tensor, Tensor]:  # shape: [], []
     r"""The batch's deviation of the ratio, and :math:`\Delta`, to which the threshold is set.
 
@@ -122,6 +124,7 @@ def update_deviation(
         decay: :math:`\delta`, in ``[0, 1]``. Smaller values forget large deviations sooner.
         floor: :math:`\Delta_{\min}`, greater than 0.
         reading: how batches are summed up.
+        mask: which of the batch count; ``None``: all.
 
     Returns:
         The largest or, with ``"ema"``, mean :math:`|\rho_R - 1|` of the batch; and :math:`\Delta`
@@ -134,10 +137,57 @@ def update_deviation(
         (tensor(0.5000), tensor(0.5000))
     """
     deviation = (relative_ratio - 1.0).abs().nan_to_num(0.0)
+    if mask is not None:
+        deviation = torch.where(mask, deviation, 0.0)
     if reading == "max":
         deviation = deviation.max()
         updated = (decay * largest).maximum(deviation)
     else:
-        deviation = deviation.mean()
+        count = None if mask is None else mask.sum().clamp_min(1)
+        deviation = deviation.mean() if count is None else deviation.sum() / count
         updated = decay * largest + (1.0 - decay) * deviation
     return deviation, updated.clamp_min(floor)
+
+
+def importance_weight(
+    weight: Tensor,  # shape: [*B]
+    reading: Literal["max", "mean"],
+    mask: Tensor | None = None,  # shape: [*B]
+) -> Tensor:  # shape: [*B]
+    r"""The weights of prioritized replay over their largest, or over their mean [inferred].
+
+    Args:
+        weight: as the replay buffer gives them, at least 0.
+        reading: what they are divided by.
+        mask: which of the batch count; ``None``: all.
+
+    Examples:
+        >>> import torch
+        >>> weight, mask = torch.tensor([1.0, 2.0, 8.0]), torch.tensor([True, True, False])
+        >>> importance_weight(weight, "max", mask)
+        tensor([0.5000, 1.0000, 0.0000])
+    """
+    if mask is None:
+        return weight / (weight.max() if reading == "max" else weight.mean())
+    kept = torch.where(mask, weight, 0.0)
+    return kept / (kept.max() if reading == "max" else kept.sum() / mask.sum().clamp_min(1))
+
+
+def of_each_transition(
+    log_ratio: Tensor,  # shape: [*B] or [*B, 1]
+    advantage: Tensor,  # shape: [*B]
+) -> Tensor:  # shape: [*B]
+    """A log-likelihood as one number for each transition, as its advantage is.
+
+    Raises:
+        ValueError: it is one for each of several actions.
+    """
+    if log_ratio.shape == (*advantage.shape, 1):
+        return log_ratio.squeeze(-1)
+    if log_ratio.shape != advantage.shape:
+        raise ValueError(
+            f"the log-likelihood of an action must be one number, of shape "
+            f"{tuple(advantage.shape)} in this batch, got {tuple(log_ratio.shape)}: use a "
+            "distribution over whole actions, such as torchrl's IndependentNormal or TanhNormal."
+        )
+    return log_ratio

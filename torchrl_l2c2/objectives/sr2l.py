@@ -103,8 +103,7 @@ class SR2LLoss(RegularizedLoss):
 
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
         terms = super().policy_regularizer(tensordict)
-        transitions = self.transitions(tensordict, self.policy_networks())
-        states = {key: state for key, (state, _) in transitions.items()}
+        states = self.policy_states(tensordict)
 
         def distance(moved: States) -> Tensor:
             batch = {key: state.unsqueeze(0) for key, state in moved.items()}

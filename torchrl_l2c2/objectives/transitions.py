@@ -76,20 +76,12 @@ def find_transitions(
         KeyError: no state that a network reads has a successor.
     """
     keys = dict.fromkeys(key for read in states.values() for key in read)
-    tensordict = tensordict.select(*keys, *map(next_key, keys), strict=False).detach()
-    found = {key: tensordict.get(key, None) for key in keys}
+    following = tensordict.select(*map(next_key, keys), strict=False).detach()
     pairs: dict[NestedKey, tuple[Tensor, Tensor]] = {}
     for network, read in states.items():
-        floating = [key for key in read if _is_floating_point(found[key])]
-        if not floating:
-            kinds = {key: getattr(found[key], "dtype", type(found[key]).__name__) for key in read}
-            raise TypeError(
-                f"{network} needs a floating-point observation among its inputs to be regularized, "
-                f"got {kinds}: cast it in the environment, the collector or the replay buffer. A "
-                "network that reads no observation has nothing to regularize."
-            )
-        successors = {key: tensordict.get(next_key(key), None) for key in floating}
-        present = {key: (found[key], s) for key, s in successors.items() if s is not None}
+        floating = find_states(tensordict, read, network)
+        successors = {key: following.get(next_key(key), None) for key in floating}
+        present = {key: (floating[key], s) for key, s in successors.items() if s is not None}
         if not present:
             raise KeyError(
                 f"{network} needs the next observation to be regularized, and the batch has no "
@@ -97,6 +89,36 @@ def find_transitions(
             )
         pairs.update(present)
     return {key: pairs[key] for key in keys if key in pairs}
+
+
+def find_states(
+    tensordict: TensorDictBase, keys: Iterable[NestedKey], network: str
+) -> dict[NestedKey, Tensor]:
+    """The floating-point states that a network reads, without a gradient, whatever follows them.
+
+    Args:
+        tensordict (TensorDictBase): the batch, ``[*B]``.
+        keys: of the states that it reads.
+        network (str): its name.
+
+    Returns:
+        dict: by their keys, ``[*B, *F]``.
+
+    Raises:
+        TypeError: none of them is floating point.
+    """
+    keys = list(keys)
+    tensordict = tensordict.select(*keys, strict=False).detach()
+    found = {key: tensordict.get(key, None) for key in keys}
+    floating = {key: state for key, state in found.items() if _is_floating_point(state)}
+    if not floating:
+        kinds = {key: getattr(s, "dtype", type(s).__name__) for key, s in found.items()}
+        raise TypeError(
+            f"{network} needs a floating-point observation among its inputs to be regularized, "
+            f"got {kinds}: cast it in the environment, the collector or the replay buffer. A "
+            "network that reads no observation has nothing to regularize."
+        )
+    return floating
 
 
 def finite_successor(state: Tensor, successor: Tensor) -> Tensor:

@@ -172,10 +172,20 @@ class L2C2PPO(RegularizedPPO):
         if "loss_l2c2_critic" in loss.added_terms:
             read += networks.critic_network.in_keys
         stored = self.storage.observations
-        moved = [group for group in dict.fromkeys(read) if stored[group].is_floating_point()]
+        groups = [group for group in dict.fromkeys(read) if stored[group].is_floating_point()]
+        moved = groups if loss.l2c2_moved_keys is None else [*loss.l2c2_moved_keys]
+        if not set(moved) <= set(groups):
+            raise ValueError(
+                f"moved_keys must be among the groups that the networks read, {groups}, got "
+                f"{moved}."
+            )
         generator = torch.Generator(self.device).manual_seed(torch.initial_seed())
         return loss, NeighborTransform(
-            near, moved, num_samples=loss.l2c2_num_samples, generator=generator
+            near,
+            moved,
+            out_key=loss.l2c2_neighbor_key,
+            num_samples=loss.l2c2_num_samples,
+            generator=generator,
         )
 
 

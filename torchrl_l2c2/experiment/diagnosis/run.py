@@ -29,7 +29,8 @@ from torchrl_l2c2.experiment.influence import gradient_shares
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.trained import load_policy
 from torchrl_l2c2.experiment.video import play_pictures
-from torchrl_l2c2.objectives.evaluation import VALUE_NETWORKS, Evaluation, is_ensemble
+from torchrl_l2c2.objectives.evaluation import Evaluation, is_ensemble
+from torchrl_l2c2.objectives.wiring import VALUE_NETWORKS
 
 LATE = 0.1  # of the training, whose mean shares are told
 

@@ -13,6 +13,10 @@ class Published(NamedTuple):
     action_variation_mean: float
     action_variation_std: float
 
+    def cell(self, quantity: str) -> tuple[float, float]:
+        """Mean and standard deviation of a quantity, such as ``"return"``."""
+        return getattr(self, f"{quantity}_mean"), getattr(self, f"{quantity}_std")
+
 
 # Kobayashi (2022), Table III: return and L2 norm of temporal actions.
 PAPER: dict[tuple[str, str], Published] = {

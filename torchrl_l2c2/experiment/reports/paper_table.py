@@ -14,7 +14,8 @@ LEGEND = (
     "Means, standard deviations over seeds in brackets; the paper's are of 18 seeds. Actions are "
     "sampled, as in training, and the action variation is that of the policy's mean: smaller is "
     "smoother. The first column of each is of the late policies, training's own episodes of its "
-    "last tenth, and P of the same: how probable it is that a run is better than one of vanilla "
+    "last tenth, marked † where it lies further from the paper's than the paper's deviation, and P "
+    "of the same: how probable it is that a run is better than one of vanilla "
     "with the same other settings, ties halved, with the 95% interval of the stratified bootstrap."
 )
 # Late policies in the first column, as they are steadier than the paper's test of the last one.
@@ -47,7 +48,7 @@ def _row(group: Group, vanilla: Group | None) -> list[str]:
     for quantity in QUANTITIES:
         better = improvement([group], [vanilla], FIRST, quantity) if vanilla else None
         cells += [
-            pooled(group, FIRST, quantity),
+            pooled(group, FIRST, quantity) + ("†" if _is_off(group, quantity) else ""),
             _published(group.first.paper, quantity),
             pooled(group, SECOND, quantity),
             probability(better),
@@ -55,8 +56,17 @@ def _row(group: Group, vanilla: Group | None) -> list[str]:
     return cells
 
 
+def _is_off(group: Group, quantity: str) -> bool:
+    """Whether the late policies lie further from the paper's mean than its standard deviation."""
+    scores, paper = group.scores(FIRST, quantity), group.first.paper
+    if paper is None or not len(scores):
+        return False
+    center, deviation = paper.cell(quantity)
+    return abs(float(scores.mean()) - center) > deviation
+
+
 def _published(paper: Published | None, quantity: str) -> str:
     if paper is None:
         return ""
-    center, deviation = getattr(paper, f"{quantity}_mean"), getattr(paper, f"{quantity}_std")
+    center, deviation = paper.cell(quantity)
     return f"{number(center, quantity)} ({number(deviation, quantity, center)})"

@@ -36,8 +36,8 @@ class Reading:
         for group in (self.vanilla, self.caps):
             for quantity in QUANTITIES:
                 published = group.first.paper
-                center = getattr(published, f"{quantity}_mean")
-                deviation = getattr(published, f"{quantity}_std")
+                assert published is not None
+                center, deviation = published.cell(quantity)
                 values = group.scores(figure, quantity)
                 distance = abs(values.mean() - center) / deviation if len(values) else math.nan
                 # A NaN first stays one.

@@ -1,0 +1,86 @@
+"""The terms and gains that regularizers say they add to a loss."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from torchrl_l2c2._checks import check_real
+
+if TYPE_CHECKING:
+    from torchrl.objectives import LossModule as Base
+else:  # Every class of a LossModule gets a forward of its own, which would hide the loss's.
+    from torch.nn import Module as Base
+
+
+class DeclaredTerms(Base):
+    """Knows which of a loss's terms were added to it, and the gains that scale these.
+
+    Attributes:
+        policy_terms (frozenset of str): the ``loss_*`` keys of all regularizers applied that train
+            the policy.
+        added_terms (frozenset of str): all ``loss_*`` keys of all regularizers applied.
+    """
+
+    policy_terms: frozenset[str] = frozenset()
+    added_terms: frozenset[str] = frozenset()
+    _coefficients: frozenset[str] = frozenset()
+    out_keys: list[str]
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name not in self._coefficients or isinstance(value, Tensor):
+            super().__setattr__(name, value)
+            return
+        check_real(name, value, at_least=0)
+        if name not in self._buffers:
+            raise ValueError(
+                f"{name} has nothing to scale: this {type(self).__name__} was made without "
+                "the term. Make it with a gain above 0, which can be set to 0 later."
+            )
+        self._buffers[name].fill_(value)
+
+    def declare_terms(
+        self,
+        *,
+        policy: Iterable[str] = (),
+        value: Iterable[str] = (),
+        diagnostics: Iterable[str] = (),
+    ) -> None:
+        """Declares what the two methods return; adds it to ``out_keys``, in the order given.
+
+        Keyword Args:
+            policy: ``loss_*`` keys of terms that train the policy, for ``policy_terms``.
+            value: ``loss_*`` keys of terms that train value functions alone.
+            diagnostics: other keys, of entries that train nothing.
+
+        Raises:
+            ValueError: a key has the beginning of another kind.
+        """
+        policy, value, diagnostics = list(policy), list(value), list(diagnostics)
+        for keys, trains in ((policy, True), (value, True), (diagnostics, False)):
+            for key in keys:
+                if key.startswith("loss_") != trains:
+                    kind = "a term must start" if trains else "a diagnostic must not start"
+                    raise ValueError(f"{kind} with 'loss_', got {key!r}: rename it.")
+        self.out_keys = [*self.out_keys, *policy, *value, *diagnostics]
+        self.policy_terms = self.policy_terms.union(policy)
+        self.added_terms = self.added_terms.union(policy, value)
+
+    def register_coefficient(self, name: str, value: float, used: bool = True) -> None:
+        """Makes a gain, a buffer of shape ``[]`` that can be assigned to later on.
+
+        Not persistent: the ``state_dict`` is to keep the keys of the plain loss's.
+
+        Args:
+            name: the attribute.
+            value: a finite number of at least 0, now and whenever it is assigned to.
+            used: whether there is a term that it scales. If not, assigning to it is an error.
+        """
+        check_real(name, value, at_least=0)
+        self._coefficients = self._coefficients | {name}
+        if used:
+            gain = torch.tensor(float(value), device=self._default_device)
+            self.register_buffer(name, gain, persistent=False)
