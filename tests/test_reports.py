@@ -781,7 +781,7 @@ class TestReadme:
         main(["--from", str(file), "--readme", str(readme)])
         text = readme.read_text()
         assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
-        assert "| swingup | L2C2 | 0-4 | 202.0 (1.6) | 693.8 (123.8) | 232.0 (1.6) |" in text
+        assert "| swingup | L2C2 | 0-4 | 202.0 (1.6)† | 693.8 (123.8) | 232.0 (1.6) |" in text
         assert (tmp_path / "docs" / "results.svg").exists()
         # Where a task has runs as long as it is trained by default, they stand for it.
         usual = replace(records[0], length=f"{TASKS['swingup'].episodes} episodes")
