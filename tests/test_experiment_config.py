@@ -25,7 +25,7 @@ from torchrl_l2c2.experiment import (
 from torchrl_l2c2.experiment.command import CONF, check_preset, register, tell_tuned
 from torchrl_l2c2.experiment.config import GROUPS
 from torchrl_l2c2.experiment.manual import manual, page
-from torchrl_l2c2.experiment.regularizers import BEGIN_TUNED, REGULARIZERS, TUNED
+from torchrl_l2c2.experiment.regularizers import BEGIN_TUNED, REGULARIZERS, TUNED, TUNED_ON
 from torchrl_l2c2.experiment.settings import SettingError, describe
 from torchrl_l2c2.experiment.tasks import FIELD_TASKS, PAPER_TASKS
 
@@ -170,7 +170,8 @@ def test_l2c2_begins_from_what_was_found_for_the_algorithm(name, algorithm, caps
     assert config.regularizer == found != REGULARIZERS[name]
     tell_tuned(config)
     told = capsys.readouterr().out
-    assert f"lambda_min={found.lambda_min}, " in told and f"for {algorithm}" in told
+    assert f"lambda_min={found.lambda_min}, " in told
+    assert f"for {algorithm} on {TUNED_ON[algorithm]}" in told
     other = ExperimentConfig.from_dict(composed(*chosen, "regularizer.beta=0.5"))
     assert other.regularizer == dataclasses.replace(found, beta=0.5)
     paper = ExperimentConfig.from_dict(composed(chosen[0], "regularizer=l2c2_paper"))

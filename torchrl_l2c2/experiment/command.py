@@ -29,7 +29,7 @@ from torchrl_l2c2.experiment.config import GROUPS, ExperimentConfig, OtherRunErr
 from torchrl_l2c2.experiment.manual import manual
 from torchrl_l2c2.experiment.naming import run_name
 from torchrl_l2c2.experiment.progress import log
-from torchrl_l2c2.experiment.regularizers import BEGIN_TUNED, TUNED
+from torchrl_l2c2.experiment.regularizers import BEGIN_TUNED, TUNED, TUNED_ON
 from torchrl_l2c2.experiment.settings import SettingError, describe
 from torchrl_l2c2.experiment.signals import (
     Interrupted,
@@ -275,7 +275,10 @@ def tell_tuned(config: ExperimentConfig) -> None:
     regularizer, algorithm = config.regularizer, config.algorithm.name
     if regularizer.name in BEGIN_TUNED and algorithm in TUNED:
         chosen = ", ".join(f"{name}={getattr(regularizer, name)}" for name in TUNED[algorithm])
-        where = f"found for {algorithm}, or given; regularizer=l2c2_paper is the paper's"
+        where = (
+            f"found for {algorithm} on {TUNED_ON[algorithm]}, or given; larger rewards may want "
+            "larger gains; regularizer=l2c2_paper is the paper's"
+        )
         print(f"regularizer={regularizer.name}: {chosen} ({where})", flush=True)
 
 

@@ -16,6 +16,7 @@ __all__ = [
     "BEGIN_TUNED",
     "REGULARIZERS",
     "TUNED",
+    "TUNED_ON",
     "ASAPConfig",
     "CAPSConfig",
     "CATSConfig",
@@ -39,8 +40,15 @@ TUNED: dict[str, dict[str, Any]] = {
         "lambda_max": 100.0,
         "beta": 0.0,
     },
-    "sac": {"policy_distance": "mean", "lambda_min": 10.0, "lambda_max": 1000.0, "beta": 0.0},
+    "sac": {
+        "policy_distance": "mean",
+        "shared": True,
+        "lambda_min": 10.0,
+        "lambda_max": 1000.0,
+        "beta": 0.0,
+    },
 }
+TUNED_ON = {"ppo": "Pendulum and LunarLander", "sac": "Pendulum"}
 
 REGULARIZERS: dict[str, RegularizerConfig] = {
     "none": NoRegularizerConfig(),
