@@ -479,8 +479,24 @@ class TestCommand:
         main([str(run), "--no-video", "--episodes", "1"])
         assert "<video" not in (run / "diagnosis.html").read_text()
 
-    def test_what_is_wrong_is_one_line(self, run, tmp_path):
-        """A folder that is no run; the same run twice."""
+    def test_actions_of_all_runs_are_one_picture(self, run, tmp_path, capsys):
+        """A row for each, by the names that were given, on the same axes."""
+        other, path = trained(tmp_path / "other", "Blank-v0"), tmp_path / "new" / "actions.svg"
+        names = ["the first", "the second"]
+        chosen = ["--names", *names, "--actions", str(path), "--no-video", "--episodes", "1"]
+        main([str(run), str(other), *chosen])
+        told, picture = capsys.readouterr().out, path.read_text()
+        for name in names:
+            assert f"{name}: return " in told and f">{name}: return " in picture
+        rows = [one for one in picture.split('<g id="axes_')[1:]]
+        limits = [sorted(re.findall(r">(−?[\d.]+)</text>", row)) for row in rows]
+        assert len(rows) == 2 and limits[0] == limits[1]
+
+    def test_what_is_wrong_is_one_line(self, run, tmp_path, capsys):
+        """A folder that is no run; the same run twice; names that are too few."""
+        with pytest.raises(SystemExit):
+            main([str(run), str(tmp_path), "--names", "one"])
+        assert "--names: one for each of the 2 runs" in capsys.readouterr().err
         with pytest.raises(SystemExit, match=r"^error: '.*' is not the folder of a run"):
             main([str(tmp_path)])
         with pytest.raises(SystemExit, match=r"^error: a run is named twice"):

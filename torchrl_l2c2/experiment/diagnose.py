@@ -11,6 +11,7 @@ from torchrl_l2c2.experiment.diagnosis import (
     Diagnosis,
     comparison,
     diagnose_run,
+    draw_together,
     findings,
     write_page,
 )
@@ -25,7 +26,10 @@ def main(arguments: Iterable[str] | None = None) -> None:
     chosen = parser.parse_args(None if arguments is None else list(arguments))
     if chosen.episodes < 1:
         parser.error(f"--episodes must be at least 1, got {chosen.episodes}")
+    if chosen.names and len(chosen.names) != len(chosen.folders):
+        parser.error(f"--names: one for each of the {len(chosen.folders)} runs, got {chosen.names}")
     try:
+        names = chosen.names or _names(chosen.folders)
         diagnoses = [
             diagnose_run(
                 folder,
@@ -36,11 +40,15 @@ def main(arguments: Iterable[str] | None = None) -> None:
                 best=chosen.best,
                 with_pictures=not chosen.no_video,
             )
-            for folder, name in zip(chosen.folders, _names(chosen.folders), strict=True)
+            for folder, name in zip(chosen.folders, names, strict=True)
         ]
         path = Path(chosen.output or Path(chosen.folders[0]) / "diagnosis.html")
         make_folder(path.parent)
         write_page(path, diagnoses)
+        if chosen.actions:
+            picture = Path(chosen.actions)
+            make_folder(picture.parent)
+            picture.write_bytes(draw_together(diagnoses))
     except (ValueError, OSError, RuntimeError, ImportError) as error:
         sys.exit(f"error: {error}")
     compared = "\n".join(comparison(diagnoses))
@@ -55,7 +63,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add("folders", nargs="+", metavar="RUN", help="a run's folder, finished or not")
+    add("--names", nargs="+", help="what the runs are called (default: what tells them apart)")
     add("--output", help="the page (default: diagnosis.html in the first folder)")
+    add("--actions", help="an SVG file for the actions of all runs, row by row (default: none)")
     add("--episodes", type=int, default=3, help="of the measures' means (default: 3)")
     add("--seed", type=int, default=TEST_SEED, help=f"of every policy (default: {TEST_SEED})")
     add("--noise", type=float, help="on observations (default: the task's)")

@@ -6,6 +6,7 @@
 
 from torchrl_l2c2.experiment.diagnosis.measured import Diagnosis, TermShare, diagnose
 from torchrl_l2c2.experiment.diagnosis.page import write_page
+from torchrl_l2c2.experiment.diagnosis.pictures import draw_together
 from torchrl_l2c2.experiment.diagnosis.run import diagnose_run, value_function
 from torchrl_l2c2.experiment.diagnosis.words import (
     THRESHOLDS,
@@ -22,6 +23,7 @@ __all__ = [
     "comparison",
     "diagnose",
     "diagnose_run",
+    "draw_together",
     "findings",
     "value_function",
     "write_page",

@@ -26,6 +26,26 @@ def draw_actions(diagnoses: Sequence[Diagnosis]) -> list[bytes]:
     return [_draw(2, 3.6, _actions, one) for one in diagnoses]
 
 
+def draw_together(diagnoses: Sequence[Diagnosis]) -> bytes:
+    """The first episodes' actions, a row for every policy on the same axes; SVG."""
+    figure, axes = subplots(1, len(diagnoses), (2 * WIDTH, 0.5 + 1.6 * len(diagnoses)))
+    for axis in axes[1:]:
+        axis.sharex(axes[0])
+        axis.sharey(axes[0])
+    for axis, one in zip(axes, diagnoses, strict=True):
+        for place, number in enumerate(busiest(one)):
+            axis.plot(one.actions[:, number].numpy(), **_line(place, number))
+        total, variation = (one.measures[name] for name in ("return", "action_variation"))
+        axis.set_title(
+            f"{one.name}: return {total:.4g}, action variation {variation:.2g}", fontsize=10
+        )
+        axis.set_ylabel("action")
+        axis.grid(alpha=0.25)
+    axes[-1].set_xlabel("step")
+    _legend(axes[0], diagnoses[0])
+    return drawn(figure)
+
+
 def draw_spectra(diagnoses: Sequence[Diagnosis]) -> list[bytes]:
     """Amplitudes of the frequencies that the actions are made of, as shares of their range."""
     spectra = [
