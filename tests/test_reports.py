@@ -758,13 +758,46 @@ class TestReport:
 
 def test_the_fields_pages_are_those_of_their_records():
     """python -m torchrl_l2c2.experiment.reports --from results/field.csv"""
-    for name, tables in (("field", (field_table, choice_table)), ("field_gains", (choice_table,))):
+    pages = {"field": (field_table, choice_table), "field_gains": (choice_table,)}
+    for name, tables in {**pages, "sac_pendulum": pages["field"]}.items():
         records = read_records(ROOT / "results" / f"{name}.csv")
         page = (ROOT / "results" / f"{name}.md").read_text()
         assert all(table(records).markdown() in page for table in tables)
 
 
+# A row of the README's first table: whose records, of which length, policies and measure.
+HEADLINE = {
+    "SAC, Pendulum": ("sac_pendulum", "l2c2_mean", "30000 frames", "last_mean", "sm_asap"),
+    "PPO, LunarLander": ("field", "l2c2", "500000 frames", "last_mean", "sm_asap"),
+    "PPO, Pendulum": ("field", "l2c2", "500000 frames", "last_mean", "sm_asap"),
+    "PPO-RPE, Swingup": ("runs", "l2c2_mean", "300 episodes", "late_sampled", "action_variation"),
+}
+
+
 class TestReadme:
+    @pytest.mark.parametrize("label", HEADLINE)
+    def test_its_first_table_is_of_the_records(self, label):
+        """Means over all seeds of vanilla and of L2C2: the measure of roughness, and the return."""
+        name, method, length, figure, measure = HEADLINE[label]
+        task = label.split(", ")[1].lower()
+        cells = {}
+        for kind in ("none", method):
+            records = [
+                record
+                for record in read_records(ROOT / "results" / f"{name}.csv")
+                if (record.task, record.method, record.length) == (task, kind, length)
+            ]
+            seeds = number_range(sorted(record.seed for record in records))
+            cells[kind] = seeds, *(
+                statistics.fmean(record.figure(figure, quantity) for record in records)
+                for quantity in (measure, "return")
+            )
+        (seeds, rough, total), (others, smooth, kept) = cells.values()
+        assert seeds == others
+        row = f"{rough:.3f} | {smooth:.3f} | {smooth / rough - 1:+.0%} | {total:.0f} | {kept:.0f} |"
+        assert f"| {label} | {seeds} | " in (text := (ROOT / "README.md").read_text())
+        assert row in text
+
     def test_its_results_are_those_of_the_records(self):
         """python -m torchrl_l2c2.experiment.reports --from results/runs.csv --readme README.md"""
         recorded = read_records(ROOT / "results" / "runs.csv")
