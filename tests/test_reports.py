@@ -721,9 +721,11 @@ class TestReport:
         swingup = str(forty / "swingup")
         main([swingup, "--length", "20", "10", "--score"])
         scores = [line.split(" | ") for line in capsys.readouterr().out.splitlines()]
-        assert [row[1] for row in scores if row[0] == "| swingup"] == [
-            "task.episodes=10",
-            "task.episodes=20",
+        # Those that were trained for 20 have all of their figures.
+        assert [(row[1], row[4]) for row in scores if row[0] == "| swingup"] == [
+            ("task.episodes=10", "sampled actions"),
+            ("task.episodes=20", "mean actions"),
+            ("task.episodes=20", "sampled actions"),
         ]
         main([swingup, "--length", "10", "30", "--output", str(tmp_path)])
         printed = capsys.readouterr().out
@@ -731,6 +733,27 @@ class TestReport:
         assert "20 runs are not as long as a length that was asked for" in printed
         report = (tmp_path / "report.md").read_text()
         assert report.count("**Statistics") == 1 and "0.50 [0.50, 0.50]" in report
+
+    def test_a_run_of_a_length_stands_for_its_seed_before_one_that_was_cut_to_it(
+        self, tmp_path, capsys
+    ):
+        """Its last policy was tested, which no record without such tests takes the place of."""
+        for episodes in (20, 10):
+            config = make_config(episodes=episodes)
+            make_run(tmp_path / str(episodes), config, float(episodes), 0.1)
+        short, long, file = (str(tmp_path / name) for name in ("10", "20", "runs.csv"))
+        for folders in ([short, long], [short], [long]):
+            main([*folders, "--length", "10", "--csv", file])
+            (record,) = read_records(file)
+            assert (record.length, record.late_sampled_return) == ("10 episodes", 9.0)
+            assert (record.last_mean_return, record.last_sampled_return) == (30.0, 40.0)
+        printed = capsys.readouterr().out
+        assert printed.count("1 runs, cut to a length, have the settings, seed and length") == 1
+        main([long, "--length", "10", "--csv", str(tmp_path / "cut.csv")])
+        (cut,) = read_records(tmp_path / "cut.csv")
+        assert math.isnan(cut.last_mean_return)
+        (whole,) = merge([cut], [record])
+        assert whole.last_mean_return == 30.0
 
     def test_what_cannot_be_done_is_one_line(self, tmp_path, capsys):
         """An empty folder, no folder, a file that is not there."""
