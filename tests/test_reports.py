@@ -806,13 +806,28 @@ class TestReadme:
         told = [line for line in readme.read_text().splitlines() if line.startswith("| swingup")]
         assert [line.split(" | ")[1:3] for line in told] == [["vanilla", "0"]]
         assert "| reacher | L2C2 | 0-4 |" in readme.read_text()
-        (tmp_path / "docs" / "results.svg").unlink()
+
+    def test_results_are_not_lost_for_those_of_other_tasks(self, records, tmp_path):
+        """Nothing is written then; what a file of records had before counts too."""
+        (tmp_path / "docs").mkdir()
+        readme, file, given = tmp_path / "README.md", tmp_path / "runs.csv", tmp_path / "given.csv"
+        before = f"{START}\nold\n{END}\n"
+        readme.write_text(before)
         for none in ([], [replace(records[0], task="pendulum", algorithm="sac")]):
-            write_records(file, none)
-            main(["--from", str(file), "--readme", str(readme)])
-            empty = f"before\n{START}\nNo runs are recorded yet.\n{END}\nafter\n"
-            assert readme.read_text() == empty
-            assert not (tmp_path / "docs" / "results.svg").exists()
+            write_records(given, none)
+            told = f"error: none of {len(none)} records is of the paper.s .* by --from or --csv"
+            with pytest.raises(SystemExit, match=told):
+                main(["--from", str(given), "--readme", str(readme)])
+        make_run(tmp_path / "run", make_config(task="pendulum", algorithm=SACConfig()), 1.0, 0.1)
+        command = [str(tmp_path / "run"), "--csv", str(file), "--readme", str(readme)]
+        with pytest.raises(SystemExit, match="error: none of 1 records"):
+            main(command)
+        assert readme.read_text() == before and not file.exists()
+        assert not (tmp_path / "docs" / "results.svg").exists()
+        write_records(file, records)
+        main(command)
+        assert "| swingup | L2C2 | 0-4 |" in readme.read_text()
+        assert len(read_records(file)) == len(records) + 1
 
     def test_a_text_without_the_marks_is_refused(self, records):
         """Rather than changed somewhere."""

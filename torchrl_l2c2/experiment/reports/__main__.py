@@ -80,19 +80,25 @@ def _parser() -> argparse.ArgumentParser:
         help="what the results had been after so many episodes of training (frames, where runs are "
         "as long as so many frames); of a longer run by its training's own episodes",
     )
-    add("--readme", metavar="FILE", help="make the results between this file's marks anew")
+    add(
+        "--readme",
+        metavar="FILE",
+        help="make the results between this file's marks anew, of all records of --csv or --from",
+    )
     return parser
 
 
 def _report(chosen: argparse.Namespace) -> None:
     records, runs, notes = _read(chosen)
+    kept = merge(read_records(chosen.csv), records) if chosen.csv else records
     written = []
-    if chosen.csv:
-        write_records(chosen.csv, merge(read_records(chosen.csv), records))
-        written.append(f"records: {chosen.csv}")
+    # Before the records, as it may be refused.
     if chosen.readme:
-        fill_readme(chosen.readme, records)
+        fill_readme(chosen.readme, kept)
         written.append(f"results: {chosen.readme}")
+    if chosen.csv:
+        write_records(chosen.csv, kept)
+        written.append(f"records: {chosen.csv}")
     alone = not (chosen.records or chosen.csv or chosen.score or chosen.readme)
     if chosen.output or alone:
         folder = Path(chosen.output or Path(chosen.folders[0]) / "report")
