@@ -535,6 +535,21 @@ class TestStatistics:
         expected = np.mean([mannwhitneyu(*pair).statistic / 35 for pair in pairs])
         assert probability_of_improvement(ours, theirs).item() == pytest.approx(expected)
 
+    def test_a_task_counts_with_all_of_its_runs(self):
+        """However many others have: 1, 3 over 2 win a half, 1 over 0 wins; 3/4 is their mean."""
+        ours, theirs = np.array([[1.0, 1.0], [3.0, math.nan]]), np.array([[2.0, 0.0]])
+        assert probability_of_improvement(ours, theirs).item() == 0.75
+        # Drawn anew, the first task has 0, 1/2 or 1 of them, the second always its one run.
+        for confidence, ends in ((0.4, (0.75, 0.75)), (0.95, (0.5, 1.0))):
+            generator = np.random.default_rng(0)
+            interval = bootstrap_interval(
+                probability_of_improvement,
+                *(ours, theirs),
+                generator=generator,
+                confidence=confidence,
+            )
+            assert interval == ends
+
     def test_the_bootstrap_of_two_runs_by_hand(self):
         """Means of 0 and 1 drawn anew: 0, 1/2 and 1, with probabilities 1/4, 1/2 and 1/4."""
 
@@ -580,6 +595,29 @@ class TestStatistics:
         assert cells(tables[1], "swingup", "ppo_rpe", "vanilla", "5")[1::2] == ["", ""]
         across = cells(tables[1], "2 tasks", "ppo_rpe", "CAPS", "5")
         assert across == ["", "1.00 [1.00, 1.00]", "", "1.00 [1.00, 1.00]"]
+
+    def test_runs_that_have_the_figure_are_counted_by_task(self, records):
+        """No seed needs to be on every task; of a run without the figure there is nothing."""
+        caps = [r for r in records if r.method == "caps"]
+        swingup, reacher = ([r for r in caps if r.task == t] for t in ("swingup", "reacher"))
+        # Four runs that return less than all of vanilla's, and one that was not tested.
+        lost = [replace(r, last_mean_return=-9.0) for r in swingup[1:]]
+        untested = replace(swingup[0], last_mean_return=math.nan)
+        others = [replace(r, seed=100 + r.seed) for r in reacher[:3]]
+        vanilla = [r for r in records if r.method == "none"]
+        groups = group_records([untested, *lost, *others, *vanilla])
+        tables = {table.title: table for table in statistics_tables(groups)}
+        table = tables["Statistics: last policy, mean actions"]
+        assert cells(table, "swingup", "ppo_rpe", "CAPS")[0] == "4"
+        # None of 20 pairs and all of 15, of seeds that the tasks do not share.
+        across = cells(table, "2 tasks", "ppo_rpe", "CAPS")
+        assert across[:3] == ["3, 4", "", "0.50 [0.50, 0.50]"]
+        without = [untested, *others, *vanilla]
+        (table,) = (
+            t for t in statistics_tables(group_records(without)) if "last policy, mean" in t.title
+        )
+        assert cells(table, "swingup", "ppo_rpe", "CAPS")[:3] == ["0", "-", ""]
+        assert not [row for row in table.rows if row[0] == "2 tasks"]
 
 
 class TestScore:
