@@ -33,7 +33,7 @@ from torchrl_l2c2.experiment.reports.choice import choice_table
 from torchrl_l2c2.experiment.reports.comparison import statistics_tables
 from torchrl_l2c2.experiment.reports.differences import differences, fingerprint
 from torchrl_l2c2.experiment.reports.field import field_table
-from torchrl_l2c2.experiment.reports.groups import baseline_of, group_records
+from torchrl_l2c2.experiment.reports.groups import baseline_of, group_records, over_tasks
 from torchrl_l2c2.experiment.reports.measures import measures_table
 from torchrl_l2c2.experiment.reports.paper_table import paper_table
 from torchrl_l2c2.experiment.reports.readme import END, START, fill
@@ -251,6 +251,10 @@ class TestChoiceTable:
             }.items()
         ]
         assert "-25% lunarlander" in sweep_summary([tmp_path])
+        records = [run.record for run in read_runs(tmp_path)]
+        others = [replace(r, length="9 episodes") for r in records if r.method == "none"]
+        # Vanilla of another length on one task takes no row apart.
+        assert choice_table([*records, *(r for r in others if r.task == "pendulum")]) == table
 
     def test_without_vanilla_there_is_nothing_to_compare(self, tmp_path):
         """Nor on the paper's tasks."""
@@ -618,6 +622,50 @@ class TestStatistics:
         )
         assert cells(table, "swingup", "ppo_rpe", "CAPS")[:3] == ["0", "-", ""]
         assert not [row for row in table.rows if row[0] == "2 tasks"]
+
+    def test_a_row_over_tasks_does_not_depend_on_what_else_a_task_has(self, records):
+        """Other lengths of one task, of vanilla or of the method, add rows and take none."""
+
+        def across(found):
+            table = statistics_tables(group_records(found))[0]
+            return [list(row[1:]) for row in table.rows if row[0].endswith(" tasks")]
+
+        before = across(records)
+        assert [row[1] for row in before] == ["CAPS", "L2C2", "L2C2, beta=0.5"]
+        swingup = [r for r in records if r.task == "swingup"]
+        longer = {
+            method: [replace(r, length="30 episodes") for r in swingup if r.method == method]
+            for method in ("none", "caps")
+        }
+        assert across([*records, *longer["none"]]) == before
+        (caps, *others), told = before, "CAPS, 20 episodes"
+        assert across([*records, *longer["none"], *longer["caps"]]) == [
+            [caps[0], told, *caps[2:]],
+            *others,
+        ]
+        # Other defaults, when they were run: which are those of the other task is not known.
+        older = [replace(r, settings="older") for r in swingup if r.method == "caps"]
+        assert across([*records, *older]) == others
+
+    def test_other_settings_of_a_method_are_another_row(self, records):
+        """Also where every task has but one of them, and so no name tells them."""
+        vanilla, l2c2 = ([r for r in records if r.method == name] for name in ("none", "l2c2"))
+        apart = [
+            *(
+                r
+                for r in l2c2
+                if r.task == "swingup" and "regularizer.beta" not in r.other_settings
+            ),
+            *(r for r in l2c2 if r.task == "reacher" and "regularizer.beta" in r.other_settings),
+        ]
+        groups = group_records([*vanilla, *apart])
+        assert [group.name for group in groups] == ["vanilla", "L2C2"] * 2
+        rows = over_tasks(group for group in groups if group.first.method != "none")
+        assert [(name, [g.first.task for g in row]) for _, name, row in rows] == [
+            ("L2C2", ["swingup"]),
+            ("L2C2, beta=0.5", ["reacher"]),
+        ]
+        assert all(row[0] != "2 tasks" for row in statistics_tables(groups)[0].rows)
 
 
 class TestScore:

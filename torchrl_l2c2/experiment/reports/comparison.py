@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_l2c2.experiment.reports.groups import Group, baseline_of
+from torchrl_l2c2.experiment.reports.groups import Group, baseline_of, over_tasks
 from torchrl_l2c2.experiment.reports.records import FIGURES, QUANTITIES
 from torchrl_l2c2.experiment.reports.statistics import (
     Interval,
@@ -107,21 +107,20 @@ def _statistics_row(figure: str, group: Group, baseline: Group | None) -> list[s
 
 def _across_tasks(figure: str, groups: Sequence[Group]) -> list[list[str]]:
     """Rows over all tasks, of methods that several have: probabilities need no common scale."""
+    vanilla = {
+        group: baseline
+        for group in groups
+        if (baseline := baseline_of(group, groups)) is not None
+        and all(len(side.scores(figure, "return")) for side in (group, baseline))
+    }
     rows = []
-    for algorithm, name in dict.fromkeys((g.first.algorithm, g.name) for g in groups):
-        pairs = [
-            (group, baseline)
-            for group in groups
-            if (group.first.algorithm, group.name) == (algorithm, name)
-            and (baseline := baseline_of(group, groups)) is not None
-            and all(len(side.scores(figure, "return")) for side in (group, baseline))
-        ]
-        if len(pairs) < 2:
+    for algorithm, name, ours in over_tasks(vanilla):
+        if len(ours) < 2:
             continue
-        ours, theirs = zip(*pairs, strict=True)
+        theirs = [vanilla[group] for group in ours]
         better = [probability(improvement(ours, theirs, figure, q)) for q in QUANTITIES]
         runs = number_range(sorted({len(group.scores(figure, "return")) for group in ours}))
-        rows.append([f"{len(pairs)} tasks", algorithm, name, runs, "", better[0], "", better[1]])
+        rows.append([f"{len(ours)} tasks", algorithm, name, runs, "", better[0], "", better[1]])
     return rows
 
 
