@@ -1,5 +1,6 @@
 """The Pareto front of return and smoothness, by hand and by Optuna."""
 
+import csv
 import re
 
 import numpy as np
@@ -8,7 +9,12 @@ import pytest
 from tests.test_reports import make_config, make_run
 from torchrl_l2c2.experiment import L2C2Config
 from torchrl_l2c2.experiment.reports import read_runs, write_report
-from torchrl_l2c2.experiment.reports.front import front_table, pareto_front, searched
+from torchrl_l2c2.experiment.reports.front import (
+    front_figure,
+    front_table,
+    pareto_front,
+    searched,
+)
 from torchrl_l2c2.experiment.reports.groups import group_records
 
 # beta -> return and action variation; 1 and 3 are alike, 5 is beaten in one by 4.
@@ -30,6 +36,16 @@ def groups(folder, settings):
             shift = 4.0 if seed else -4.0  # the mean over seeds is what counts
             make_run(folder / f"{beta}_{seed}", config, total + shift, variation)
     return group_records(run.record for run in read_runs(folder))
+
+
+def forget(folder, *columns):
+    """Runs as if these had not been measured: ``late_share=0`` measures no late tests."""
+    for path in folder.rglob("metrics.csv"):
+        lines = [row | dict.fromkeys(columns, "nan") for row in csv.DictReader(path.open())]
+        with open(path, "w", newline="") as file:
+            writer = csv.DictWriter(file, list(lines[0]))
+            writer.writeheader()
+            writer.writerows(lines)
 
 
 def test_the_front_is_what_nothing_beats(tmp_path):
@@ -68,3 +84,36 @@ def test_the_report_has_the_front_and_its_picture(tmp_path):
     assert "Pareto front" in page.read_text()
     picture = (page.parent / "front_1_swingup.svg").read_text()
     assert set("1234") <= set(re.findall(r">(\d)</text>", picture))
+
+
+def test_without_late_tests_the_front_is_of_the_last_policies(tmp_path):
+    """``late_share=0``, as presets have it; where neither was tested, there is none."""
+    groups(tmp_path / "runs", SETTINGS)
+    forget(tmp_path / "runs", "test_return", "test_action_variation")
+    records = [run.record for run in read_runs(tmp_path / "runs")]
+    found = group_records(records)
+    assert front_figure(found) == "last_mean"
+    page = write_report(tmp_path / "report", records)
+    assert "Pareto front, last policy, mean actions" in page.read_text()
+    # make_run: the last policy's is 20 more than the total.
+    assert "| 1 | L2C2, beta=6 | 0, 1 | 70.00 (5.66) | 0.040 (0.000) |" in (
+        page.with_suffix(".md").read_text()
+    )
+    assert page.with_name("front_1_swingup.svg").exists()
+    cut = [run.until(19).record for run in read_runs(tmp_path / "runs")]
+    assert searched(group_records(cut)) == []
+    page = write_report(tmp_path / "cut", cut)
+    assert not list(page.parent.glob("front_*")) and "Pareto" not in page.read_text()
+
+
+def test_a_report_that_cannot_be_drawn_leaves_none(tmp_path, monkeypatch):
+    """Nor a half of one: a picture without its page would pass for all there is."""
+    many = groups(tmp_path / "runs", SETTINGS)
+
+    def fail(*_):
+        raise ValueError("no picture")
+
+    monkeypatch.setattr("torchrl_l2c2.experiment.reports.page.draw_front", fail)
+    with pytest.raises(ValueError, match="no picture"):
+        write_report(tmp_path / "report", [record for group in many for record in group.records])
+    assert not (tmp_path / "report").exists()

@@ -33,7 +33,7 @@ from torchrl_l2c2.experiment.reports.choice import choice_table
 from torchrl_l2c2.experiment.reports.comparison import statistics_tables
 from torchrl_l2c2.experiment.reports.differences import differences, fingerprint
 from torchrl_l2c2.experiment.reports.field import field_table
-from torchrl_l2c2.experiment.reports.groups import baseline_of, group_records
+from torchrl_l2c2.experiment.reports.groups import baseline_of, group_records, over_tasks
 from torchrl_l2c2.experiment.reports.measures import measures_table
 from torchrl_l2c2.experiment.reports.paper_table import paper_table
 from torchrl_l2c2.experiment.reports.readme import END, START, fill
@@ -258,6 +258,10 @@ class TestChoiceTable:
             }.items()
         ]
         assert "-25% lunarlander" in sweep_summary([tmp_path])
+        records = [run.record for run in read_runs(tmp_path)]
+        others = [replace(r, length="9 episodes") for r in records if r.method == "none"]
+        # Vanilla of another length on one task takes no row apart.
+        assert choice_table([*records, *(r for r in others if r.task == "pendulum")]) == table
 
     def test_without_vanilla_there_is_nothing_to_compare(self, tmp_path):
         """Nor on the paper's tasks."""
@@ -542,6 +546,21 @@ class TestStatistics:
         expected = np.mean([mannwhitneyu(*pair).statistic / 35 for pair in pairs])
         assert probability_of_improvement(ours, theirs).item() == pytest.approx(expected)
 
+    def test_a_task_counts_with_all_of_its_runs(self):
+        """However many others have: 1, 3 over 2 win a half, 1 over 0 wins; 3/4 is their mean."""
+        ours, theirs = np.array([[1.0, 1.0], [3.0, math.nan]]), np.array([[2.0, 0.0]])
+        assert probability_of_improvement(ours, theirs).item() == 0.75
+        # Drawn anew, the first task has 0, 1/2 or 1 of them, the second always its one run.
+        for confidence, ends in ((0.4, (0.75, 0.75)), (0.95, (0.5, 1.0))):
+            generator = np.random.default_rng(0)
+            interval = bootstrap_interval(
+                probability_of_improvement,
+                *(ours, theirs),
+                generator=generator,
+                confidence=confidence,
+            )
+            assert interval == ends
+
     def test_the_bootstrap_of_two_runs_by_hand(self):
         """Means of 0 and 1 drawn anew: 0, 1/2 and 1, with probabilities 1/4, 1/2 and 1/4."""
 
@@ -587,6 +606,73 @@ class TestStatistics:
         assert cells(tables[1], "swingup", "ppo_rpe", "vanilla", "5")[1::2] == ["", ""]
         across = cells(tables[1], "2 tasks", "ppo_rpe", "CAPS", "5")
         assert across == ["", "1.00 [1.00, 1.00]", "", "1.00 [1.00, 1.00]"]
+
+    def test_runs_that_have_the_figure_are_counted_by_task(self, records):
+        """No seed needs to be on every task; of a run without the figure there is nothing."""
+        caps = [r for r in records if r.method == "caps"]
+        swingup, reacher = ([r for r in caps if r.task == t] for t in ("swingup", "reacher"))
+        # Four runs that return less than all of vanilla's, and one that was not tested.
+        lost = [replace(r, last_mean_return=-9.0) for r in swingup[1:]]
+        untested = replace(swingup[0], last_mean_return=math.nan)
+        others = [replace(r, seed=100 + r.seed) for r in reacher[:3]]
+        vanilla = [r for r in records if r.method == "none"]
+        groups = group_records([untested, *lost, *others, *vanilla])
+        tables = {table.title: table for table in statistics_tables(groups)}
+        table = tables["Statistics: last policy, mean actions"]
+        assert cells(table, "swingup", "ppo_rpe", "CAPS")[0] == "4"
+        # None of 20 pairs and all of 15, of seeds that the tasks do not share.
+        across = cells(table, "2 tasks", "ppo_rpe", "CAPS")
+        assert across[:3] == ["3, 4", "", "0.50 [0.50, 0.50]"]
+        without = [untested, *others, *vanilla]
+        (table,) = (
+            t for t in statistics_tables(group_records(without)) if "last policy, mean" in t.title
+        )
+        assert cells(table, "swingup", "ppo_rpe", "CAPS")[:3] == ["0", "-", ""]
+        assert not [row for row in table.rows if row[0] == "2 tasks"]
+
+    def test_a_row_over_tasks_does_not_depend_on_what_else_a_task_has(self, records):
+        """Other lengths of one task, of vanilla or of the method, add rows and take none."""
+
+        def across(found):
+            table = statistics_tables(group_records(found))[0]
+            return [list(row[1:]) for row in table.rows if row[0].endswith(" tasks")]
+
+        before = across(records)
+        assert [row[1] for row in before] == ["CAPS", "L2C2", "L2C2, beta=0.5"]
+        swingup = [r for r in records if r.task == "swingup"]
+        longer = {
+            method: [replace(r, length="30 episodes") for r in swingup if r.method == method]
+            for method in ("none", "caps")
+        }
+        assert across([*records, *longer["none"]]) == before
+        (caps, *others), told = before, "CAPS, 20 episodes"
+        assert across([*records, *longer["none"], *longer["caps"]]) == [
+            [caps[0], told, *caps[2:]],
+            *others,
+        ]
+        # Other defaults, when they were run: which are those of the other task is not known.
+        older = [replace(r, settings="older") for r in swingup if r.method == "caps"]
+        assert across([*records, *older]) == others
+
+    def test_other_settings_of_a_method_are_another_row(self, records):
+        """Also where every task has but one of them, and so no name tells them."""
+        vanilla, l2c2 = ([r for r in records if r.method == name] for name in ("none", "l2c2"))
+        apart = [
+            *(
+                r
+                for r in l2c2
+                if r.task == "swingup" and "regularizer.beta" not in r.other_settings
+            ),
+            *(r for r in l2c2 if r.task == "reacher" and "regularizer.beta" in r.other_settings),
+        ]
+        groups = group_records([*vanilla, *apart])
+        assert [group.name for group in groups] == ["vanilla", "L2C2"] * 2
+        rows = over_tasks(group for group in groups if group.first.method != "none")
+        assert [(name, [g.first.task for g in row]) for _, name, row in rows] == [
+            ("L2C2", ["swingup"]),
+            ("L2C2, beta=0.5", ["reacher"]),
+        ]
+        assert all(row[0] != "2 tasks" for row in statistics_tables(groups)[0].rows)
 
 
 class TestScore:
@@ -728,9 +814,11 @@ class TestReport:
         swingup = str(forty / "swingup")
         main([swingup, "--length", "20", "10", "--score"])
         scores = [line.split(" | ") for line in capsys.readouterr().out.splitlines()]
-        assert [row[1] for row in scores if row[0] == "| swingup"] == [
-            "task.episodes=10",
-            "task.episodes=20",
+        # Those that were trained for 20 have all of their figures.
+        assert [(row[1], row[4]) for row in scores if row[0] == "| swingup"] == [
+            ("task.episodes=10", "sampled actions"),
+            ("task.episodes=20", "mean actions"),
+            ("task.episodes=20", "sampled actions"),
         ]
         main([swingup, "--length", "10", "30", "--output", str(tmp_path)])
         printed = capsys.readouterr().out
@@ -738,6 +826,27 @@ class TestReport:
         assert "20 runs are not as long as a length that was asked for" in printed
         report = (tmp_path / "report.md").read_text()
         assert report.count("**Statistics") == 1 and "0.50 [0.50, 0.50]" in report
+
+    def test_a_run_of_a_length_stands_for_its_seed_before_one_that_was_cut_to_it(
+        self, tmp_path, capsys
+    ):
+        """Its last policy was tested, which no record without such tests takes the place of."""
+        for episodes in (20, 10):
+            config = make_config(episodes=episodes)
+            make_run(tmp_path / str(episodes), config, float(episodes), 0.1)
+        short, long, file = (str(tmp_path / name) for name in ("10", "20", "runs.csv"))
+        for folders in ([short, long], [short], [long]):
+            main([*folders, "--length", "10", "--csv", file])
+            (record,) = read_records(file)
+            assert (record.length, record.late_sampled_return) == ("10 episodes", 9.0)
+            assert (record.last_mean_return, record.last_sampled_return) == (30.0, 40.0)
+        printed = capsys.readouterr().out
+        assert printed.count("1 runs, cut to a length, have the settings, seed and length") == 1
+        main([long, "--length", "10", "--csv", str(tmp_path / "cut.csv")])
+        (cut,) = read_records(tmp_path / "cut.csv")
+        assert math.isnan(cut.last_mean_return)
+        (whole,) = merge([cut], [record])
+        assert whole.last_mean_return == 30.0
 
     def test_what_cannot_be_done_is_one_line(self, tmp_path, capsys):
         """An empty folder, no folder, a file that is not there."""
@@ -823,13 +932,28 @@ class TestReadme:
         told = [line for line in readme.read_text().splitlines() if line.startswith("| swingup")]
         assert [line.split(" | ")[1:3] for line in told] == [["vanilla", "0"]]
         assert "| reacher | L2C2 | 0-4 |" in readme.read_text()
-        (tmp_path / "docs" / "results.svg").unlink()
+
+    def test_results_are_not_lost_for_those_of_other_tasks(self, records, tmp_path):
+        """Nothing is written then; what a file of records had before counts too."""
+        (tmp_path / "docs").mkdir()
+        readme, file, given = tmp_path / "README.md", tmp_path / "runs.csv", tmp_path / "given.csv"
+        before = f"{START}\nold\n{END}\n"
+        readme.write_text(before)
         for none in ([], [replace(records[0], task="pendulum", algorithm="sac")]):
-            write_records(file, none)
-            main(["--from", str(file), "--readme", str(readme)])
-            empty = f"before\n{START}\nNo runs are recorded yet.\n{END}\nafter\n"
-            assert readme.read_text() == empty
-            assert not (tmp_path / "docs" / "results.svg").exists()
+            write_records(given, none)
+            told = f"error: none of {len(none)} records is of the paper.s .* by --from or --csv"
+            with pytest.raises(SystemExit, match=told):
+                main(["--from", str(given), "--readme", str(readme)])
+        make_run(tmp_path / "run", make_config(task="pendulum", algorithm=SACConfig()), 1.0, 0.1)
+        command = [str(tmp_path / "run"), "--csv", str(file), "--readme", str(readme)]
+        with pytest.raises(SystemExit, match="error: none of 1 records"):
+            main(command)
+        assert readme.read_text() == before and not file.exists()
+        assert not (tmp_path / "docs" / "results.svg").exists()
+        write_records(file, records)
+        main(command)
+        assert "| swingup | L2C2 | 0-4 |" in readme.read_text()
+        assert len(read_records(file)) == len(records) + 1
 
     def test_a_text_without_the_marks_is_refused(self, records):
         """Rather than changed somewhere."""

@@ -12,6 +12,8 @@ import pytest
 
 optuna = pytest.importorskip("optuna")
 
+from tests.test_front import forget  # noqa: E402
+from tests.test_reports import make_config, make_run  # noqa: E402
 from torchrl_l2c2.experiment.search import Search, main, read_space  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
@@ -61,7 +63,12 @@ def test_a_search_goes_on_with_the_trial_that_was_lost(tmp_path):
 
 @pytest.mark.parametrize(
     ("settings", "told"),
-    [(("seed=0,1",), "nothing is searched"), ((*GAINS, "task=ant"), "choose another folder")],
+    [
+        (("seed=0,1",), "nothing is searched"),
+        ((*GAINS, "task=ant"), "choose another folder"),
+        # Without these a run leaves no results, whatever was tested during its training.
+        ((*GAINS, "late_share=0", "test_episodes=0"), "choose test_episodes of at least 1, got 0"),
+    ],
 )
 def test_what_cannot_be_searched_is_refused(tmp_path, settings, told):
     """And another search's folder is left as it is."""
@@ -70,6 +77,25 @@ def test_what_cannot_be_searched_is_refused(tmp_path, settings, told):
         Search(tmp_path, settings)
     with pytest.raises(SystemExit, match=f"error: .*{told}"):
         main([*settings, "--output", str(tmp_path)])
+
+
+def test_a_trial_without_late_tests_is_scored_by_its_last_policies(tmp_path):
+    """``late_share=0``, as presets have it; the late ones' where there are any."""
+    search = Search(tmp_path, GAINS)
+    begun = [search.study.ask(search.space).number for _ in range(3)]
+    for number in begun[:2]:
+        for seed in (0, 1):
+            place = tmp_path / f"trial_{number:04d}" / str(seed)
+            make_run(place, make_config(regularizer="l2c2", seed=seed), 10.0 + 4 * seed, 0.05)
+    forget(tmp_path / "trial_0001", "test_return", "test_action_variation")
+    # make_run: late policies' are 12, last policies' 20 more than the total, a mean of 12.
+    assert search.tell(0) == pytest.approx({"return": 24.0, "action_variation": 0.062})
+    assert search.tell(1) == pytest.approx({"return": 32.0, "action_variation": 0.07})
+    assert [trial.values for trial in search.study.trials[:2]] == [
+        pytest.approx(values) for values in ([24.0, 0.062], [32.0, 0.07])
+    ]
+    with pytest.raises(RuntimeError, match=r"trial 3 has no results; .* test_episodes of"):
+        search.tell(2)
 
 
 def start(folder):

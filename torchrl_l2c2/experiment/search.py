@@ -26,7 +26,7 @@ from torchrl_l2c2.experiment.folder import make_folder
 from torchrl_l2c2.experiment.lock import FolderInUseError, lock_folder
 from torchrl_l2c2.experiment.reports import find_runs, write_report
 from torchrl_l2c2.experiment.reports.comparison import SIGNS
-from torchrl_l2c2.experiment.reports.front import front_table
+from torchrl_l2c2.experiment.reports.front import front_figure, front_table
 from torchrl_l2c2.experiment.reports.groups import group_records
 from torchrl_l2c2.experiment.sweep import start_guard
 
@@ -51,8 +51,8 @@ example:
   python -m torchrl_l2c2.experiment.search --trials 30 --output outputs/search \
     seed=0,1 'regularizer.lambda_max=tag(log,interval(.1,10))' 'regularizer.beta=interval(0,1)'
 """
-FIGURE = "late_mean"
 DIGITS = 4
+UNTESTED = "a trial is scored by tests of its policies: choose test_episodes of at least 1"
 MARK = "TORCHRL_L2C2_SEARCH"  # of the environment, by which the processes of a search are known
 
 
@@ -68,13 +68,15 @@ class Search:
 
     Raises:
         ImportError: Optuna is not installed.
-        ValueError: nothing is searched, or the folder is of another search.
+        ValueError: nothing is searched, nothing is tested, or the folder is of another search.
     """
 
     def __init__(self, folder: Path, overrides: Sequence[str], *, seed: int = 0) -> None:
         self.space, self.fixed = read_space(overrides)
         if not self.space:
             raise ValueError("nothing is searched; give a setting interval(a,b) or choice(a,b).")
+        if "test_episodes=0" in self.fixed:
+            raise ValueError(f"{UNTESTED}, got 0.")
         self.folder, self._seed = make_folder(folder), seed
         self.study = self._open()
         settings = [each for each in self.fixed if not each.startswith("hydra")]
@@ -115,9 +117,16 @@ class Search:
         return [*main, *self.fixed, *found, f"outputs={self._of(number)}"]
 
     def tell(self, number: int) -> dict[str, float]:
-        """Gives Optuna what a trial's runs came to, and returns it: means over them."""
-        runs = find_runs([self._of(number)]).runs
-        scores = {q: [run.record.figure(FIGURE, q) for run in runs] for q in SIGNS}
+        """Gives Optuna what a trial's runs came to, and returns it: means over them.
+
+        Raises:
+            RuntimeError: its runs left no results.
+        """
+        records = [run.record for run in find_runs([self._of(number)]).runs]
+        if not records:
+            raise RuntimeError(f"trial {number + 1} has no results; {UNTESTED}.")
+        figure = front_figure(group_records(records))
+        scores = {q: [record.figure(figure, q) for record in records] for q in SIGNS}
         values = {quantity: statistics.fmean(each) for quantity, each in scores.items()}
         self.study.tell(number, list(values.values()), skip_if_finished=True)
         return values
@@ -253,7 +262,9 @@ def _report(folder: Path) -> None:
     if not records:
         raise RuntimeError(f"no trial has finished; see train.log below {str(folder)!r}.")
     page = write_report(folder / "report", records, found.runs, found.notes)
-    print(front_table(group_records(records), FIGURE).markdown(), f"report: {page}", sep="\n\n")
+    groups = group_records(records)
+    front = front_table(groups, front_figure(groups))
+    print(front.markdown(), f"report: {page}", sep="\n\n")
 
 
 if __name__ == "__main__":

@@ -78,21 +78,27 @@ def _parser() -> argparse.ArgumentParser:
         type=int,
         metavar="N",
         help="what the results had been after so many episodes of training (frames, where runs are "
-        "as long as so many frames), by training's own episodes",
+        "as long as so many frames); of a longer run by its training's own episodes",
     )
-    add("--readme", metavar="FILE", help="make the results between this file's marks anew")
+    add(
+        "--readme",
+        metavar="FILE",
+        help="make the results between this file's marks anew, of all records of --csv or --from",
+    )
     return parser
 
 
 def _report(chosen: argparse.Namespace) -> None:
     records, runs, notes = _read(chosen)
+    kept = merge(read_records(chosen.csv), records) if chosen.csv else records
     written = []
-    if chosen.csv:
-        write_records(chosen.csv, merge(read_records(chosen.csv), records))
-        written.append(f"records: {chosen.csv}")
+    # Before the records, as it may be refused.
     if chosen.readme:
-        fill_readme(chosen.readme, records)
+        fill_readme(chosen.readme, kept)
         written.append(f"results: {chosen.readme}")
+    if chosen.csv:
+        write_records(chosen.csv, kept)
+        written.append(f"records: {chosen.csv}")
     alone = not (chosen.records or chosen.csv or chosen.score or chosen.readme)
     if chosen.output or alone:
         folder = Path(chosen.output or Path(chosen.folders[0]) / "report")
@@ -125,13 +131,21 @@ def _shortened(
     found: Found, lengths: Sequence[int]
 ) -> tuple[Sequence[Record], Sequence[FinishedRun], Sequence[str]]:
     cut = [run.until(length) for length in sorted(set(lengths)) for run in found.runs]
-    runs = [run for run in cut if run is not None]
-    notes = list(found.notes)
-    if len(runs) < len(cut):
-        notes.append(f"{len(cut) - len(runs)} runs are not as long as a length that was asked for")
-    if not runs:
+    long = [run for run in cut if run is not None]
+    if not long:
         raise ValueError(f"no run is as long as {min(lengths)} episodes, or frames; ask for less.")
-    return [run.record for run in runs], runs, notes
+    runs: dict[tuple[str | int, ...], FinishedRun] = {}
+    # One that ended just then was tested, and comes before a longer one with the same settings.
+    for run in sorted(long, key=lambda run: not run.record.is_tested):
+        runs.setdefault(run.record.identity, run)
+    notes = list(found.notes)
+    if len(long) < len(cut):
+        notes.append(f"{len(cut) - len(long)} runs are not as long as a length that was asked for")
+    if len(runs) < len(long):
+        what = "have the settings, seed and length of another, left out"
+        notes.append(f"{len(long) - len(runs)} runs, cut to a length, {what}")
+    kept = sorted(runs.values(), key=lambda run: run.record.place)
+    return [run.record for run in kept], kept, notes
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from torchrl_l2c2.experiment.reports.comparison import improvement, probability
 from torchrl_l2c2.experiment.reports.field import BETTER, field_groups
-from torchrl_l2c2.experiment.reports.groups import Group, baseline_of
+from torchrl_l2c2.experiment.reports.groups import Group, baseline_of, over_tasks
 from torchrl_l2c2.experiment.reports.records import Record
 from torchrl_l2c2.experiment.reports.tables import Table, number_range
 
@@ -47,22 +46,22 @@ def choice_table(records: Sequence[Record]) -> Table | None:
     Returns:
         Table: ``None`` where nothing is to be compared.
     """
-    settings: dict[tuple[str, ...], list[Beside]] = defaultdict(list)
     groups = field_groups(records)
-    for group in groups:
-        vanilla = baseline_of(group, groups)
-        beside = None if vanilla is None else _beside(group, vanilla)
-        if beside is not None:
-            settings[group.first.algorithm, group.name].append(beside)
-    if not settings:
+    compared = {
+        group: beside
+        for group in groups
+        if (vanilla := baseline_of(group, groups)) is not None
+        and (beside := _beside(group, vanilla)) is not None
+    }
+    if not compared:
         return None
-    rows = [
-        [*setting, *_cells(tasks)]
-        # What ran on most tasks comes first: other means are of other tasks.
-        for setting, tasks in sorted(
-            settings.items(), key=lambda item: (item[0][0], -len(item[1]), _sm(item[1]))
-        )
+    settings = [
+        (algorithm, name, [compared[group] for group in row])
+        for algorithm, name, row in over_tasks(compared)
     ]
+    # What ran on most tasks comes first: other means are of other tasks.
+    settings.sort(key=lambda setting: (setting[0], -len(setting[2]), _sm(setting[2])))
+    rows = [[algorithm, name, *_cells(tasks)] for algorithm, name, tasks in settings]
     columns = ["algorithm", "method", "tasks", "seeds"]
     columns += [f"{what}{where}" for what in ("return", "Sm") for where in ("", ", worst task")]
     columns += BETTER.values()

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
 
-from torchrl_l2c2.experiment.reports.groups import Group, baseline_of
+from torchrl_l2c2.experiment.reports.groups import Group, baseline_of, over_tasks
 from torchrl_l2c2.experiment.reports.records import FIGURES, QUANTITIES
 from torchrl_l2c2.experiment.reports.statistics import (
     Interval,
@@ -19,7 +20,7 @@ from torchrl_l2c2.experiment.reports.statistics import (
     mean_and_deviation,
     probability_of_improvement,
 )
-from torchrl_l2c2.experiment.reports.tables import Table, number
+from torchrl_l2c2.experiment.reports.tables import Table, number, number_range
 
 # What is better: a larger return, a smaller action variation.
 SIGNS = {"return": 1.0, "action_variation": -1.0}
@@ -55,16 +56,18 @@ def improvement(
     """Probability that a run is better than a vanilla one, over tasks.
 
     Args:
-        groups (sequence of Group): one of each task; runs count whose seed every task has.
+        groups (sequence of Group): one of each task, which counts with all of its runs.
         baselines (sequence of Group): vanilla of the same tasks.
         figure (str): one of ``FIGURES``.
         quantity (str): ``"return"``, or a measure of which less is better.
 
     Returns:
-        Estimate: ``None`` where there are no such runs.
+        Estimate: ``None`` where a task has no such runs.
     """
     sign = SIGNS.get(quantity, -1.0)
     matrices = [sign * _matrix(side, figure, quantity) for side in (groups, baselines)]
+    if any(np.isnan(matrix).all(0).any() for matrix in matrices):
+        return None
     return Estimate.of(probability_of_improvement, *matrices)
 
 
@@ -89,7 +92,8 @@ def _statistics(figure: str, groups: Sequence[Group]) -> Table:
 
 
 def _statistics_row(figure: str, group: Group, baseline: Group | None) -> list[str]:
-    cells = [group.first.task, group.first.algorithm, group.name, str(len(group.records))]
+    runs = str(len(group.scores(figure, "return")))
+    cells = [group.first.task, group.first.algorithm, group.name, runs]
     for quantity in QUANTITIES:
         center = Estimate.of(interquartile_mean, group.scores(figure, quantity))
         better = improvement([group], [baseline], figure, quantity) if baseline else None
@@ -103,20 +107,20 @@ def _statistics_row(figure: str, group: Group, baseline: Group | None) -> list[s
 
 def _across_tasks(figure: str, groups: Sequence[Group]) -> list[list[str]]:
     """Rows over all tasks, of methods that several have: probabilities need no common scale."""
+    vanilla = {
+        group: baseline
+        for group in groups
+        if (baseline := baseline_of(group, groups)) is not None
+        and all(len(side.scores(figure, "return")) for side in (group, baseline))
+    }
     rows = []
-    for algorithm, name in dict.fromkeys((g.first.algorithm, g.name) for g in groups):
-        pairs = [
-            (group, baseline)
-            for group in groups
-            if (group.first.algorithm, group.name) == (algorithm, name)
-            and (baseline := baseline_of(group, groups)) is not None
-        ]
-        if len(pairs) < 2:
+    for algorithm, name, ours in over_tasks(vanilla):
+        if len(ours) < 2:
             continue
-        ours, theirs = zip(*pairs, strict=True)
+        theirs = [vanilla[group] for group in ours]
         better = [probability(improvement(ours, theirs, figure, q)) for q in QUANTITIES]
-        runs = str(len(_matrix(ours, figure, "return")))
-        rows.append([f"{len(pairs)} tasks", algorithm, name, runs, "", better[0], "", better[1]])
+        runs = number_range(sorted({len(group.scores(figure, "return")) for group in ours}))
+        rows.append([f"{len(ours)} tasks", algorithm, name, runs, "", better[0], "", better[1]])
     return rows
 
 
@@ -161,11 +165,10 @@ def _plain(estimate: Estimate | None) -> dict[str, Any] | None:
 
 
 def _matrix(groups: Sequence[Group], figure: str, quantity: str) -> Scores:
-    """``[runs, tasks]``: runs of the seeds that every group has the figure of."""
-    columns = [group.by_seed(figure, quantity) for group in groups]
-    seeds = sorted(set.intersection(*(set(column) for column in columns)))
-    matrix = np.array([[column[seed] for column in columns] for seed in seeds])
-    return matrix.reshape(len(seeds), len(groups))
+    """``[runs, tasks]``: runs that have the figure, in the order of seeds; NaN below the fewer."""
+    found = [sorted(group.by_seed(figure, quantity).items()) for group in groups]
+    columns = [[value for _, value in each] for each in found]
+    return np.array(list(zip_longest(*columns, fillvalue=np.nan))).reshape(-1, len(groups))
 
 
 def probability(estimate: Estimate | None) -> str:

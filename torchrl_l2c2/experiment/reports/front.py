@@ -12,6 +12,9 @@ from torchrl_l2c2.experiment.reports.tables import Table, number_range, pooled
 
 # Fewer settings of one method are a comparison, which tables of results show.
 LEAST = 4
+# What a front is of: the policy's mean is what is deployed, and many policies are steadier than the
+# last one, where they were tested.
+MEASURED = ("late_mean", "last_mean")
 
 
 def searched(groups: Sequence[Group]) -> list[list[Group]]:
@@ -23,13 +26,23 @@ def searched(groups: Sequence[Group]) -> list[list[Group]]:
         found
         for found in together.values()
         if max(Counter(group.first.method for group in found).values()) >= LEAST
+        and pareto_front(found, front_figure(found))
     ]
+
+
+def front_figure(groups: Sequence[Group]) -> str:
+    """The figure that a front of these groups is of: what most of them have, or else the first."""
+    return max(MEASURED, key=lambda figure: sum(_is_known(group, figure) for group in groups))
 
 
 def means(group: Group, figure: str) -> tuple[float, ...]:
     """Return and action variation, means over seeds; fewer numbers where one is not known."""
     scores = [group.scores(figure, quantity) for quantity in SIGNS]
     return tuple(float(each.mean()) for each in scores if len(each))
+
+
+def _is_known(group: Group, figure: str) -> bool:
+    return len(means(group, figure)) == len(SIGNS)
 
 
 def pareto_front(groups: Sequence[Group], figure: str) -> list[Group]:
@@ -42,9 +55,9 @@ def pareto_front(groups: Sequence[Group], figure: str) -> list[Group]:
         groups (sequence of Group): of one task and algorithm.
         figure (str): one of ``FIGURES``.
     """
-    known = [(group, means(group, figure)) for group in groups]
+    known = [(group, means(group, figure)) for group in groups if _is_known(group, figure)]
     # The smoothest first, and of equally smooth ones that with the largest return.
-    ordered = sorted((m[1], -m[0], i) for i, (_, m) in enumerate(known) if len(m) == len(SIGNS))
+    ordered = sorted((m[1], -m[0], i) for i, (_, m) in enumerate(known))
     front: list[int] = []
     best: tuple[float, float] | None = None
     for variation, loss, place in ordered:

@@ -6,6 +6,7 @@ import math
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,11 @@ from torchrl_l2c2.experiment.reports.differences import BUDGETS
 from torchrl_l2c2.experiment.reports.paper import method_name
 from torchrl_l2c2.experiment.reports.records import Record
 from torchrl_l2c2.experiment.reports.statistics import Scores
+
+# A row's settings by name; ``None`` where the default stands.
+Settings = tuple[tuple[str, str | None], ...]
+# What sets groups apart and is no setting of a run: how long it was, and the code of all settings.
+LENGTH, CODE = "length", "settings"
 
 
 @dataclass(frozen=True)
@@ -42,9 +48,7 @@ class Group:
     @property
     def reading(self) -> tuple[Any, ...]:
         """Every setting but the regularizer's: what is compared with it has the same."""
-        # A run of so many frames has a number of episodes, too, which says nothing.
-        others = _without(self.first, "regularizer.", *BUDGETS)
-        return (self.first.task, self.first.algorithm, self.first.length, *sorted(others.items()))
+        return (self.first.task, self.first.algorithm, *sorted(_others(self).items()))
 
     def by_seed(self, figure: str, quantity: str) -> dict[int, float]:
         """One of the eight figures of every run that has it."""
@@ -75,6 +79,59 @@ def baseline_of(group: Group, groups: Iterable[Group]) -> Group | None:
         return None
     candidates = (other for other in groups if other.first.method == "none")
     return next((other for other in candidates if other.reading == group.reading), None)
+
+
+def over_tasks(groups: Iterable[Group]) -> list[tuple[str, str, list[Group]]]:
+    """A row for every method and its own settings: of each task that has them, one group.
+
+    Other settings and the length may be a task's own, as a preset's are. Where a task has several
+    such groups, only what sets these apart must be the same on all tasks of a row.
+
+    Args:
+        groups (iterable of Group): of several tasks.
+
+    Returns:
+        list: the algorithm, the row's name, with what sets it apart from the method's other rows,
+        and its groups.
+    """
+    methods: dict[tuple[str, str], dict[Settings, list[Group]]] = {}
+    for group in groups:
+        of_method = methods.setdefault((group.first.algorithm, group.first.method), {})
+        of_method.setdefault(_own(group), []).append(group)
+    rows = []
+    for (algorithm, method), found in methods.items():
+        common = set.intersection(*map(set, found))
+        for own, alike in found.items():
+            told = tuple(pair for pair in own if pair not in common)
+            for others, row in _one_of_each(alike).items():
+                rows.append((algorithm, _row_name(method, told + others), row))
+    return rows
+
+
+def _one_of_each(groups: Sequence[Group]) -> dict[Settings, list[Group]]:
+    """Rows with one group of a task, by the settings that set groups of the same task apart."""
+    apart: set[str] = set()
+    for one, other in combinations(groups, 2):
+        if one.first.task == other.first.task:
+            ours, theirs = _others(one), _others(other)
+            apart |= {k for k in ours | theirs if ours.get(k) != theirs.get(k)} or {CODE}
+    rows: dict[Settings, list[Group]] = defaultdict(list)
+    for group in groups:
+        others = _others(group) | {CODE: group.first.settings}
+        rows[tuple((key, others.get(key)) for key in sorted(apart))].append(group)
+    return rows
+
+
+def _row_name(method: str, settings: Settings) -> str:
+    keys = {key for key, _ in settings}
+    return ", ".join(
+        [method_name(method)]
+        + [
+            value if key in (LENGTH, CODE) else f"{_shortest(key, keys)}={value}"
+            for key, value in settings
+            if value is not None
+        ]
+    )
 
 
 def differing_lengths(groups: Sequence[Group]) -> list[str]:
@@ -123,6 +180,19 @@ def common_settings(groups: Sequence[Group]) -> dict[str, str]:
     """What differs from the defaults in all groups alike."""
     first, *rest = ({**group.first.other_settings} for group in groups)
     return {k: v for k, v in first.items() if all(other.get(k) == v for other in rest)}
+
+
+def _own(group: Group) -> Settings:
+    """The regularizer's settings."""
+    found = group.first.other_settings.items()
+    return tuple((k, v) for k, v in found if k.startswith("regularizer."))
+
+
+def _others(group: Group) -> dict[str, str]:
+    """All other settings, and the length."""
+    # A run of so many frames has a number of episodes, too, which says nothing.
+    others = _without(group.first, "regularizer.", *BUDGETS)
+    return {**others, LENGTH: group.first.length}
 
 
 def _without(record: Record, *prefixes: str) -> dict[str, str]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from torchrl_l2c2.experiment.folder import make_folder, write_atomically, write_json
 from torchrl_l2c2.experiment.reports.choice import choice_table
@@ -12,7 +13,7 @@ from torchrl_l2c2.experiment.reports.comparison import statistics_tables, summar
 from torchrl_l2c2.experiment.reports.document import picture, whole_page
 from torchrl_l2c2.experiment.reports.field import field_groups, field_table
 from torchrl_l2c2.experiment.reports.figures import draw_front, draw_learning_curves, draw_plane
-from torchrl_l2c2.experiment.reports.front import front_table, searched
+from torchrl_l2c2.experiment.reports.front import front_figure, front_table, searched
 from torchrl_l2c2.experiment.reports.groups import Group, group_records
 from torchrl_l2c2.experiment.reports.measures import measures_table
 from torchrl_l2c2.experiment.reports.paper_table import paper_table
@@ -20,9 +21,6 @@ from torchrl_l2c2.experiment.reports.records import FIGURES, Record
 from torchrl_l2c2.experiment.reports.runs import FinishedRun
 from torchrl_l2c2.experiment.reports.score import readings
 from torchrl_l2c2.experiment.reports.tables import Table, results_tables, runs_table, score_table
-
-# What a front is drawn of: the policy's mean is what is deployed.
-FRONT = "late_mean"
 
 
 def _results(groups: Sequence[Group]) -> list[Table]:
@@ -38,7 +36,7 @@ def _others(records: Sequence[Record], runs: Sequence[FinishedRun]) -> list[Tabl
     more = (field_table(records), choice_table(records), measures_table(runs))
     return [
         *statistics_tables(groups),
-        *(front_table(found, FRONT) for found in searched(groups)),
+        *(front_table(found, front_figure(found)) for found in searched(groups)),
         *([score_table(scored)] if scored else []),
         *(table for table in more if table is not None),
         runs_table(records),
@@ -53,6 +51,8 @@ def write_report(
 ) -> Path:
     """Writes ``report.md``, ``report.html``, ``report.json`` and the pictures as SVG files.
 
+    All of it is made before any is written: what cannot be told or drawn leaves no half report.
+
     Args:
         folder (str or Path): made where it is not there.
         records (sequence of Record): what the tables are of, at least one.
@@ -63,23 +63,28 @@ def write_report(
     Returns:
         Path: of the page; it has its pictures in it and needs no other file.
     """
-    folder = make_folder(folder)
     groups = group_records(records)
     results, others = _results(groups), _others(records, runs)
-    pictures = _draw(folder, records, runs)
+    numbers = {"groups": summary(groups), "notes": list(notes)}
+    with TemporaryDirectory() as drawn:
+        paths = _draw(Path(drawn), records, runs)
+        pictures = {path.name: path.read_bytes() for path in paths}
     text = "\n\n".join(
         [
             "# Runs",
             *notes,
             *(table.markdown() for table in (*results, *others)),
-            *(f"![{path.stem.replace('_', ' ')}]({path.name})" for path in pictures),
+            *(f"![{_told(name)}]({name})" for name in pictures),
         ]
     )
+    page = _page(results, others, pictures, notes)
+    folder = make_folder(folder)
+    for name, content in pictures.items():
+        write_atomically(folder / name, content)
     write_atomically(folder / "report.md", f"{text}\n".encode())
-    write_json(folder / "report.json", {"groups": summary(groups), "notes": list(notes)})
-    page = folder / "report.html"
-    write_atomically(page, _page(results, others, pictures, notes).encode())
-    return page
+    write_json(folder / "report.json", numbers)
+    write_atomically(folder / "report.html", page.encode())
+    return folder / "report.html"
 
 
 def _draw(folder: Path, records: Sequence[Record], runs: Sequence[FinishedRun]) -> list[Path]:
@@ -98,18 +103,18 @@ def _draw(folder: Path, records: Sequence[Record], runs: Sequence[FinishedRun]) 
         draw_plane(of_field, "last_mean", paths[-1], "sm_asap")
     for number, found in enumerate(searched(group_records(records)), 1):
         paths.append(folder / f"front_{number}_{found[0].first.task.replace('/', '_')}.svg")
-        draw_front(found, FRONT, paths[-1])
+        draw_front(found, front_figure(found), paths[-1])
     return paths
 
 
 def _page(
     results: Sequence[Table],
     others: Sequence[Table],
-    pictures: Sequence[Path],
+    pictures: Mapping[str, bytes],
     notes: Sequence[str],
 ) -> str:
     drawn = "\n".join(
-        f"<p>{picture(path.stem.replace('_', ' '), path.read_bytes())}</p>" for path in pictures
+        f"<p>{picture(_told(name), content)}</p>" for name, content in pictures.items()
     )
     parts = [
         "<h1>Runs</h1>",
@@ -119,3 +124,8 @@ def _page(
         *(table.html() for table in others),
     ]
     return whole_page("Runs", parts)
+
+
+def _told(name: str) -> str:
+    """What a picture shows, by its file."""
+    return Path(name).stem.replace("_", " ")

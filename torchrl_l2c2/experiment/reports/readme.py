@@ -9,7 +9,7 @@ from pathlib import Path
 from torchrl_l2c2.experiment.folder import write_atomically
 from torchrl_l2c2.experiment.reports.figures import draw_plane
 from torchrl_l2c2.experiment.reports.groups import Group, group_records
-from torchrl_l2c2.experiment.reports.paper import is_of_paper
+from torchrl_l2c2.experiment.reports.paper import PAPER, is_of_paper
 from torchrl_l2c2.experiment.reports.paper_table import paper_table
 from torchrl_l2c2.experiment.reports.records import Record
 from torchrl_l2c2.experiment.reports.tables import settings_notes
@@ -20,14 +20,21 @@ PICTURE = Path("docs") / "results.svg"
 
 
 def results_text(records: Sequence[Record]) -> str:
-    """What stands between the marks: a picture and the paper's table, if there are such runs.
+    """What stands between the marks: a picture and the paper's table.
 
     Where a task has runs of its default length, others are not told: they compare lengths.
+
+    Raises:
+        ValueError: no record is of the paper's tasks with its algorithm.
     """
     groups = _groups(records)
     table = paper_table(groups)
     if table is None:
-        return "No runs are recorded yet."
+        tasks = ", ".join(dict.fromkeys(task for task, _ in PAPER))
+        raise ValueError(
+            f"none of {len(records)} records is of the paper's {tasks} with ppo_rpe, of which a "
+            "README's results are: name a file that has some, by --from or --csv."
+        )
     picture = f"![Return against action variation of every method]({PICTURE.as_posix()})"
     return "\n\n".join([picture, table.markdown(), *settings_notes(groups)])
 
@@ -36,7 +43,7 @@ def fill(text: str, records: Sequence[Record]) -> str:
     """A README's text with its results made anew.
 
     Raises:
-        ValueError: the marks are not there, once each and in order.
+        ValueError: the marks are not there, once each and in order, or there are no results.
     """
     pattern = re.compile(f"{re.escape(START)}.*?{re.escape(END)}", re.S)
     if (text.count(START), text.count(END), len(pattern.findall(text))) != (1, 1, 1):
@@ -49,12 +56,11 @@ def fill_readme(path: str | Path, records: Sequence[Record]) -> None:
     """Makes a README's results anew, and the picture in the ``docs`` folder beside it.
 
     Raises:
-        ValueError: the marks are not there, once each and in order.
+        ValueError: as :func:`fill`; nothing is written then.
     """
     path = Path(path)
     text = fill(path.read_text(), records)
-    if groups := _groups(records):
-        draw_plane(groups, "late_sampled", path.parent / PICTURE)
+    draw_plane(_groups(records), "late_sampled", path.parent / PICTURE)
     write_atomically(path, text.encode())
 
 

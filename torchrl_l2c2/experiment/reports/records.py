@@ -92,6 +92,12 @@ class Record:
         value: float = getattr(self, f"{figure}_{quantity}")
         return value
 
+    @property
+    def is_tested(self) -> bool:
+        """Whether its last policy was, by its means or samples of it."""
+        tests = (self.last_mean_return, self.last_sampled_return)
+        return not all(map(math.isnan, tests))
+
     @cached_property
     def other_settings(self) -> dict[str, str]:
         """What differs from the defaults, by name."""
@@ -136,8 +142,15 @@ def write_records(path: str | Path, records: Iterable[Record]) -> None:
 
 
 def merge(old: Iterable[Record], new: Iterable[Record]) -> list[Record]:
-    """Old and new records, sorted; a run's newer record takes the place of its older one."""
-    merged = {record.identity: record for record in (*old, *new)}
+    """Old and new records, sorted; a run's newer record takes the place of its older one.
+
+    But not one without its last policy's tests: that of a longer run, cut to the same length.
+    """
+    merged: dict[tuple[str | int, ...], Record] = {}
+    for record in (*old, *new):
+        older = merged.get(record.identity)
+        if older is None or record.is_tested or not older.is_tested:
+            merged[record.identity] = record
     return sorted(merged.values(), key=lambda record: record.place)
 
 

@@ -105,14 +105,17 @@ class FinishedRun:
     def until(self, length: int) -> FinishedRun | None:
         """The run as if its training had ended earlier; ``None`` where it was shorter than that.
 
-        Its training's own episodes are all that is known of it then, those with sampled actions:
-        tests of earlier policies with their means were not played.
+        Itself where it ended just then. Of a longer one its training's own episodes are all that
+        is known, those with sampled actions: tests of earlier policies with their means were not
+        played.
 
         Args:
             length (int): in episodes, or in frames where the run's own length is in frames; at
                 least as many as the first episode has.
         """
         unit = "episodes" if self.config["task"].get("frames") is None else "frames"
+        if self.record.length == f"{length} {unit}":
+            return self
         column = self.column("episode" if unit == "episodes" else "frames")
         if not column or not column[0] <= length <= column[-1]:
             return None

@@ -70,7 +70,8 @@ def probability_of_improvement(scores: Scores, baseline: Scores) -> Scores:
 
     Args:
         scores (array): ``[..., runs, tasks]``; larger is better, so negate what should be small.
-        baseline (array): ``[..., other runs, tasks]``.
+            NaN where a task has fewer runs than others.
+        baseline (array): ``[..., other runs, tasks]``, likewise.
 
     Returns:
         Array of shape ``[...]``.
@@ -80,7 +81,12 @@ def probability_of_improvement(scores: Scores, baseline: Scores) -> Scores:
         0.625
     """
     ours, theirs = scores[..., :, None, :], baseline[..., None, :, :]
-    return np.asarray(((ours > theirs) + 0.5 * (ours == theirs)).mean((-3, -2, -1)))
+    # Where there is no run, neither holds.
+    better = ((ours > theirs) + 0.5 * (ours == theirs)).sum((-3, -2))
+    pairs = (~np.isnan(scores)).sum(-2) * (~np.isnan(baseline)).sum(-2)
+    most = pairs.max(-1, keepdims=True)
+    # Where tasks have as many pairs each, exact up to a single division.
+    return np.asarray((better * (most / pairs)).sum(-1) / (most[..., 0] * pairs.shape[-1]))
 
 
 def bootstrap_interval(
@@ -94,7 +100,8 @@ def bootstrap_interval(
 
     Args:
         statistic (Callable): of matrices ``[..., runs, tasks]``, to ``[...]``.
-        *scores (array): a matrix ``[runs, tasks]`` for each of its arguments.
+        *scores (array): a matrix ``[runs, tasks]`` for each of its arguments. A task with fewer
+            runs than others has NaN below them, and as many in what is drawn.
 
     Keyword Args:
         generator (numpy.random.Generator): draws the runs.
@@ -117,8 +124,10 @@ def bootstrap_interval(
         raise ValueError(f"resamples must be at least 1, got {resamples}.")
     drawn = []
     for matrix in scores:
-        rows = generator.integers(len(matrix), size=(resamples, *matrix.shape))
-        drawn.append(np.take_along_axis(matrix[None], rows, 1))
+        runs = (~np.isnan(matrix)).sum(0)
+        rows = generator.integers(runs, size=(resamples, *matrix.shape))
+        absent = np.arange(len(matrix))[:, None] >= runs
+        drawn.append(np.where(absent, np.nan, np.take_along_axis(matrix[None], rows, 1)))
     tail = (1.0 - confidence) / 2.0
     lower, upper = np.quantile(statistic(*drawn), [tail, 1.0 - tail])
     return float(lower), float(upper)
