@@ -7,6 +7,7 @@ import json
 import math
 import os
 import re
+import statistics
 import subprocess
 from dataclasses import replace
 from pathlib import Path
@@ -47,7 +48,7 @@ from torchrl_l2c2.experiment.reports.statistics import (
     mean_and_deviation,
     probability_of_improvement,
 )
-from torchrl_l2c2.experiment.reports.tables import results_tables
+from torchrl_l2c2.experiment.reports.tables import number_range, results_tables
 from torchrl_l2c2.experiment.tasks import TASKS
 
 ROOT = Path(__file__).parents[1]
