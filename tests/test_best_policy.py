@@ -61,6 +61,16 @@ def test_tests_during_training_are_continued_with_the_run(tmp_path):
     assert whole._best_policy.tests == parts._best_policy.tests
 
 
+def test_a_run_in_another_folder_takes_its_best_policy_along(tmp_path):
+    """Even where no later one is better, or tested."""
+    run(tmp_path / "old", evaluate_every=2, task=replace(TASK, episodes=2))
+    config = ExperimentConfig(task=TASK, compile=False)
+    Experiment(config, tmp_path / "new", resume=tmp_path / "old").close()
+    for name in ("evaluations.json", "policy_best.pt"):
+        brought = (tmp_path / "new" / name).read_bytes()
+        assert brought == (tmp_path / "old" / name).read_bytes()
+
+
 def test_a_run_without_tests_plays_none():
     """And a test of none is asked for in vain."""
     experiment = Experiment(ExperimentConfig(task=TASK, compile=False, test_episodes=0))

@@ -16,7 +16,13 @@ from torchrl_l2c2.experiment.config import (
     OtherRunError,
     is_neutral,
 )
-from torchrl_l2c2.experiment.folder import CheckpointError, list_checkpoints, load_newest, versions
+from torchrl_l2c2.experiment.folder import (
+    CheckpointError,
+    list_checkpoints,
+    load_newest,
+    versions,
+    write_atomically,
+)
 from torchrl_l2c2.experiment.player import SimulatorError
 from torchrl_l2c2.experiment.tasks import Budget
 
@@ -117,6 +123,13 @@ def check_continuable(
         if not allow_other_versions:
             raise
         warnings.warn(str(error), stacklevel=5)
+
+
+def bring_files(old: Path, new: Path) -> None:
+    """Copies what a run in another folder goes on writing there."""
+    of_tests = (old / name for name in ("evaluations.json", "policy_best.pt"))
+    for path in (old / "metrics.csv", *filter(Path.exists, of_tests)):
+        write_atomically(new / path.name, path.read_bytes())
 
 
 @contextlib.contextmanager

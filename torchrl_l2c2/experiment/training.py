@@ -13,6 +13,7 @@ from torchrl_l2c2.experiment.best_policy import BestPolicy
 from torchrl_l2c2.experiment.compilation import compiler_available
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.continuation import (
+    bring_files,
     check_continuable,
     check_length,
     check_same_settings,
@@ -27,7 +28,6 @@ from torchrl_l2c2.experiment.folder import (
     save_checkpoint,
     save_policy,
     versions,
-    write_atomically,
     write_settings,
 )
 from torchrl_l2c2.experiment.gain import GainControl
@@ -308,8 +308,7 @@ class Experiment:
         path, state = found
         check_continuable(state, self.config, allow_other_versions=allow_other_versions)
         if self.folder is not None and path.parent != self.folder:
-            log = (path.parent / "metrics.csv").read_bytes()
-            write_atomically(self.folder / "metrics.csv", log)
+            bring_files(path.parent, self.folder)
         self.load_state_dict(state)
         say(self.folder, f"continuing after episode {len(self.metrics)} from {path}")
 
