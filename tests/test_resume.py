@@ -1,5 +1,6 @@
 """N episodes equal k episodes, a kill and N - k episodes: bit for bit."""
 
+import contextlib
 import csv
 import hashlib
 import importlib.metadata
@@ -25,10 +26,12 @@ from torchrl_l2c2.experiment import (
     PPORPEConfig,
     TaskConfig,
     UniformReplayConfig,
+    continuation,
 )
 from torchrl_l2c2.experiment.config import GROUPS, OtherRunError
 from torchrl_l2c2.experiment.continuation import check_same_settings
 from torchrl_l2c2.experiment.folder import list_checkpoints, load_checkpoint, save_checkpoint
+from torchrl_l2c2.experiment.reports.runs import finished_run
 from torchrl_l2c2.experiment.trained import load_policy
 
 ROOT = Path(__file__).parent.parent
@@ -118,6 +121,41 @@ def test_a_run_can_be_continued_in_another_folder(tmp_path):
     longer.train()
     assert len(lines(tmp_path / "a")) == 6
     assert [row["episode"] for row in lines(tmp_path / "b")] == [str(i) for i in range(1, 9)]
+
+
+@pytest.mark.parametrize("steps", range(6))
+def test_a_finished_run_that_goes_on_is_unfinished(tmp_path, monkeypatch, steps):
+    """Killed after any of its first steps, it is not taken for the longer run, and goes on."""
+    shorter, longer = small(), small(task=replace(SWINGUP, episodes=8))
+    run = Experiment(shorter, tmp_path)
+    run.train()
+    run.finish(run.test())
+    (tmp_path / "video.mp4").touch()
+    run.close()
+
+    left = iter(range(steps))
+
+    def until_it_is_killed(changed):
+        def change(*arguments, **options):
+            if next(left, None) is None:
+                raise KeyboardInterrupt
+            return changed(*arguments, **options)
+
+        return change
+
+    with monkeypatch.context() as patched, contextlib.suppress(KeyboardInterrupt):
+        written = until_it_is_killed(continuation.write_settings)
+        patched.setattr(continuation, "write_settings", written)
+        patched.setattr(Path, "unlink", until_it_is_killed(Path.unlink))
+        Experiment(longer, tmp_path).close()
+    assert finished_run(tmp_path, longer.to_dict()) is None
+    assert (finished_run(tmp_path, shorter.to_dict()) is None) == (steps > 0)
+    saved = json.loads((tmp_path / "config.json").read_text())
+    ends = {"policy.pt", "video.mp4", "learning_curves.png"}
+    of_the_longer = saved["task"]["episodes"] == 8
+    assert not of_the_longer or not ends & {path.name for path in tmp_path.iterdir()}
+    again = Experiment(longer, tmp_path)
+    assert len(again.train()) == 8
 
 
 def test_changed_settings_are_refused_and_nothing_is_overwritten(tmp_path):

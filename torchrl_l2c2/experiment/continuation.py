@@ -22,11 +22,14 @@ from torchrl_l2c2.experiment.folder import (
     load_newest,
     versions,
     write_atomically,
+    write_settings,
 )
 from torchrl_l2c2.experiment.player import SimulatorError
 from torchrl_l2c2.experiment.tasks import Budget
 
 MISSING = "none, as it is a setting since"
+# What a run's end leaves; without the first it counts as unfinished, whatever else is there.
+OF_THE_END = ("evaluation.json", "video.mp4", "policy.pt", "learning_curves.png")
 
 
 def check_same_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> None:
@@ -130,6 +133,25 @@ def bring_files(old: Path, new: Path) -> None:
     of_tests = (old / name for name in ("evaluations.json", "policy_best.pt"))
     for path in (old / "metrics.csv", *filter(Path.exists, of_tests)):
         write_atomically(new / path.name, path.read_bytes())
+
+
+def begin_folder(folder: Path, settings: Mapping[str, Any], *, ended: bool) -> None:
+    """Writes what a run begins with.
+
+    Of a shorter run that goes on, the end is removed before: killed at any moment, the folder is
+    that of a shorter run or of an unfinished one, and never a longer one's with an older policy.
+
+    Args:
+        folder (Path): of the run.
+        settings (Mapping): of the run, as in ``config.json``.
+
+    Keyword Args:
+        ended (bool): whether its training is over.
+    """
+    if not ended:
+        for name in OF_THE_END:
+            (folder / name).unlink(missing_ok=True)
+    write_settings(folder, settings)
 
 
 @contextlib.contextmanager
