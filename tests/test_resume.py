@@ -223,6 +223,34 @@ def test_fewer_episodes_than_there_are_are_refused(tmp_path):
         Experiment(small(), tmp_path).train(5)
 
 
+def test_fewer_frames_than_there_are_are_refused(tmp_path):
+    """What the last episode has beyond them may be asked for again or not."""
+    task = replace(SWINGUP, frames=200)
+    Experiment(small(task=task), tmp_path).train()
+    config = (tmp_path / "config.json").read_bytes()
+    with pytest.raises(OtherRunError, match=r"frames=199 is fewer than the 200 .* already has"):
+        Experiment(small(task=replace(task, frames=199)), tmp_path)
+    with pytest.raises(OtherRunError, match=r"episodes=1 is fewer than the \d+ that this run"):
+        Experiment(small(task=replace(task, frames=None, episodes=1)), tmp_path)
+    assert (tmp_path / "config.json").read_bytes() == config
+    assert Experiment(small(task=task), tmp_path).metrics[-1]["frames"] > 200
+
+
+def test_the_episodes_of_the_last_rollout_may_be_more_than_were_asked_for(tmp_path):
+    """The same command again is the same run, whose length is what was asked for."""
+    config = small(
+        task=TaskConfig("pendulum", "Pendulum-v1", 0.01, 3, 20),
+        algorithm=PPOConfig(num_envs=2, frames=80, epochs=1, hidden=(8,)),
+    )
+    first = Experiment(config, tmp_path)
+    assert len(first.train()) == 4
+    assert first.finish(first.test()).record.length == "3 episodes"
+    again = Experiment(config, tmp_path)
+    assert len(again.train()) == 4
+    with pytest.raises(OtherRunError, match="episodes=2 is fewer than the 3"):
+        Experiment(replace(config, task=replace(config.task, episodes=2)), tmp_path)
+
+
 def test_what_changes_no_number_may_change(tmp_path):
     """Where metrics go, which policies are tested and how often it is saved."""
     Experiment(small(), tmp_path).train()

@@ -25,7 +25,7 @@ from torchrl_l2c2.experiment.folder import (
     write_settings,
 )
 from torchrl_l2c2.experiment.player import SimulatorError
-from torchrl_l2c2.experiment.tasks import Budget
+from torchrl_l2c2.experiment.tasks import Budget, TaskConfig
 
 MISSING = "none, as it is a setting since"
 # What a run's end leaves; without the first it counts as unfinished, whatever else is there.
@@ -73,16 +73,25 @@ def check_same_versions(saved: Mapping[str, str], now: Mapping[str, str]) -> Non
         )
 
 
-def check_length(asked: Budget, played: int) -> None:
-    """Refuses to be asked for fewer episodes than a run already has.
+def check_length(asked: Budget, before: Budget, played: int) -> None:
+    """Refuses to be asked for less than a run already has.
+
+    A training ends with the episode, or the round of them, that reaches what was asked for: what is
+    beyond that may be asked for again, or not.
+
+    Args:
+        asked (Budget): how long the training is to be.
+        before (Budget): how long it was to be.
+        played (int): how long it is, in the unit that is asked for.
 
     Raises:
         OtherRunError: with both numbers.
     """
-    if asked.unit == "episode" and asked.total < played:
+    least = min(played, before.total) if asked.unit == before.unit else played
+    if asked.total < least:
         raise OtherRunError(
-            f"episodes={asked.total} is fewer than the {played} that this run already has: ask for "
-            "as many or more, or choose another folder. Nothing was changed."
+            f"{asked.unit}s={asked.total} is fewer than the {least} that this run already has: ask "
+            "for as many or more, or choose another folder. Nothing was changed."
         )
 
 
@@ -115,10 +124,12 @@ def check_continuable(
     """Refuses a checkpoint that a run with these settings, here and now, cannot go on from.
 
     Raises:
-        OtherRunError: other settings, fewer episodes than there are, or other versions.
+        OtherRunError: other settings, a shorter training than it is, or other versions.
     """
-    check_same_settings(json.loads(state["config"]), config.to_dict())
-    check_length(config.task.budget, len(json.loads(state["metrics"])))
+    saved, asked = json.loads(state["config"]), config.task.budget
+    check_same_settings(saved, config.to_dict())
+    played = asked.spent(len(json.loads(state["metrics"])), state["counters"][0])
+    check_length(asked, TaskConfig(**saved["task"]).budget, played)
     try:
         # Checkpoints of earlier releases do not say.
         check_same_versions(json.loads(state.get("versions", "{}")), versions())

@@ -154,7 +154,7 @@ class Experiment:
                 or a regularizer's terms are too small to matter.
         """
         budget = self.config.task.budget if episodes is None else Budget(episodes)
-        check_length(budget, len(self.metrics))
+        check_length(budget, self.config.task.budget, self._spent(budget))
         algorithm, saved = self.config.algorithm, time.monotonic()
         schedule = SCHEDULES[algorithm.schedule](self.player, self.learner, algorithm)
         compiles = self.learner.compiles and not self.learner.updates

@@ -125,8 +125,11 @@ class FinishedRun:
         return replace(self, config=config, evaluation={}, metrics=kept)
 
     def _length(self) -> str:
-        frames = self.config["task"].get("frames")
-        return f"{len(self.metrics)} episodes" if frames is None else f"{frames:.0f} frames"
+        """What was asked for: a training ends with the round of episodes that reaches it."""
+        task = self.config["task"]
+        if task.get("frames") is not None:
+            return f"{task['frames']:.0f} frames"
+        return f"{min(task['episodes'], len(self.metrics))} episodes"
 
     def _last(self, acting: str, test: dict[str, Any], *quantities: str) -> dict[str, float]:
         summary = test.get("summary", {})
