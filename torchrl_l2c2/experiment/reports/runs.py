@@ -133,9 +133,9 @@ class FinishedRun:
 
     def _last(self, acting: str, test: dict[str, Any], *quantities: str) -> dict[str, float]:
         summary = test.get("summary", {})
-        return {
-            f"last_{acting}_{name}": summary.get(f"{name}_mean", math.nan) for name in quantities
-        }
+        found = {name: summary.get(f"{name}_mean") for name in quantities}
+        # JSON has null where there is no number, as of episodes that are too short.
+        return {f"last_{acting}_{k}": math.nan if v is None else v for k, v in found.items()}
 
     def _late(self) -> dict[str, float]:
         """Of the last tenth of training, those policies that played a test episode."""
