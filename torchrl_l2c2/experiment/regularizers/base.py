@@ -29,6 +29,17 @@ class RegularizerConfig:
         """The loss with the regularizer's terms."""
         raise NotImplementedError
 
+    def add_to(self, loss: LossModule) -> LossModule:
+        """As :meth:`wrap`, for the loss of an algorithm that was chosen.
+
+        Raises:
+            SettingError: the regularizer is none for such a loss.
+        """
+        try:
+            return self.wrap(loss)
+        except TypeError as error:
+            raise SettingError("", f"regularizer={self.name}: {error}") from error
+
     def transform(self, generator: torch.Generator) -> Transform | None:
         """What the replay buffer's batches go through; ``None`` where the loss needs nothing."""
         return None
