@@ -12,6 +12,7 @@ from torchrl_l2c2.experiment import (
     Experiment,
     ExperimentConfig,
     TaskConfig,
+    diagnose,
     evaluate_policy,
     load_policy,
 )
@@ -126,6 +127,9 @@ def test_evaluate_refuses_what_cannot_be(folder, tmp_path):
         evaluated(folder, "--noise", "-1")
     with pytest.raises(SystemExit, match="is not the folder of a run"):
         main([str(tmp_path)])
+    for command in (main, diagnose.main):
+        with pytest.raises(SystemExit, match="error: seed must be at least 0 and below"):
+            command([str(folder), "--seed", "-1"])
 
 
 def test_the_folder_says_how_to_load_its_policy(folder):
