@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -249,6 +250,17 @@ def test_the_episodes_of_the_last_rollout_may_be_more_than_were_asked_for(tmp_pa
     assert len(again.train()) == 4
     with pytest.raises(OtherRunError, match="episodes=2 is fewer than the 3"):
         Experiment(replace(config, task=replace(config.task, episodes=2)), tmp_path)
+
+
+def test_a_learning_rate_that_fell_by_another_length_is_told(tmp_path):
+    """A longer run had it fall more slowly; the same length is the same run."""
+    config = small(task=replace(SWINGUP, episodes=1), optimizer=AdamConfig(linear=True))
+    Experiment(config, tmp_path).train()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Experiment(config, tmp_path).close()
+    with pytest.warns(UserWarning, match="training of 1 episodes; 6 episodes in one"):
+        Experiment(replace(config, task=SWINGUP), tmp_path).close()
 
 
 def test_what_changes_no_number_may_change(tmp_path):

@@ -125,11 +125,22 @@ def check_continuable(
 
     Raises:
         OtherRunError: other settings, a shorter training than it is, or other versions.
+
+    Warns:
+        UserWarning: another length, by which the learning rate falls.
     """
     saved, asked = json.loads(state["config"]), config.task.budget
     check_same_settings(saved, config.to_dict())
+    before = TaskConfig(**saved["task"]).budget
     played = asked.spent(len(json.loads(state["metrics"])), state["counters"][0])
-    check_length(asked, TaskConfig(**saved["task"]).budget, played)
+    check_length(asked, before, played)
+    if asked != before and getattr(config.optimizer, "linear", False):
+        warnings.warn(
+            "optimizer.linear=true: the learning rate fell till now as in a training of "
+            f"{before.total} {before.unit}s; {asked.total} {asked.unit}s in one go would give "
+            "other numbers.",
+            stacklevel=5,
+        )
     try:
         # Checkpoints of earlier releases do not say.
         check_same_versions(json.loads(state.get("versions", "{}")), versions())
