@@ -159,6 +159,20 @@ def test_a_finished_run_that_goes_on_is_unfinished(tmp_path, monkeypatch, steps)
     assert len(again.train()) == 8
 
 
+def test_a_finished_run_that_is_tested_anew_is_unfinished(tmp_path):
+    """Till it has been; what was trained stays, and so does the test of the same settings."""
+    run = Experiment(small(), tmp_path)
+    run.train()
+    run.finish(run.test())
+    run.close()
+    Experiment(small(), tmp_path).close()
+    assert finished_run(tmp_path, small().to_dict()) is not None
+    more = small(test_episodes=3)
+    Experiment(more, tmp_path).close()
+    assert finished_run(tmp_path, more.to_dict()) is None
+    assert (tmp_path / "policy.pt").exists()
+
+
 def test_changed_settings_are_refused_and_nothing_is_overwritten(tmp_path):
     """The error names the setting with both values."""
     Experiment(small(), tmp_path).train()

@@ -25,11 +25,12 @@ from torchrl_l2c2.experiment.folder import (
     write_settings,
 )
 from torchrl_l2c2.experiment.player import SimulatorError
+from torchrl_l2c2.experiment.reports.runs import finished_run
 from torchrl_l2c2.experiment.tasks import Budget, TaskConfig
 
 MISSING = "none, as it is a setting since"
-# What a run's end leaves; without the first it counts as unfinished, whatever else is there.
-OF_THE_END = ("evaluation.json", "video.mp4", "policy.pt", "learning_curves.png")
+# What the end of a training leaves, beside the test that marks a run as finished.
+OF_THE_END = ("video.mp4", "policy.pt", "learning_curves.png")
 
 
 def check_same_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> None:
@@ -157,19 +158,22 @@ def bring_files(old: Path, new: Path) -> None:
         write_atomically(new / path.name, path.read_bytes())
 
 
-def begin_folder(folder: Path, settings: Mapping[str, Any], *, ended: bool) -> None:
+def begin_folder(folder: Path, settings: dict[str, Any], *, ended: bool) -> None:
     """Writes what a run begins with.
 
-    Of a shorter run that goes on, the end is removed before: killed at any moment, the folder is
-    that of a shorter run or of an unfinished one, and never a longer one's with an older policy.
+    A test that was of other settings is removed before, and of a shorter run that goes on the end:
+    killed at any moment, the folder is that of the older run or of an unfinished one, and never a
+    longer one's with an older policy.
 
     Args:
         folder (Path): of the run.
-        settings (Mapping): of the run, as in ``config.json``.
+        settings (dict): of the run, as in ``config.json``.
 
     Keyword Args:
         ended (bool): whether its training is over.
     """
+    if not ended or finished_run(folder, settings) is None:
+        (folder / "evaluation.json").unlink(missing_ok=True)
     if not ended:
         for name in OF_THE_END:
             (folder / name).unlink(missing_ok=True)
