@@ -12,6 +12,7 @@ from torchrl_l2c2.experiment import (
     Experiment,
     ExperimentConfig,
     TaskConfig,
+    diagnose,
     evaluate_policy,
     load_policy,
 )
@@ -59,6 +60,16 @@ def test_tests_during_training_are_continued_with_the_run(tmp_path):
     written = [(tmp_path / name / "evaluations.json").read_text() for name in ("whole", "parts")]
     assert written[0] == written[1]
     assert whole._best_policy.tests == parts._best_policy.tests
+
+
+def test_a_run_in_another_folder_takes_its_best_policy_along(tmp_path):
+    """Even where no later one is better, or tested."""
+    run(tmp_path / "old", evaluate_every=2, task=replace(TASK, episodes=2))
+    config = ExperimentConfig(task=TASK, compile=False)
+    Experiment(config, tmp_path / "new", resume=tmp_path / "old").close()
+    for name in ("evaluations.json", "policy_best.pt"):
+        brought = (tmp_path / "new" / name).read_bytes()
+        assert brought == (tmp_path / "old" / name).read_bytes()
 
 
 def test_a_run_without_tests_plays_none():
@@ -116,6 +127,9 @@ def test_evaluate_refuses_what_cannot_be(folder, tmp_path):
         evaluated(folder, "--noise", "-1")
     with pytest.raises(SystemExit, match="is not the folder of a run"):
         main([str(tmp_path)])
+    for command in (main, diagnose.main):
+        with pytest.raises(SystemExit, match="error: seed must be at least 0 and below"):
+            command([str(folder), "--seed", "-1"])
 
 
 def test_the_folder_says_how_to_load_its_policy(folder):

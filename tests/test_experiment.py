@@ -36,6 +36,7 @@ from torchrl_l2c2.experiment import (
 from torchrl_l2c2.experiment.collection import check_finite
 from torchrl_l2c2.experiment.evaluate import LateTests, evaluate_policy
 from torchrl_l2c2.experiment.player import SimulatorError
+from torchrl_l2c2.experiment.regularizers import LCPConfig
 from torchrl_l2c2.experiment.reports import read_runs
 
 ROOT = Path(__file__).parent.parent
@@ -527,6 +528,22 @@ def test_a_wrong_setting_ends_with_one_clear_line(tmp_path, overrides, message):
         (
             {"task": TaskConfig("cartpole", "CartPole-v1")},
             "ppo_rpe needs continuous actions, this task's are OneHot",
+        ),
+        (
+            {"algorithm": TD3Config(), "regularizer": LCPConfig()},
+            "regularizer=lcp: LCPLoss needs a stochastic policy",
+        ),
+        (
+            {
+                "task": TaskConfig("cartpole", "CartPole-v1"),
+                "algorithm": DQNConfig(),
+                "regularizer": CAPSConfig(),
+            },
+            "regularizer=caps: CAPSLoss needs a policy",
+        ),
+        (
+            {"algorithm": TD3Config(), "regularizer": L2C2Config(policy_distance="kl")},
+            "regularizer=l2c2: the loss has a deterministic policy",
         ),
     ],
 )

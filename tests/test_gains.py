@@ -356,7 +356,14 @@ class TestRefusals:
             ({"gain": "gradient"}, "gain_target must be given with gain=gradient"),
             (
                 {"gain_target": 0.1},
-                "gain_target is of gain=gradient and gain=target alone, got 0.1",
+                "gain_target is of gain=gradient and gain=target alone, got 0.1 .* at null",
+            ),
+            ({"gain_length": 0.5}, "gain_length is of gain=ramp alone, got 0.5 .* at 1.0"),
+            ({"gain": "ramp", "gain_rate": 0.5}, "gain_rate is of gain=gradient and gain=target"),
+            ({"gain_limit": 10.0}, "gain_limit is of gain=gradient and gain=target alone"),
+            (
+                {"gain": "gradient", "gain_target": 0.1, "gain_of": "return"},
+                "gain_of is of gain=target alone, got return with gain=gradient",
             ),
             ({"gain": "pid"}, "gain must be 'constant', 'ramp', 'gradient' or 'target'"),
         ],

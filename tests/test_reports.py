@@ -428,6 +428,16 @@ class TestGroups:
         summary = sweep_summary([tmp_path])
         assert "| vanilla | 0 |" in summary and all(note in summary for note in found.notes)
 
+    def test_a_measure_that_could_not_be_taken_is_no_number(self, tmp_path):
+        """Of test episodes that are too short, where evaluation.json has null."""
+        make_run(tmp_path / "run", make_config(), 1.0, 0.1)
+        path = tmp_path / "run" / "evaluation.json"
+        content = json.loads(path.read_text())
+        content["summary"]["sm_asap_mean"] = None
+        path.write_text(json.dumps(content))
+        (run,) = read_runs(tmp_path)
+        assert math.isnan(run.record.last_mean_sm_asap) and run.record.last_mean_return == 21.0
+
     def test_names_tell_what_differs_and_only_that(self, tmp_path):
         """What all have in common is a note; what CAPS does not have does not name it."""
         chosen = {"algorithm": PPORPEConfig(replay_ratio=10, critic_weighting="ratio")}

@@ -1,5 +1,6 @@
 """N episodes equal k episodes, a kill and N - k episodes: bit for bit."""
 
+import contextlib
 import csv
 import hashlib
 import importlib.metadata
@@ -10,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,10 +27,12 @@ from torchrl_l2c2.experiment import (
     PPORPEConfig,
     TaskConfig,
     UniformReplayConfig,
+    continuation,
 )
 from torchrl_l2c2.experiment.config import GROUPS, OtherRunError
 from torchrl_l2c2.experiment.continuation import check_same_settings
 from torchrl_l2c2.experiment.folder import list_checkpoints, load_checkpoint, save_checkpoint
+from torchrl_l2c2.experiment.reports.runs import finished_run
 from torchrl_l2c2.experiment.trained import load_policy
 
 ROOT = Path(__file__).parent.parent
@@ -120,6 +124,55 @@ def test_a_run_can_be_continued_in_another_folder(tmp_path):
     assert [row["episode"] for row in lines(tmp_path / "b")] == [str(i) for i in range(1, 9)]
 
 
+@pytest.mark.parametrize("steps", range(6))
+def test_a_finished_run_that_goes_on_is_unfinished(tmp_path, monkeypatch, steps):
+    """Killed after any of its first steps, it is not taken for the longer run, and goes on."""
+    shorter, longer = small(), small(task=replace(SWINGUP, episodes=8))
+    run = Experiment(shorter, tmp_path)
+    run.train()
+    run.finish(run.test())
+    (tmp_path / "video.mp4").touch()
+    run.close()
+
+    left = iter(range(steps))
+
+    def until_it_is_killed(changed):
+        def change(*arguments, **options):
+            if next(left, None) is None:
+                raise KeyboardInterrupt
+            return changed(*arguments, **options)
+
+        return change
+
+    with monkeypatch.context() as patched, contextlib.suppress(KeyboardInterrupt):
+        written = until_it_is_killed(continuation.write_settings)
+        patched.setattr(continuation, "write_settings", written)
+        patched.setattr(Path, "unlink", until_it_is_killed(Path.unlink))
+        Experiment(longer, tmp_path).close()
+    assert finished_run(tmp_path, longer.to_dict()) is None
+    assert (finished_run(tmp_path, shorter.to_dict()) is None) == (steps > 0)
+    saved = json.loads((tmp_path / "config.json").read_text())
+    ends = {"policy.pt", "video.mp4", "learning_curves.png"}
+    of_the_longer = saved["task"]["episodes"] == 8
+    assert not of_the_longer or not ends & {path.name for path in tmp_path.iterdir()}
+    again = Experiment(longer, tmp_path)
+    assert len(again.train()) == 8
+
+
+def test_a_finished_run_that_is_tested_anew_is_unfinished(tmp_path):
+    """Till it has been; what was trained stays, and so does the test of the same settings."""
+    run = Experiment(small(), tmp_path)
+    run.train()
+    run.finish(run.test())
+    run.close()
+    Experiment(small(), tmp_path).close()
+    assert finished_run(tmp_path, small().to_dict()) is not None
+    more = small(test_episodes=3)
+    Experiment(more, tmp_path).close()
+    assert finished_run(tmp_path, more.to_dict()) is None
+    assert (tmp_path / "policy.pt").exists()
+
+
 def test_changed_settings_are_refused_and_nothing_is_overwritten(tmp_path):
     """The error names the setting with both values."""
     Experiment(small(), tmp_path).train()
@@ -183,6 +236,45 @@ def test_fewer_episodes_than_there_are_are_refused(tmp_path):
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
     with pytest.raises(OtherRunError, match="episodes=5 is fewer than the 6"):
         Experiment(small(), tmp_path).train(5)
+
+
+def test_fewer_frames_than_there_are_are_refused(tmp_path):
+    """What the last episode has beyond them may be asked for again or not."""
+    task = replace(SWINGUP, frames=200)
+    Experiment(small(task=task), tmp_path).train()
+    config = (tmp_path / "config.json").read_bytes()
+    with pytest.raises(OtherRunError, match=r"frames=199 is fewer than the 200 .* already has"):
+        Experiment(small(task=replace(task, frames=199)), tmp_path)
+    with pytest.raises(OtherRunError, match=r"episodes=1 is fewer than the \d+ that this run"):
+        Experiment(small(task=replace(task, frames=None, episodes=1)), tmp_path)
+    assert (tmp_path / "config.json").read_bytes() == config
+    assert Experiment(small(task=task), tmp_path).metrics[-1]["frames"] > 200
+
+
+def test_the_episodes_of_the_last_rollout_may_be_more_than_were_asked_for(tmp_path):
+    """The same command again is the same run, whose length is what was asked for."""
+    config = small(
+        task=TaskConfig("pendulum", "Pendulum-v1", 0.01, 3, 20),
+        algorithm=PPOConfig(num_envs=2, frames=80, epochs=1, hidden=(8,)),
+    )
+    first = Experiment(config, tmp_path)
+    assert len(first.train()) == 4
+    assert first.finish(first.test()).record.length == "3 episodes"
+    again = Experiment(config, tmp_path)
+    assert len(again.train()) == 4
+    with pytest.raises(OtherRunError, match="episodes=2 is fewer than the 3"):
+        Experiment(replace(config, task=replace(config.task, episodes=2)), tmp_path)
+
+
+def test_a_learning_rate_that_fell_by_another_length_is_told(tmp_path):
+    """A longer run had it fall more slowly; the same length is the same run."""
+    config = small(task=replace(SWINGUP, episodes=1), optimizer=AdamConfig(linear=True))
+    Experiment(config, tmp_path).train()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Experiment(config, tmp_path).close()
+    with pytest.warns(UserWarning, match="training of 1 episodes; 6 episodes in one"):
+        Experiment(replace(config, task=SWINGUP), tmp_path).close()
 
 
 def test_what_changes_no_number_may_change(tmp_path):

@@ -98,6 +98,15 @@ def test_a_trial_without_late_tests_is_scored_by_its_last_policies(tmp_path):
         search.tell(2)
 
 
+@pytest.mark.parametrize("setting", ["foo", "regularizer.beta=interval(0,1", "a=interval(b,1)"])
+def test_what_hydra_cannot_read_is_told_in_a_line(tmp_path, setting):
+    """With what it was to be."""
+    with pytest.raises(SystemExit) as ended:
+        main(["seed=0,1", setting, "--output", str(tmp_path / "search")])
+    assert str(ended.value).startswith(f"error: {setting!r} cannot be read: settings are NAME=")
+    assert "\n" not in str(ended.value) and not list(tmp_path.iterdir())
+
+
 def start(folder):
     command = [sys.executable, "-m", "torchrl_l2c2.experiment.search", *SHORT, *GAINS]
     with open(folder / "said", "a") as output:

@@ -84,13 +84,13 @@ def test_a_task_that_draws_nothing_is_refused(tmp_path):
     assert not list(folder.glob("*video*"))
 
 
-@pytest.mark.slow
-def test_recording_is_a_setting(tmp_path):
-    """After training; the command says where it is."""
+@pytest.mark.parametrize("tests", [0, pytest.param(1, marks=pytest.mark.slow)])
+def test_recording_is_a_setting(tmp_path, tests):
+    """After training, with a test or without; the command says where it is."""
     command = [
         *(sys.executable, ROOT / "train.py", "task=gymnasium", "task.env_id=Pendulum-v1"),
-        *("task.episodes=1", "task.max_steps=20", "compile=false", "test_episodes=1"),
-        *("record=true", f"outputs={tmp_path}"),
+        *("task.episodes=1", "task.max_steps=20", "compile=false"),
+        *(f"test_episodes={tests}", "record=true", f"outputs={tmp_path}"),
     ]
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(command, env=env, capture_output=True, text=True, check=True)

@@ -42,6 +42,7 @@ def settings_of():
     ("line", "message"),
     [
         ("seed=-1", "seed must be greater than or equal to 0, got -1."),
+        ("seed=4294967000", "seed must be less than 2147483648, got 4294967000."),
         ("seed=zero", "seed must be a valid integer, got 'zero'."),
         ("seed=1.5", "seed must be a valid integer, got 1.5."),
         ("threads=0", "threads must be greater than or equal to 1, got 0."),
@@ -60,7 +61,7 @@ def settings_of():
         ("task.max_steps=-3", "task.max_steps must be greater than or equal to 1, got -3."),
         ("task.noise_scale=-0.1", "task.noise_scale must be greater than or equal to 0, got -0.1."),
         ("task.noise_scale=nan", "task.noise_scale must be a finite number, got nan."),
-        ("task=gymnasium", "task.name must be a valid string, got None."),
+        ("task=gymnasium", "task.env_id must be given with task=gymnasium, such as Pendulum-v1"),
         ("regularizer.sigma=0", "regularizer.sigma must be greater than 0, got 0."),
         ("regularizer.beta=-1", "regularizer.beta must be greater than or equal to 0, got -1."),
         ("regularizer.lambda_min=low", "regularizer.lambda_min must be a valid number, got 'low'."),

@@ -237,17 +237,18 @@ def run(values: dict[str, Any], standing: str = "", patience: float = 0.0) -> Fi
         going_on = {name: values[name] for name in ("resume", "allow_other_versions")}
         with closing(Experiment(config, folder, **going_on)) as experiment, _end_logged(folder):
             experiment.train(progress=standing or True)
-            if not config.test_episodes:
+            if config.test_episodes:
+                tests = [experiment.test(sampled=s, progress=True) for s in (False, True)]
+                finished = experiment.finish(*tests)
+                log(folder, f"finished:\n{compare_with_paper(finished)}")
+            else:
                 save_policy(experiment.agent.policy, folder / "policy.pt")
-                return None
-            tests = [experiment.test(sampled=s, progress=True) for s in (False, True)]
-            finished = experiment.finish(*tests)
-            log(folder, f"finished:\n{compare_with_paper(finished)}")
     video = folder / "video.mp4"
     if config.record and not video.exists():
         record_video(folder, video)
-    print(compare_with_paper(finished))
-    print(f"picture: {folder / 'learning_curves.png'}", flush=True)
+    if finished is not None:
+        print(compare_with_paper(finished))
+        print(f"picture: {folder / 'learning_curves.png'}", flush=True)
     if video.exists():
         print(f"video: {video}", flush=True)
     return finished

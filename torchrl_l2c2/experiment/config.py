@@ -80,7 +80,13 @@ class ExperimentConfig:
     replay: ReplayConfig = None  # type: ignore[assignment]
     optimizer: OptimizerConfig = None  # type: ignore[assignment]
     logger: LoggerConfig = dataclasses.field(default_factory=LoggerConfig)
-    seed: int = Field(default=0, ge=0, description="of everything that is random in the run")
+    seed: int = Field(
+        # Simulators and tests have seeds that are larger, and NumPy takes those below 2 ** 32.
+        default=0,
+        ge=0,
+        lt=2**31,
+        description="of everything that is random in the run",
+    )
     device: str = Field(
         default="cpu",
         pattern=r"^(cpu|cuda(:\d+)?)$",
@@ -256,6 +262,10 @@ def _read_group(group: str, values: Mapping[str, Any]) -> Any:
     if name in choices:
         return read(partial(dataclasses.replace, choices[name]), values, group)
     if group == "task":  # Any name will do for a task of one's own.
+        if values.get("env_id", "") is None:
+            raise SettingError(
+                "env_id", "must be given with task=gymnasium, such as Pendulum-v1, got null.", group
+            )
         return read(TaskConfig, values, group)
     raise SettingError("name", f"must be one of {sorted(choices)}, got {name!r}.", group)
 

@@ -16,11 +16,21 @@ from torchrl_l2c2.experiment.config import (
     OtherRunError,
     is_neutral,
 )
-from torchrl_l2c2.experiment.folder import CheckpointError, list_checkpoints, load_newest, versions
+from torchrl_l2c2.experiment.folder import (
+    CheckpointError,
+    list_checkpoints,
+    load_newest,
+    versions,
+    write_atomically,
+    write_settings,
+)
 from torchrl_l2c2.experiment.player import SimulatorError
-from torchrl_l2c2.experiment.tasks import Budget
+from torchrl_l2c2.experiment.reports.runs import finished_run
+from torchrl_l2c2.experiment.tasks import Budget, TaskConfig
 
 MISSING = "none, as it is a setting since"
+# What the end of a training leaves, beside the test that marks a run as finished.
+OF_THE_END = ("video.mp4", "policy.pt", "learning_curves.png")
 
 
 def check_same_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> None:
@@ -64,16 +74,25 @@ def check_same_versions(saved: Mapping[str, str], now: Mapping[str, str]) -> Non
         )
 
 
-def check_length(asked: Budget, played: int) -> None:
-    """Refuses to be asked for fewer episodes than a run already has.
+def check_length(asked: Budget, before: Budget, played: int) -> None:
+    """Refuses to be asked for less than a run already has.
+
+    A training ends with the episode, or the round of them, that reaches what was asked for: what is
+    beyond that may be asked for again, or not.
+
+    Args:
+        asked (Budget): how long the training is to be.
+        before (Budget): how long it was to be.
+        played (int): how long it is, in the unit that is asked for.
 
     Raises:
         OtherRunError: with both numbers.
     """
-    if asked.unit == "episode" and asked.total < played:
+    least = min(played, before.total) if asked.unit == before.unit else played
+    if asked.total < least:
         raise OtherRunError(
-            f"episodes={asked.total} is fewer than the {played} that this run already has: ask for "
-            "as many or more, or choose another folder. Nothing was changed."
+            f"{asked.unit}s={asked.total} is fewer than the {least} that this run already has: ask "
+            "for as many or more, or choose another folder. Nothing was changed."
         )
 
 
@@ -106,10 +125,23 @@ def check_continuable(
     """Refuses a checkpoint that a run with these settings, here and now, cannot go on from.
 
     Raises:
-        OtherRunError: other settings, fewer episodes than there are, or other versions.
+        OtherRunError: other settings, a shorter training than it is, or other versions.
+
+    Warns:
+        UserWarning: another length, by which the learning rate falls.
     """
-    check_same_settings(json.loads(state["config"]), config.to_dict())
-    check_length(config.task.budget, len(json.loads(state["metrics"])))
+    saved, asked = json.loads(state["config"]), config.task.budget
+    check_same_settings(saved, config.to_dict())
+    before = TaskConfig(**saved["task"]).budget
+    played = asked.spent(len(json.loads(state["metrics"])), state["counters"][0])
+    check_length(asked, before, played)
+    if asked != before and getattr(config.optimizer, "linear", False):
+        warnings.warn(
+            "optimizer.linear=true: the learning rate fell till now as in a training of "
+            f"{before.total} {before.unit}s; {asked.total} {asked.unit}s in one go would give "
+            "other numbers.",
+            stacklevel=5,
+        )
     try:
         # Checkpoints of earlier releases do not say.
         check_same_versions(json.loads(state.get("versions", "{}")), versions())
@@ -117,6 +149,35 @@ def check_continuable(
         if not allow_other_versions:
             raise
         warnings.warn(str(error), stacklevel=5)
+
+
+def bring_files(old: Path, new: Path) -> None:
+    """Copies what a run in another folder goes on writing there."""
+    of_tests = (old / name for name in ("evaluations.json", "policy_best.pt"))
+    for path in (old / "metrics.csv", *filter(Path.exists, of_tests)):
+        write_atomically(new / path.name, path.read_bytes())
+
+
+def begin_folder(folder: Path, settings: dict[str, Any], *, ended: bool) -> None:
+    """Writes what a run begins with.
+
+    A test that was of other settings is removed before, and of a shorter run that goes on the end:
+    killed at any moment, the folder is that of the older run or of an unfinished one, and never a
+    longer one's with an older policy.
+
+    Args:
+        folder (Path): of the run.
+        settings (dict): of the run, as in ``config.json``.
+
+    Keyword Args:
+        ended (bool): whether its training is over.
+    """
+    if not ended or finished_run(folder, settings) is None:
+        (folder / "evaluation.json").unlink(missing_ok=True)
+    if not ended:
+        for name in OF_THE_END:
+            (folder / name).unlink(missing_ok=True)
+    write_settings(folder, settings)
 
 
 @contextlib.contextmanager

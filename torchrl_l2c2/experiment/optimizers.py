@@ -44,7 +44,9 @@ class AdamConfig:
     )
     eps: float = Field(default=1e-8, ge=0, description="added to the denominator")
     linear: bool = Field(
-        default=False, description="the learning rate falls to 0 in a line over the training"
+        default=False,
+        description="the learning rate falls to 0 in a line over the training that is asked for: a "
+        "run that is later continued for longer had a steeper line",
     )
 
     def make(self, parameters: Iterable[Parameter]) -> Optimizer:

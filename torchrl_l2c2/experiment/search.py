@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep, IntervalSweep, Override
+from hydra.errors import OverrideParseException
 
 from torchrl_l2c2.experiment.folder import make_folder
 from torchrl_l2c2.experiment.lock import FolderInUseError, lock_folder
@@ -173,13 +174,20 @@ def read_space(overrides: Sequence[str]) -> tuple[dict[str, BaseDistribution], l
     """What is searched, as Optuna has it, and what is not.
 
     Raises:
-        ValueError: a range that cannot be.
+        ValueError: what Hydra cannot read, or a range that cannot be.
     """
     from optuna.distributions import CategoricalDistribution, FloatDistribution
 
     space: dict[str, BaseDistribution] = {}
     fixed = []
-    for override in OverridesParser.create().parse_overrides([*overrides]):
+    try:
+        parsed = OverridesParser.create().parse_overrides([*overrides])
+    except OverrideParseException as error:
+        raise ValueError(
+            f"{error.override!r} cannot be read: settings are NAME=VALUE in Hydra's grammar, such "
+            "as regularizer.beta=interval(0,1)."
+        ) from error
+    for override in parsed:
         name, value = override.get_key_element(), override.value()
         if isinstance(value, IntervalSweep):
             assert value.start is not None and value.end is not None

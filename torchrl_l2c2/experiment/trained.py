@@ -13,6 +13,7 @@ from torchrl.envs import EnvBase
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
 from torchrl_l2c2.experiment.folder import load_newest
+from torchrl_l2c2.experiment.settings import SettingError
 
 
 def load_policy(
@@ -46,7 +47,7 @@ def load_policy(
     Raises:
         FileNotFoundError: the folder is not a run's, or holds no such policy nor a checkpoint.
         CheckpointError: its checkpoints are damaged.
-        SettingError: a scale of noise below zero.
+        SettingError: a scale of noise below zero, or a seed that NumPy does not take.
 
     Examples:
         >>> import tempfile
@@ -61,6 +62,8 @@ def load_policy(
         torch.Size([20, 1])
     """
     folder = Path(folder)
+    if seed is not None and not 0 <= seed < 2**32:
+        raise SettingError("seed", f"must be at least 0 and below 2 ** 32, got {seed}.")
     if not (folder / "config.json").exists():
         raise FileNotFoundError(f"{str(folder)!r} is not the folder of a run: no config.json.")
     config = ExperimentConfig.from_dict(json.loads((folder / "config.json").read_text()))

@@ -13,6 +13,8 @@ from torchrl_l2c2.experiment.best_policy import BestPolicy
 from torchrl_l2c2.experiment.compilation import compiler_available
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.continuation import (
+    begin_folder,
+    bring_files,
     check_continuable,
     check_length,
     check_same_settings,
@@ -27,8 +29,6 @@ from torchrl_l2c2.experiment.folder import (
     save_checkpoint,
     save_policy,
     versions,
-    write_atomically,
-    write_settings,
 )
 from torchrl_l2c2.experiment.gain import GainControl
 from torchrl_l2c2.experiment.learner import Learner, untrained
@@ -154,7 +154,7 @@ class Experiment:
                 or a regularizer's terms are too small to matter.
         """
         budget = self.config.task.budget if episodes is None else Budget(episodes)
-        check_length(budget, len(self.metrics))
+        check_length(budget, self.config.task.budget, self._spent(budget))
         algorithm, saved = self.config.algorithm, time.monotonic()
         schedule = SCHEDULES[algorithm.schedule](self.player, self.learner, algorithm)
         compiles = self.learner.compiles and not self.learner.updates
@@ -167,7 +167,7 @@ class Experiment:
             unit=budget.unit,
             folder=self.folder,
         )
-        ended = self._spent(budget) >= budget.total
+        ended = self._ended(budget)
         with self._process, bar, stop_on_signals() as signals, checkpoint_named(self.folder):
             while not ended:
                 episode = next(schedule)
@@ -177,7 +177,7 @@ class Experiment:
                 self._best_policy.after(len(self.metrics))
                 if not episode.ends_round:
                     continue
-                ended = self._spent(budget) >= budget.total
+                ended = self._ended(budget)
                 overdue = time.monotonic() - saved > self.config.checkpoint_interval
                 if ended or signals or overdue:
                     self.save()
@@ -299,17 +299,16 @@ class Experiment:
         self._log = MetricsLog(self.folder, logger=self.config.logger.name)
         self._resume(resume, allow_other_versions)
         if self.folder is not None:
-            write_settings(self.folder, self.config.to_dict())
+            ended = self._ended(self.config.task.budget)
+            begin_folder(self.folder, self.config.to_dict(), ended=ended)
 
     def _resume(self, elsewhere: str | Path | None, allow_other_versions: bool) -> None:
-        found = find_checkpoint(self.folder, elsewhere)
-        if found is None:
+        if (found := find_checkpoint(self.folder, elsewhere)) is None:
             return
         path, state = found
         check_continuable(state, self.config, allow_other_versions=allow_other_versions)
         if self.folder is not None and path.parent != self.folder:
-            log = (path.parent / "metrics.csv").read_bytes()
-            write_atomically(self.folder / "metrics.csv", log)
+            bring_files(path.parent, self.folder)
         self.load_state_dict(state)
         say(self.folder, f"continuing after episode {len(self.metrics)} from {path}")
 
@@ -326,6 +325,9 @@ class Experiment:
 
     def _spent(self, budget: Budget) -> int:
         return budget.spent(len(self.metrics), self.player.frames)
+
+    def _ended(self, budget: Budget) -> bool:
+        return self._spent(budget) >= budget.total
 
     def _row(self, episode: Episode, budget: Budget) -> dict[str, float]:
         number = len(self.metrics) + 1

@@ -51,7 +51,7 @@ class DQNConfig(PerStepConfig):
             values, action_space=spec, loss_function="l2", delay_value=True, double_dqn=True
         )
         loss.make_value_estimator(gamma=self.gamma)
-        loss = regularizer.wrap(loss)
+        loss = regularizer.add_to(loss)
         greedy = EGreedyModule(
             spec,
             eps_init=1.0,

@@ -137,7 +137,7 @@ class PPOConfig(AlgorithmConfig):
             loss_critic_type="l2",
             normalize_advantage=True,
         )
-        loss = regularizer.wrap(loss)
+        loss = regularizer.add_to(loss)
         advantage = GAE(
             gamma=self.gamma,
             lmbda=self.gae_lambda,

@@ -138,7 +138,7 @@ class PPORPEConfig(OffPolicyConfig):
             baseline=self.baseline,
             importance=self.importance,
         )
-        loss = regularizer.wrap(loss)
+        loss = regularizer.add_to(loss)
         acting = "target_actor_network" if self.acting_policy == "target" else "actor_network"
         return Agent(
             loss,

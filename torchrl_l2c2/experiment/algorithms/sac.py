@@ -64,7 +64,7 @@ class SACConfig(PerStepConfig):
         loss.make_value_estimator(gamma=self.gamma)
         # A buffer that is made when first read: in a compiled function it would be lost again.
         loss.target_entropy  # noqa: B018
-        loss = regularizer.wrap(loss)
+        loss = regularizer.add_to(loss)
         return Agent(
             loss,
             policy=sharing(actor, loss.actor_network_params),

@@ -74,7 +74,7 @@ class TD3Config(PerStepConfig):
             noise_clip=self.noise_clip * half_range,
         )
         loss.make_value_estimator(gamma=self.gamma)
-        loss = regularizer.wrap(loss)
+        loss = regularizer.add_to(loss)
         sigma = self.exploration_noise * half_range
         noise = AdditiveGaussianModule(spec, sigma_init=sigma, sigma_end=sigma)
         return Agent(

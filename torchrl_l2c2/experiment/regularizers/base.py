@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar, Literal
+import dataclasses
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -12,6 +13,15 @@ if TYPE_CHECKING:
     import torch
     from torchrl.envs import Transform
     from torchrl.objectives import LossModule
+
+# The gains that read a setting: with the others it would have no effect.
+READ_BY = {
+    "gain_target": ("gradient", "target"),
+    "gain_of": ("target",),
+    "gain_rate": ("gradient", "target"),
+    "gain_limit": ("gradient", "target"),
+    "gain_length": ("ramp",),
+}
 
 
 class RegularizerConfig:
@@ -28,6 +38,17 @@ class RegularizerConfig:
     def wrap(self, loss: LossModule) -> LossModule:
         """The loss with the regularizer's terms."""
         raise NotImplementedError
+
+    def add_to(self, loss: LossModule) -> LossModule:
+        """As :meth:`wrap`, for the loss of an algorithm that was chosen.
+
+        Raises:
+            SettingError: the regularizer is none for such a loss.
+        """
+        try:
+            return self.wrap(loss)
+        except TypeError as error:
+            raise SettingError("", f"regularizer={self.name}: {error}") from error
 
     def transform(self, generator: torch.Generator) -> Transform | None:
         """What the replay buffer's batches go through; ``None`` where the loss needs nothing."""
@@ -71,15 +92,18 @@ class GainConfig(RegularizerConfig):
     )
 
     def __post_init__(self) -> None:
-        needs = self.gain in ("gradient", "target")
-        if needs and self.gain_target is None:
+        if self.gain in READ_BY["gain_target"] and self.gain_target is None:
             raise SettingError("gain_target", f"must be given with gain={self.gain}, got null.")
-        if not needs and self.gain_target is not None:
-            raise SettingError(
-                "gain_target",
-                f"is of gain=gradient and gain=target alone, got {self.gain_target} with "
-                f"gain={self.gain}: choose one of these, or leave gain_target at null.",
-            )
+        declared: Any = {field.name: field.default for field in dataclasses.fields(GainConfig)}
+        for name, gains in READ_BY.items():
+            given, usual = getattr(self, name), declared[name].default
+            if self.gain not in gains and given != usual:
+                raise SettingError(
+                    name,
+                    f"is of gain={' and gain='.join(gains)} alone, got {given} with "
+                    f"gain={self.gain}: choose such a gain, or leave {name} at "
+                    f"{'null' if usual is None else usual}.",
+                )
 
     @property
     def targets(self) -> dict[str, float]:

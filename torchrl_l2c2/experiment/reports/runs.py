@@ -128,14 +128,17 @@ class FinishedRun:
         return replace(self, config=config, evaluation={}, metrics=kept)
 
     def _length(self) -> str:
-        frames = self.config["task"].get("frames")
-        return f"{len(self.metrics)} episodes" if frames is None else f"{frames:.0f} frames"
+        """What was asked for: a training ends with the round of episodes that reaches it."""
+        task = self.config["task"]
+        if task.get("frames") is not None:
+            return f"{task['frames']:.0f} frames"
+        return f"{min(task['episodes'], len(self.metrics))} episodes"
 
     def _last(self, acting: str, test: dict[str, Any], *quantities: str) -> dict[str, float]:
         summary = test.get("summary", {})
-        return {
-            f"last_{acting}_{name}": summary.get(f"{name}_mean", math.nan) for name in quantities
-        }
+        found = {name: summary.get(f"{name}_mean") for name in quantities}
+        # JSON has null where there is no number, as of episodes that are too short.
+        return {f"last_{acting}_{k}": math.nan if v is None else v for k, v in found.items()}
 
     def _late(self) -> dict[str, float]:
         """Of the last tenth of training, those policies that played a test episode."""
