@@ -908,9 +908,12 @@ class TestReadme:
                 if (record.task, record.method, record.length) == (task, kind, length)
             ]
             seeds = number_range(sorted(record.seed for record in records))
-            cells[kind] = seeds, *(
-                statistics.fmean(record.figure(figure, quantity) for record in records)
-                for quantity in (measure, "return")
+            cells[kind] = (
+                seeds,
+                *(
+                    statistics.fmean(record.figure(figure, quantity) for record in records)
+                    for quantity in (measure, "return")
+                ),
             )
         (seeds, rough, total), (others, smooth, kept) = cells.values()
         assert seeds == others
