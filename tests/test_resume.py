@@ -40,6 +40,11 @@ SWINGUP = TaskConfig(episodes=6, max_steps=60)
 HOPPER = TaskConfig("hopper", "pybullet_envs_gymnasium:HopperBulletEnv-v0", 0.001, 6, 100)
 
 
+def contents(folder):
+    """What is in a folder's files, but for who uses it, and since when."""
+    return {p: p.read_bytes() for p in folder.iterdir() if not p.name.startswith(".lock")}
+
+
 def small(**settings):
     return ExperimentConfig(
         **{"task": SWINGUP, "compile": False, "test_episodes": 1, "checkpoint_interval": 0.0}
@@ -176,10 +181,10 @@ def test_a_finished_run_that_is_tested_anew_is_unfinished(tmp_path):
 def test_changed_settings_are_refused_and_nothing_is_overwritten(tmp_path):
     """The error names the setting with both values."""
     Experiment(small(), tmp_path).train()
-    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    before = contents(tmp_path)
     with pytest.raises(ValueError, match=r"regularizer.sigma=1.0, not 2.0: choose another folder"):
         Experiment(small(regularizer=L2C2Config(sigma=2.0)), tmp_path)
-    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+    assert contents(tmp_path) == before
 
 
 def test_a_damaged_newest_checkpoint_gives_the_run_from_the_one_before(tmp_path):
@@ -230,10 +235,10 @@ def test_other_versions_are_refused_unless_they_are_allowed(tmp_path):
 def test_fewer_episodes_than_there_are_are_refused(tmp_path):
     """Nothing is changed, and the run can be continued as it was or for longer."""
     Experiment(small(), tmp_path).train()
-    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    before = contents(tmp_path)
     with pytest.raises(OtherRunError, match=r"episodes=5 is fewer than the 6 .* already has"):
         Experiment(small(task=replace(SWINGUP, episodes=5)), tmp_path)
-    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+    assert contents(tmp_path) == before
     with pytest.raises(OtherRunError, match="episodes=5 is fewer than the 6"):
         Experiment(small(), tmp_path).train(5)
 
