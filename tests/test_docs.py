@@ -14,6 +14,7 @@ from torchrl.objectives import SACLoss
 
 import torchrl_l2c2
 from torchrl_l2c2 import affinities
+from torchrl_l2c2.experiment.regularizers import TUNED
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs"
@@ -61,7 +62,22 @@ def test_the_readmes_code_does_what_it_says() -> None:
     assert "<!-- no-test -->" not in page.read_text()
     defined = run_blocks(page)
     assert isinstance(defined["loss"], SACLoss)
-    assert {"loss_l2c2_actor", "loss_l2c2_qvalue"} <= set(defined["terms"].keys())
+    assert {"loss_l2c2_actor", "l2c2_mean_distance"} <= set(defined["terms"].keys())
+    assert "loss_l2c2_qvalue" not in defined["terms"].keys()
+
+
+@pytest.mark.parametrize("algorithm", TUNED)
+def test_what_to_begin_from_is_what_runs_begin_from(algorithm: str) -> None:
+    """In the README's snippet and in the guide's table."""
+    found = TUNED[algorithm]
+    near = f"lambda_min={found['lambda_min']:g}, lambda_max={found['lambda_max']:g}, shared=True"
+    rest = f'beta={found["beta"]:g}, policy_distance="{found["policy_distance"]}"'
+    assert found["shared"]
+    row = f"| {algorithm.upper()} | `L2C2Loss(loss, Neighborhood({near}), {rest})` |"
+    assert row in (FOLDER / "choosing.md").read_text()
+    if algorithm == "sac":
+        snippet = (ROOT / "README.md").read_text().replace(".0", "")
+        assert near in snippet and rest in snippet
 
 
 def test_a_marked_block_is_left_out_and_the_others_share_a_namespace(tmp_path: Path) -> None:
