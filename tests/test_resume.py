@@ -271,14 +271,21 @@ def test_the_episodes_of_the_last_rollout_may_be_more_than_were_asked_for(tmp_pa
         Experiment(replace(config, task=replace(config.task, episodes=2)), tmp_path)
 
 
-def test_a_learning_rate_that_fell_by_another_length_is_told(tmp_path):
-    """A longer run had it fall more slowly; the same length is the same run."""
-    config = small(task=replace(SWINGUP, episodes=1), optimizer=AdamConfig(linear=True))
+@pytest.mark.parametrize(
+    ("setting", "told"),
+    [
+        ({"optimizer": AdamConfig(linear=True)}, "optimizer.linear=true"),
+        ({"regularizer": L2C2Config(gain="ramp")}, "regularizer.gain=ramp"),
+    ],
+)
+def test_what_followed_another_length_is_told(tmp_path, setting, told):
+    """A longer run had it change more slowly; the same length is the same run."""
+    config = small(task=replace(SWINGUP, episodes=1), **setting)
     Experiment(config, tmp_path).train()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         Experiment(config, tmp_path).close()
-    with pytest.warns(UserWarning, match="training of 1 episodes; 6 episodes in one"):
+    with pytest.warns(UserWarning, match=f"{told} .*training of 1 episodes; 6 episodes in one"):
         Experiment(replace(config, task=SWINGUP), tmp_path).close()
 
 

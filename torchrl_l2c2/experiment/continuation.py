@@ -135,13 +135,17 @@ def check_continuable(
     before = TaskConfig(**saved["task"]).budget
     played = asked.spent(len(json.loads(state["metrics"])), state["counters"][0])
     check_length(asked, before, played)
-    if asked != before and getattr(config.optimizer, "linear", False):
-        warnings.warn(
-            "optimizer.linear=true: the learning rate fell till now as in a training of "
-            f"{before.total} {before.unit}s; {asked.total} {asked.unit}s in one go would give "
-            "other numbers.",
-            stacklevel=5,
-        )
+    followed = {
+        "optimizer.linear=true": getattr(config.optimizer, "linear", False),
+        "regularizer.gain=ramp": getattr(config.regularizer, "gain", "") == "ramp",
+    }
+    for setting, chosen in followed.items():
+        if chosen and asked != before:
+            warnings.warn(
+                f"{setting} has been till now as in a training of {before.total} {before.unit}s; "
+                f"{asked.total} {asked.unit}s in one go would give other numbers.",
+                stacklevel=5,
+            )
     try:
         # Checkpoints of earlier releases do not say.
         check_same_versions(json.loads(state.get("versions", "{}")), versions())
