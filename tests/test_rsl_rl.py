@@ -378,13 +378,15 @@ def test_the_pages_configuration_builds(monkeypatch: pytest.MonkeyPatch) -> None
     """As it stands there, on any task."""
     monkeypatch.syspath_prepend(EXAMPLE.parent)
     from rsl_rl.runners import OnPolicyRunner
+    from rsl_rl_l2c2 import GAINS
     from rsl_rl_points import NoisyPoints
 
     page = (EXAMPLE.parents[1] / "docs" / "rsl_rl.md").read_text()
     told: dict[str, Any] = {}
     exec(re.search(r"^```python\n(.*?)^```", page, re.M | re.S)[1], told)
     loss = OnPolicyRunner(NoisyPoints(2), told["config"]).alg.regularization.loss
-    assert (loss.l2c2_policy_distance, loss.l2c2_neighborhood.lambda_min) == ("mean", 0.1)
+    near = loss.l2c2_neighborhood
+    assert {"lambda_min": near.lambda_min, "lambda_max": near.lambda_max} == GAINS
 
 
 def test_the_runner_builds_it_by_its_name(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
