@@ -91,4 +91,5 @@ print([faults() for _ in range(2)][-1], keep_freed_memory(), [faults() for _ in 
     before, taken, after = done.stdout.split()
     if taken == "False":
         pytest.skip("the C library is not glibc")
-    assert int(before) > 5000 and int(after) < 500
+    # Not none: what else the process does maps a page now and then.
+    assert int(before) > 5000 and int(after) < int(before) / 50
