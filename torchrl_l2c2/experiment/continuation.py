@@ -128,7 +128,7 @@ def check_continuable(
         OtherRunError: other settings, a shorter training than it is, or other versions.
 
     Warns:
-        UserWarning: another length, by which the learning rate falls.
+        UserWarning: another length, by which the learning rate falls or a gain rises.
     """
     saved, asked = json.loads(state["config"]), config.task.budget
     check_same_settings(saved, config.to_dict())
