@@ -63,7 +63,7 @@ experiment.reports.tables
 experiment.reports.comparison experiment.reports.measures
 experiment.reports.front experiment.reports.field experiment.reports.paper_table
 experiment.reports.figures
-experiment.reports.choice
+experiment.reports.choice experiment.reports.pairwise
 experiment.reports.page experiment.reports.readme experiment.reports.results
 experiment.reports.__init__
 experiment.reports.__main__

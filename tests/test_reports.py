@@ -33,9 +33,10 @@ from torchrl_l2c2.experiment.reports.__main__ import main
 from torchrl_l2c2.experiment.reports.choice import choice_table
 from torchrl_l2c2.experiment.reports.comparison import statistics_tables
 from torchrl_l2c2.experiment.reports.differences import differences, fingerprint
-from torchrl_l2c2.experiment.reports.field import field_table
+from torchrl_l2c2.experiment.reports.field import BETTER, field_table
 from torchrl_l2c2.experiment.reports.groups import baseline_of, group_records, over_tasks
 from torchrl_l2c2.experiment.reports.measures import measures_table
+from torchrl_l2c2.experiment.reports.pairwise import pairwise_tables
 from torchrl_l2c2.experiment.reports.paper_table import paper_table
 from torchrl_l2c2.experiment.reports.readme import END, START, fill
 from torchrl_l2c2.experiment.reports.records import FIGURES, merge
@@ -258,11 +259,23 @@ class TestChoiceTable:
                 0.1: ["-8%", "-25% lunarlander", "1.00", "2.00 lunarlander", "0.29", "0.50"],
             }.items()
         ]
-        assert "-25% lunarlander" in sweep_summary([tmp_path])
+        told = sweep_summary([tmp_path])
+        assert "-25% lunarlander" in told
         records = [run.record for run in read_runs(tmp_path)]
         others = [replace(r, length="9 episodes") for r in records if r.method == "none"]
         # Vanilla of another length on one task takes no row apart.
         assert choice_table([*records, *(r for r in others if r.task == "pendulum")]) == table
+        # .3 beside .1: a half of 4 pairs of Pendulum and all of LunarLander's; Sm of these alone.
+        pairwise = pairwise_tables(records)
+        assert [each.title.split(",")[0] for each in pairwise] == [*BETTER.values()]
+        first, last = (f"L2C2, gain_target={share}" for share in (0.1, 0.3))
+        for each, better in zip(pairwise, (0.56, 0.50), strict=True):
+            assert [*each.columns] == ["method", "vanilla", first, last]
+            cells = {row[0]: dict(zip(each.columns, row, strict=True)) for row in each.rows}
+            assert cells[last][first].split()[0] == f"{better:.2f}"
+            assert cells[first][last].split()[0] == f"{1 - better:.2f}"
+            assert [cells[name][name] for name in cells] == ["", "", ""]
+            assert each.markdown() in told
 
     def test_without_vanilla_there_is_nothing_to_compare(self, tmp_path):
         """Nor on the paper's tasks."""
@@ -882,7 +895,10 @@ def test_the_fields_pages_are_those_of_their_records():
     for name, tables in {**pages, "sac_pendulum": pages["field"]}.items():
         records = read_records(ROOT / "results" / f"{name}.csv")
         page = (ROOT / "results" / f"{name}.md").read_text()
-        assert all(table(records).markdown() in page for table in tables)
+        told = [table(records) for table in tables]
+        # Of three seeds of each gain, each against each other one tells little.
+        told += [] if name == "field_gains" else pairwise_tables(records)
+        assert all(table.markdown() in page for table in told)
 
 
 # A row of the README's first table: whose records, of which length, policies and measure.

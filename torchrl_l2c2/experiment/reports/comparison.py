@@ -53,11 +53,11 @@ class Estimate:
 def improvement(
     groups: Sequence[Group], baselines: Sequence[Group], figure: str, quantity: str
 ) -> Estimate | None:
-    """Probability that a run is better than a vanilla one, over tasks.
+    """Probability that a run is better than one of the baseline, over tasks.
 
     Args:
         groups (sequence of Group): one of each task, which counts with all of its runs.
-        baselines (sequence of Group): vanilla of the same tasks.
+        baselines (sequence of Group): vanilla, or another method, of the same tasks in this order.
         figure (str): one of ``FIGURES``.
         quantity (str): ``"return"``, or a measure of which less is better.
 

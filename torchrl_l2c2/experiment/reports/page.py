@@ -16,6 +16,7 @@ from torchrl_l2c2.experiment.reports.figures import draw_front, draw_learning_cu
 from torchrl_l2c2.experiment.reports.front import front_figure, front_table, searched
 from torchrl_l2c2.experiment.reports.groups import Group, group_records
 from torchrl_l2c2.experiment.reports.measures import measures_table
+from torchrl_l2c2.experiment.reports.pairwise import pairwise_tables
 from torchrl_l2c2.experiment.reports.paper_table import paper_table
 from torchrl_l2c2.experiment.reports.records import FIGURES, Record
 from torchrl_l2c2.experiment.reports.runs import FinishedRun
@@ -39,6 +40,7 @@ def _others(records: Sequence[Record], runs: Sequence[FinishedRun]) -> list[Tabl
         *(front_table(found, front_figure(found)) for found in searched(groups)),
         *([score_table(scored)] if scored else []),
         *(table for table in more if table is not None),
+        *pairwise_tables(records),
         runs_table(records),
     ]
 

@@ -10,6 +10,7 @@ from torchrl_l2c2.experiment.reports.choice import choice_table
 from torchrl_l2c2.experiment.reports.field import field_table
 from torchrl_l2c2.experiment.reports.figures import draw_learning_curves
 from torchrl_l2c2.experiment.reports.groups import group_records
+from torchrl_l2c2.experiment.reports.pairwise import pairwise_tables
 from torchrl_l2c2.experiment.reports.paper_table import paper_table
 from torchrl_l2c2.experiment.reports.records import QUANTITIES, Record
 from torchrl_l2c2.experiment.reports.runs import FinishedRun, find_runs, write_evaluation
@@ -58,7 +59,8 @@ def printed_tables(records: Sequence[Record]) -> list[Table]:
     """What is told of runs without a report: results, and beside them what was published."""
     groups = group_records(records)
     beside = (paper_table(groups), field_table(records), choice_table(records))
-    return [*results_tables(groups), *(table for table in beside if table is not None)]
+    told = [table for table in beside if table is not None]
+    return [*results_tables(groups), *told, *pairwise_tables(records)]
 
 
 def sweep_summary(folders: Sequence[str | Path]) -> str:
