@@ -14,6 +14,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 
 from torchrl_l2c2 import make_actor
 from torchrl_l2c2.experiment import (
@@ -118,6 +119,18 @@ def test_every_alternative_changes_the_run(settings):
     first, second = parameters(), parameters(**settings)
     assert second.isfinite().all()
     assert first.shape != second.shape or not torch.equal(first, second)
+
+
+@pytest.mark.parametrize("scale", [0.1, 1.0, 2.5])
+def test_the_policy_begins_with_the_initial_scale(scale):
+    """Where the network's output is 0."""
+    policy = Experiment(small(algorithm=PPORPEConfig(initial_scale=scale))).agent.policy
+    with torch.no_grad():
+        for parameter in policy.parameters():
+            parameter.zero_()
+        played = policy(TensorDict({"observation": torch.ones(4, 3)}, [4]))
+    assert played["loc"].abs().max() == 0
+    torch.testing.assert_close(played["scale"], torch.full((4, 1), scale))
 
 
 def test_updates_follow_the_schedule():

@@ -66,8 +66,9 @@ def train(algorithm, regularizer, compile):
         late_share=0.0,
     )
     experiment = Experiment(config)
+    initial = [parameter.detach().clone() for parameter in experiment.agent.loss.parameters()]
     experiment.train()
-    return experiment
+    return experiment, initial
 
 
 @pytest.mark.parametrize("name, method", PAIRS)
@@ -79,9 +80,10 @@ def test_the_graph_learns_what_the_update_does(name, method, monkeypatch):
         graphs.append(module)
         return module
 
-    plain = train(ALGORITHMS[name], METHODS[method], compile=False)
+    plain, plain_initial = train(ALGORITHMS[name], METHODS[method], compile=False)
     monkeypatch.setattr(torch._inductor.compile_fx, "compile_fx", keep)
-    traced = train(ALGORITHMS[name], METHODS[method], compile=True)
+    traced, traced_initial = train(ALGORITHMS[name], METHODS[method], compile=True)
+    assert all(map(torch.equal, traced_initial, plain_initial)), "one seed, other weights"
     assert graphs and traced.learner.updates == plain.learner.updates > 3
     for ours, theirs in zip(
         traced.agent.loss.parameters(), plain.agent.loss.parameters(), strict=True

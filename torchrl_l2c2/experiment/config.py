@@ -293,6 +293,7 @@ FREE_TASK_SETTINGS = {"name", "episodes", "frames", "solved_at"}
 NEUTRAL_SETTINGS = {
     "device": "cpu",
     "algorithm.activation": "tanh",
+    "algorithm.initial_scale": 1.0,
     "algorithm.scale_mapping": "softplus",
     "regularizer.policy_distance": "hellinger",
     "regularizer.over_neighbors": "mean",

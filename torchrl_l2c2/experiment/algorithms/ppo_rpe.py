@@ -59,6 +59,11 @@ class PPORPEConfig(OffPolicyConfig):
     squash: Literal["tanh", "none"] = Field(
         default="tanh", description="how actions are kept in their bounds [inferred: tanh]"
     )
+    initial_scale: float = Field(
+        default=1.0,
+        gt=0.01,
+        description="deviation of the policy's normal at first, before the squashing [inferred: 1]",
+    )
     hidden: Layers = Field(
         default=(100, 100), description="neurons of the hidden layers of both networks [paper]"
     )
@@ -115,6 +120,7 @@ class PPORPEConfig(OffPolicyConfig):
             env.action_spec.to(torch.get_default_device()),
             hidden=self.hidden,
             squash=self.squash,
+            scale_mapping=f"biased_softplus_{self.initial_scale}",
             squish_b=self.squish_b,
             encoder=image_encoder(env),
         )
