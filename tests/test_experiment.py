@@ -102,6 +102,7 @@ def test_the_same_seed_gives_the_same_numbers_and_another_seed_others():
         {"algorithm": PPORPEConfig(schedule="step", updates=2)},
         {"algorithm": PPORPEConfig(acting_policy="online", baseline="target")},
         {"algorithm": PPORPEConfig(importance="mean")},
+        {"algorithm": PPORPEConfig(time_limit="terminated", squash="sigmoid")},
         {"algorithm": PPORPEConfig(squash="none", threshold="ema", critic_weighting="ratio")},
         {"algorithm": PPORPEConfig(reward_scale=1.0, hidden=(8,), num_heads=1, updates=3)},
         {"task": replace(PENDULUM, noise_scale=0.0)},
@@ -119,6 +120,32 @@ def test_every_alternative_changes_the_run(settings):
     first, second = parameters(), parameters(**settings)
     assert second.isfinite().all()
     assert first.shape != second.shape or not torch.equal(first, second)
+
+
+@pytest.mark.parametrize("time_limit", ["truncated", "terminated"])
+def test_the_value_at_a_time_limit(time_limit):
+    """Of rewards of 0 and a value of 5 everywhere: gamma times 5, or 0 as at a terminal state."""
+    loss = Experiment(small(algorithm=PPORPEConfig(time_limit=time_limit))).agent.loss
+    batch = TensorDict(
+        {
+            "observation": torch.zeros(2, 3),
+            "action": torch.zeros(2, 1),
+            "action_log_prob": torch.zeros(2),
+            "next": {
+                "observation": torch.zeros(2, 3),
+                "reward": torch.zeros(2, 1),
+                "done": torch.tensor([[True], [False]]),
+                "terminated": torch.zeros(2, 1, dtype=torch.bool),
+            },
+        },
+        [2],
+    )
+    for parameters in (loss.critic_network_params, loss.target_critic_network_params):
+        parameters.apply_(lambda p: p.data.zero_())
+        parameters["module", "body", "6", "bias"].data.fill_(5.0)
+    loss(batch)
+    at_limit = 5.0 if time_limit == "terminated" else 0.05
+    torch.testing.assert_close(batch["td_error"], torch.tensor([at_limit, 0.05]))
 
 
 @pytest.mark.parametrize("scale", [0.1, 1.0, 2.5])

@@ -7,7 +7,12 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
-from torch.distributions import Normal
+from torch.distributions import (
+    AffineTransform,
+    Normal,
+    SigmoidTransform,
+    TransformedDistribution,
+)
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.objectives import ClipPPOLoss
@@ -111,11 +116,22 @@ def test_the_log_likelihood_is_that_of_a_squashed_normal():
     assert (td["action"].abs().amax() > 2.0) and (td["action"] >= -2.0).all()
 
 
+def test_a_sigmoid_squashes_a_normal_of_the_given_location_and_scale():
+    """By torch's own transforms; the actor's other keys are those of the normal."""
+    torch.manual_seed(0)
+    td = make_actor(3, Bounded(low=-2.0, high=4.0, shape=(2,)), squash="sigmoid")(observations(50))
+    normal = Normal(td["loc"].double(), td["scale"].double())
+    squashed = TransformedDistribution(normal, [SigmoidTransform(), AffineTransform(-2.0, 6.0)])
+    expected = squashed.log_prob(td["action"].double()).sum(-1)
+    torch.testing.assert_close(td["action_log_prob"].double(), expected, rtol=1e-3, atol=1e-3)
+
+
 @pytest.mark.parametrize(
     ("squash", "action", "expected"),
     [
         ("tanh", 2, torch.tanh),
         ("tanh", Bounded(-2.0, 4.0, shape=(2,)), lambda loc: 1.0 + 3.0 * loc.tanh()),
+        ("sigmoid", Bounded(-2.0, 4.0, shape=(2,)), lambda loc: 6.0 * loc.sigmoid() - 2.0),
         ("none", 2, lambda loc: loc),
         ("none", Unbounded(shape=(2,)), lambda loc: loc),
     ],
@@ -218,7 +234,11 @@ def test_compiled_they_give_the_same_numbers():
             ValueError,
             "every entry of hidden must be at least 1",
         ),
-        (lambda: make_actor(3, 1, squash="clip"), ValueError, "squash must be 'tanh' or 'none'"),
+        (
+            lambda: make_actor(3, 1, squash="clip"),
+            ValueError,
+            "squash must be 'tanh' or 'sigmoid' or 'none'",
+        ),
         (lambda: make_actor(3, 1, squish_b=0.0), ValueError, "b must be finite"),
         (lambda: make_actor(3, Unbounded(shape=(2,))), ValueError, "needs finite bounds"),
         (lambda: make_actor(3, Bounded(-1.0, math.inf, (2,))), ValueError, "needs finite bounds"),

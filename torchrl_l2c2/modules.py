@@ -55,6 +55,33 @@ class Squish(nn.Module):
         return f"b={self.b}"
 
 
+class SigmoidNormal(TanhNormal):
+    r"""A normal squashed into bounds by the logistic function: a tanh of half its values.
+
+    .. math::
+        \mathrm{low} + (\mathrm{high} - \mathrm{low})\, \sigma(x), \qquad
+        \sigma(x) = \tfrac{1}{2} \big(1 + \tanh \tfrac{x}{2}\big)
+
+    Takes what :class:`~torchrl.modules.TanhNormal` takes; its base distribution has half the
+    location and half the scale that were given.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_l2c2.modules import SigmoidNormal
+        >>> policy = SigmoidNormal(torch.tensor([2.0]), torch.tensor([0.5]), low=0.0, high=10.0)
+        >>> policy.deterministic_sample, 10 * torch.tensor([2.0]).sigmoid()
+        (tensor([8.8080]), tensor([8.8080]))
+    """
+
+    def update(self, loc: Tensor, scale: Tensor) -> None:
+        """Sets the location and the scale of the normal, before it is squashed."""
+        super().update(loc / 2, scale / 2)
+
+
+# How a sample of the normal is kept in the action's bounds.
+DISTRIBUTIONS = {"tanh": TanhNormal, "sigmoid": SigmoidNormal, "none": IndependentNormal}
+
+
 class EncodedNetwork(nn.Module):
     """A network on what an encoder makes of the first input, with the other inputs as they are."""
 
@@ -99,7 +126,7 @@ def make_actor(
     action: TensorSpec | int,
     *,
     hidden: Sequence[int] = (100, 100),
-    squash: Literal["tanh", "none"] = "tanh",
+    squash: Literal["tanh", "sigmoid", "none"] = "tanh",
     scale_mapping: str = "biased_softplus_1.0",
     squish_b: float = 4.0,
     in_keys: Sequence[NestedKey] = ("observation",),
@@ -120,7 +147,8 @@ def make_actor(
     Keyword Args:
         hidden (sequence of int): neurons of each hidden layer. More can represent more and cost
             more. Default ``(100, 100)``.
-        squash (str): ``"tanh"`` maps the normal sample into the action's bounds; ``"none"`` leaves
+        squash (str): ``"tanh"`` maps the normal sample into the action's bounds, ``"sigmoid"``
+            too, at half the pace (:class:`SigmoidNormal`); ``"none"`` leaves
             it unbounded, for an environment that clips. [inferred] Default ``"tanh"``.
         scale_mapping (str): how the scale is made positive, a name that
             :class:`~tensordict.nn.NormalParamExtractor` knows. [inferred] Default
@@ -149,7 +177,7 @@ def make_actor(
         >>> batch["action"].shape, batch["action_log_prob"].shape
         (torch.Size([8, 1]), torch.Size([8]))
     """
-    check_choice("make_actor: squash", squash, ("tanh", "none"))
+    check_choice("make_actor: squash", squash, tuple(DISTRIBUTIONS))
     spec = action
     if not isinstance(spec, TensorSpec):
         check_positive_int("make_actor: the number of actions", action)
@@ -163,8 +191,8 @@ def make_actor(
         TensorDictModule(network, in_keys=list(in_keys), out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
         spec=spec,
-        distribution_class=TanhNormal if squash == "tanh" else IndependentNormal,
-        distribution_kwargs=_bounds(spec) if squash == "tanh" else {},
+        distribution_class=DISTRIBUTIONS[squash],
+        distribution_kwargs={} if squash == "none" else _bounds(spec),
         return_log_prob=True,
         log_prob_key="action_log_prob",
         default_interaction_type=ExplorationType.RANDOM,
@@ -266,7 +294,7 @@ def _bounds(spec: TensorSpec) -> dict[str, Tensor]:
     low, high = spec.space.low, spec.space.high
     if not (isinstance(spec, Bounded) and low.isfinite().all() and high.isfinite().all()):
         raise ValueError(
-            f"make_actor: squash='tanh' needs finite bounds of the action, got {spec}: "
+            f"make_actor: squashing needs finite bounds of the action, got {spec}: "
             "use squash='none'."
         )
     return {"low": low, "high": high}

@@ -294,6 +294,7 @@ NEUTRAL_SETTINGS = {
     "device": "cpu",
     "algorithm.activation": "tanh",
     "algorithm.initial_scale": 1.0,
+    "algorithm.time_limit": "truncated",
     "algorithm.scale_mapping": "softplus",
     "regularizer.policy_distance": "hellinger",
     "regularizer.over_neighbors": "mean",

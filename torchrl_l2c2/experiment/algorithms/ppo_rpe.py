@@ -56,8 +56,13 @@ class PPORPEConfig(OffPolicyConfig):
     reward_scale: float | None = Field(
         default=None, description="factor on rewards while learning; null: 1 - gamma [inferred]"
     )
-    squash: Literal["tanh", "none"] = Field(
+    squash: Literal["tanh", "sigmoid", "none"] = Field(
         default="tanh", description="how actions are kept in their bounds [inferred: tanh]"
+    )
+    time_limit: Literal["truncated", "terminated"] = Field(
+        default="truncated",
+        description="whether the value at a time limit is that of the state, or 0 as at a terminal "
+        "one [inferred: truncated]",
     )
     initial_scale: float = Field(
         default=1.0,
@@ -113,7 +118,7 @@ class PPORPEConfig(OffPolicyConfig):
         from torchrl_l2c2.objectives import PPORPELoss
         from torchrl_l2c2.updaters import TSoftUpdate
 
-        check_actions(env, self.name, continuous=True, squashed=self.squash == "tanh")
+        check_actions(env, self.name, continuous=True, squashed=self.squash != "none")
         size = observation_size(env)
         actor = make_actor(
             size,
@@ -144,6 +149,8 @@ class PPORPEConfig(OffPolicyConfig):
             baseline=self.baseline,
             importance=self.importance,
         )
+        if self.time_limit == "terminated":
+            loss.set_keys(terminated="done")
         loss = regularizer.add_to(loss)
         acting = "target_actor_network" if self.acting_policy == "target" else "actor_network"
         return Agent(
