@@ -19,6 +19,7 @@ from tensordict import TensorDict
 from torchrl_l2c2 import make_actor
 from torchrl_l2c2.experiment import (
     AdamConfig,
+    AdaTermConfig,
     CAPSConfig,
     DQNConfig,
     Experiment,
@@ -102,6 +103,7 @@ def test_the_same_seed_gives_the_same_numbers_and_another_seed_others():
         {"algorithm": PPORPEConfig(schedule="step", updates=2)},
         {"algorithm": PPORPEConfig(acting_policy="online", baseline="target")},
         {"algorithm": PPORPEConfig(importance="mean")},
+        {"algorithm": PPORPEConfig(reduction="sum")},
         {"algorithm": PPORPEConfig(time_limit="terminated", squash="sigmoid")},
         {"algorithm": PPORPEConfig(squash="none", threshold="ema", critic_weighting="ratio")},
         {"algorithm": PPORPEConfig(reward_scale=1.0, hidden=(8,), num_heads=1, updates=3)},
@@ -120,6 +122,20 @@ def test_every_alternative_changes_the_run(settings):
     first, second = parameters(), parameters(**settings)
     assert second.isfinite().all()
     assert first.shape != second.shape or not torch.equal(first, second)
+
+
+def test_a_sum_over_the_batch_is_a_smaller_eps():
+    """To AdaTerm: its steps know no other scale of a gradient. The regularizer is summed, too."""
+
+    def learn(reduction, eps):
+        algorithm = PPORPEConfig(reduction=reduction, updates=3, hidden=(8,))
+        experiment = Experiment(small(algorithm=algorithm, optimizer=AdaTermConfig(eps=eps)))
+        experiment.train()
+        return torch.cat([p.detach().flatten() for p in experiment.agent.loss.parameters()])
+
+    summed, averaged = learn("sum", 1e-3), learn("mean", 1e-3)
+    torch.testing.assert_close(summed, learn("mean", 1e-3 / 32), rtol=0, atol=1e-6)
+    assert (summed - averaged).abs().max() > 1e-4
 
 
 @pytest.mark.parametrize("time_limit", ["truncated", "terminated"])

@@ -294,6 +294,7 @@ NEUTRAL_SETTINGS = {
     "device": "cpu",
     "algorithm.activation": "tanh",
     "algorithm.initial_scale": 1.0,
+    "algorithm.reduction": "mean",
     "algorithm.time_limit": "truncated",
     "algorithm.scale_mapping": "softplus",
     "regularizer.policy_distance": "hellinger",

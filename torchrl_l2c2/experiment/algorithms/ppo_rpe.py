@@ -50,6 +50,11 @@ class PPORPEConfig(OffPolicyConfig):
         default="max",
         description="what the weights of prioritized replay are divided by [inferred: max]",
     )
+    reduction: Literal["mean", "sum"] = Field(
+        default="mean",
+        description="of losses and regularization over the batch; a sum lifts gradients above the "
+        "optimizer's eps [inferred: mean]",
+    )
     acting_policy: Literal["target", "online"] = Field(
         default="target", description="which copy of the policy acts [inferred: target]"
     )
@@ -148,6 +153,7 @@ class PPORPEConfig(OffPolicyConfig):
             critic_weighting=self.critic_weighting,
             baseline=self.baseline,
             importance=self.importance,
+            reduction=self.reduction,
         )
         if self.time_limit == "terminated":
             loss.set_keys(terminated="done")
