@@ -9,10 +9,23 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
 import onnxruntime
+from gymnasium import spaces
+
+
+def observed(space: spaces.Space[Any], seen: Any, contract: dict[str, Any]) -> Any:
+    """What the policy reads: a vector, of several in the order of their names, or an image."""
+    if image := contract.get("image"):
+        scaled = (seen - image["low"]) / (image["high"] - image["low"])
+        return scaled.transpose(image["axes"]).reshape(contract["shape"][1:])
+    if isinstance(space, spaces.Dict):
+        names = sorted(space.spaces)
+        return np.concatenate([spaces.flatten(space[name], seen[name]) for name in names])
+    return spaces.flatten(space, seen)
 
 
 def play(folder: Path, episodes: int) -> None:
@@ -26,6 +39,7 @@ def play(folder: Path, episodes: int) -> None:
         seen, _ = env.reset(seed=episode)
         rewards, actions, over = [], [], False
         while not over:
+            seen = observed(env.observation_space, seen, contract["observation"])
             # What the policy was trained on: float32, with the task's noise.
             seen = seen + contract["noise_scale"] * noise.standard_normal(seen.shape)
             batch = seen.astype(np.float32)[None]
@@ -35,6 +49,9 @@ def play(folder: Path, episodes: int) -> None:
             actions.append(action)
             over = terminated or truncated
         returns.append(sum(rewards))
+        if "choices" in contract["action"]:  # labels, whose order says nothing: one-hot
+            kinds = np.eye(contract["action"]["choices"])
+            actions = kinds[np.array(actions) - contract["action"]["first"]]
         changes.append(np.linalg.norm(np.diff(actions, axis=0), axis=-1).mean())
     env.close()
     print(f"return {np.mean(returns):.1f}")

@@ -1,5 +1,10 @@
 """Small settings of every algorithm, for tests that are not about learning well."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from hydra.core.config_store import ConfigStore
+
 from torchrl_l2c2.experiment import (
     DQNConfig,
     PPOConfig,
@@ -9,6 +14,7 @@ from torchrl_l2c2.experiment import (
     TD3Config,
     UniformReplayConfig,
 )
+from torchrl_l2c2.experiment.config import GROUPS
 
 ALGORITHMS = {
     "ppo_rpe": PPORPEConfig(hidden=(8,)),
@@ -27,3 +33,15 @@ def replay_of(name):
 def env_id_of(name):
     """A task that it can learn."""
     return "CartPole-v1" if name == "dqn" else "Pendulum-v1"
+
+
+@contextmanager
+def own_nodes() -> Iterator[None]:
+    """Room for the nodes of the command; other tests store TorchRL's, of the same names."""
+    store = ConfigStore.instance()
+    stored = store.repo
+    store.repo = {name: nodes for name, nodes in stored.items() if name not in GROUPS}
+    try:
+        yield
+    finally:
+        store.repo = stored

@@ -67,7 +67,7 @@ experiment.reports.choice experiment.reports.pairwise
 experiment.reports.page experiment.reports.readme experiment.reports.results
 experiment.reports.__init__
 experiment.reports.__main__
-experiment.trained experiment.search
+experiment.trained
 experiment.video
 experiment.workers
 experiment.evaluate experiment.update experiment.player experiment.manual
@@ -83,6 +83,8 @@ experiment.gain
 experiment.continuation experiment.schedules
 experiment.training
 experiment.command
+experiment.search_space
+experiment.search
 experiment.__init__
 experiment.__main__ __main__
 """.strip().splitlines()

@@ -1,6 +1,7 @@
 """Tests during training, and evaluate: the policy that was best, and the figures of any."""
 
 import json
+import math
 from dataclasses import replace
 
 import pytest
@@ -13,10 +14,15 @@ from torchrl_l2c2.experiment import (
     ExperimentConfig,
     TaskConfig,
     diagnose,
+    evaluate,
     evaluate_policy,
     load_policy,
+    video,
 )
 from torchrl_l2c2.experiment.evaluate import main
+
+# What each command begins with.
+LOADS = {evaluate: "load_policy", diagnose: "diagnose_run", video: "play_pictures"}
 
 TASK = TaskConfig("pendulum", "Pendulum-v1", episodes=6, max_steps=40)
 
@@ -110,6 +116,46 @@ def test_evaluate_records_its_first_episode(folder, tmp_path):
     assert ffmpeg.count_frames_and_secs(str(tmp_path / "test.mp4"))[0] == 41
     with pytest.raises(SystemExit):
         evaluated(folder, "--record", str(tmp_path / "other.mp4"), "--sampled")
+
+
+@pytest.mark.parametrize(
+    ("option", "told"),
+    [
+        ("--output=file/x.json", r"the folder '.*file' cannot be written to .*; choose another"),
+        ("--output=.", "is a folder; name a file"),
+        ("--record=file/x.mp4", r"the folder '.*file' cannot be written to"),
+        ("--record=x.foo", r"a video's file ends in .*\.mp4, got 'x.foo'"),
+    ],
+)
+def test_what_could_not_be_written_is_refused_before_it_is_played(
+    folder, tmp_path, monkeypatch, option, told
+):
+    """By all commands that write what they played."""
+    pytest.importorskip("imageio_ffmpeg")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    for module in (evaluate, diagnose, video):
+        monkeypatch.setattr(f"{module.__name__}.{LOADS[module]}", None)
+    with pytest.raises(SystemExit, match=f"error: .*{told}"):
+        main([str(folder), option])
+    other = diagnose if option.startswith("--output") else video
+    with pytest.raises(SystemExit, match=f"error: .*{told}"):
+        other.main([str(folder), option.replace("--record", "--output")])
+
+
+def test_the_summary_is_json_and_is_told_before_anything_is_written(folder, capsys, monkeypatch):
+    """What is no number, such as a measure of too short an episode, is null."""
+    figures = {"return_mean": 1.0, "roughness_mean": math.nan}
+    monkeypatch.setattr(evaluate.Evaluation, "summary", lambda self: figures)
+    monkeypatch.setattr(evaluate, "write_json", broken)
+    with pytest.raises(SystemExit, match="error: no space left"):
+        main([str(folder), "--episodes", "1", "--output", str(folder / "result.json")])
+    told = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    assert told == {"return_mean": 1.0, "roughness_mean": None}
+
+
+def broken(path, value):
+    raise OSError("no space left")
 
 
 def test_sensitivity_to_noise_is_among_the_measures():

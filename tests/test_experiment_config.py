@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
-from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
+from small import own_nodes
 
 import torchrl_l2c2
 from torchrl_l2c2.experiment import (
@@ -33,16 +33,11 @@ ROOT = Path(__file__).parent.parent
 
 
 def composed(*overrides):
-    """What the command composes; other tests store TorchRL's nodes under the same names."""
-    store = ConfigStore.instance()
-    stored = store.repo
-    store.repo = {name: nodes for name, nodes in stored.items() if name not in GROUPS}
-    try:
+    """What the command composes."""
+    with own_nodes():
         register()
         with initialize_config_dir(str(CONF), version_base="1.3"):
             return OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
-    finally:
-        store.repo = stored
 
 
 def test_the_command_has_the_defaults_of_the_classes():

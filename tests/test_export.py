@@ -3,8 +3,10 @@
 import json
 import os
 import re
+import runpy
 import subprocess
 import sys
+from collections import OrderedDict
 from pathlib import Path
 
 import gymnasium
@@ -19,6 +21,7 @@ from torchrl.envs import ExplorationType, GymWrapper, set_exploration_type
 from torchrl_l2c2.experiment import (
     Experiment,
     ExperimentConfig,
+    PPORPEConfig,
     TaskConfig,
     evaluate_policy,
 )
@@ -30,12 +33,12 @@ onnxruntime = pytest.importorskip("onnxruntime")
 ROOT = Path(__file__).parents[1]
 
 
-def finished_run(folder, name="ppo_rpe", **task):
+def finished_run(folder, name="ppo_rpe", algorithm=None, **task):
     config = ExperimentConfig(
         task=TaskConfig(
             "task", **{"env_id": env_id_of(name), "episodes": 3, "max_steps": 40, **task}
         ),
-        algorithm=ALGORITHMS[name],
+        algorithm=algorithm or ALGORITHMS[name],
         replay=replay_of(name),
         compile=False,
         test_episodes=1,
@@ -141,6 +144,86 @@ class Named(gymnasium.Env):
 
 
 gymnasium.register("Named-v0", Named)
+
+
+class Clock(gymnasium.Env):
+    """Every episode is the same but for its actions, the numbers of which are its rewards."""
+
+    action_space = gymnasium.spaces.Discrete(3, start=5)
+
+    def __init__(self, observation_space):
+        self.observation_space = observation_space
+
+    def see(self):
+        self.observation_space.seed(self.time)
+        return self.observation_space.sample()
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.time = 0
+        return self.see(), {}
+
+    def step(self, action):
+        assert self.action_space.contains(np.int64(action))
+        self.time += 1
+        return self.see(), float(action), False, False, {}
+
+
+gymnasium.register("Clock-v0", Clock)
+ANGLE = gymnasium.spaces.Box(-1, 1, (2,))
+NESTED = OrderedDict(b=ANGLE, a=gymnasium.spaces.Dict(label=gymnasium.spaces.Discrete(4)))
+
+
+@pytest.mark.parametrize(
+    ("space", "task"),
+    [
+        (gymnasium.spaces.Box(-9, 9, (2,), np.float64), {}),
+        (gymnasium.spaces.Dict(NESTED), {"flatten": True}),
+        (gymnasium.spaces.Box(10, 250, (9, 8, 3), np.uint8), {"images": True}),
+        (gymnasium.spaces.Box(0, 255, (3, 9, 8), np.uint8), {"images": True}),
+        (gymnasium.spaces.Box(0, 255, (9, 8), np.uint8), {"images": True}),
+    ],
+    ids=["vector", "nested", "channels last", "channels first", "no channels"],
+)
+def test_the_example_plays_what_the_run_tested(tmp_path, monkeypatch, capsys, space, task):
+    """Numbers of actions, their variation and what is observed are those of training."""
+    monkeypatch.setitem(gymnasium.registry["Clock-v0"].kwargs, "observation_space", space)
+    folder = finished_run(tmp_path, "dqn", env_id="Clock-v0", **task)
+    # A policy of a few updates does the same at all times.
+    weights = torch.load(folder / "policy.pt", weights_only=True)
+    torch.manual_seed(0)
+    torch.save({k: 3 * torch.randn(v.shape) for k, v in weights.items()}, folder / "policy.pt")
+    policy, env, steps = load_policy(folder)
+    expected = evaluate_policy(policy, env, 1, max_steps=steps).summary()
+    example = runpy.run_path(str(ROOT / "examples" / "onnx_policy.py"))
+    exported = export_policy(folder)
+    seen = example["observed"](space, Clock(space).reset()[0], exported.contract["observation"])
+    np.testing.assert_allclose(env.reset()["observation"], seen, rtol=1e-6)
+    example["play"](exported.folder, 1)
+    told = dict(re.findall(r"^([a-z ]+) (\S+)$", capsys.readouterr().out, re.M))
+    assert float(told["return"]) == expected["return_mean"]
+    variation = expected["action_variation_mean"]
+    assert float(told["action variation"]) == pytest.approx(variation, abs=1e-3)
+    assert variation > 0 or "images" in task
+
+
+def test_episodes_of_one_step_are_enough_and_no_bounds_are_made_up(tmp_path):
+    """One row is all that there is to trace; an unbounded action has no lowest."""
+    folder = finished_run(
+        tmp_path, algorithm=PPORPEConfig(hidden=(8,), squash="none"), env_id="Free-v0", max_steps=1
+    )
+    contract = export_policy(folder).contract
+    assert contract["agreement"]["observations"] == 1
+    assert contract["action"].keys() == {"shape", "dtype", "entries"}
+
+
+class Free(Named):
+    """Takes any number."""
+
+    action_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,), np.float32)
+
+
+gymnasium.register("Free-v0", Free)
 
 
 @pytest.mark.parametrize(

@@ -395,6 +395,19 @@ class TestNeighbors:
             mean = terms["l2c2_distance"].item() - NEAR.epsilon
             assert mean == pytest.approx(0.75, abs=0.03)
 
+    @pytest.mark.parametrize("written", [False, True], ids=["drawn here", "in the batch"])
+    def test_a_single_transition_is_taken(self, written):
+        """Its terms are those of a batch of it alone."""
+        loss = L2C2Loss(DDPGLoss(deterministic_actor(), qvalue()), NEAR)
+        batch, terms = transitions(1), []
+        if written:
+            NeighborTransform(NEAR)(batch)
+        for each in (batch, batch[0]):
+            torch.manual_seed(0)
+            terms.append(loss(each))
+        for name in loss.added_terms:
+            torch.testing.assert_close(terms[1][name], terms[0][name])
+
     def test_neighbors_are_drawn_as_often_as_asked(self):
         """More samples leave the mean as it is and make it less noisy."""
         torch.manual_seed(0)
@@ -443,10 +456,11 @@ class TestWhichStatesAreMoved:
         batch = TensorDict({**batch, "action": torch.zeros(400, 2), "next": later}, [400])
         return L2C2Loss(DDPGLoss(actor, value), **{"neighborhood": NEAR, **kwargs}), batch
 
-    def test_the_keys_can_be_chosen(self):
+    @pytest.mark.parametrize("keys", [["position"], "position"], ids=["a list", "one"])
+    def test_the_keys_can_be_chosen(self, keys):
         """The largest of one draw has the mean 1/2; of all three 3/4."""
         torch.manual_seed(0)
-        loss, batch = self.two_part_loss(moved_keys=["position"])
+        loss, batch = self.two_part_loss(moved_keys=keys)
         mean = loss.policy_regularizer(batch)["l2c2_distance"].item() - NEAR.epsilon
         assert mean == pytest.approx(0.5, abs=0.05)
 
@@ -697,6 +711,7 @@ class TestConstruction:
             ({"neighborhood": 1.0}, TypeError, r"neighborhood must be a Neighborhood, got 1\.0"),
             ({"num_samples": 0}, ValueError, "num_samples must be at least 1"),
             ({"num_samples": 1.5}, TypeError, "num_samples must be an integer"),
+            ({"moved_keys": []}, ValueError, "moved_keys must name at least one observation"),
             ({"hellinger_samples": 0}, ValueError, "hellinger_samples must be at least 1"),
             ({"hellinger_samples": "8"}, TypeError, "hellinger_samples must be an integer"),
             (

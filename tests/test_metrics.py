@@ -1,5 +1,7 @@
 """The measures of smoothness against hand-computed numbers."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -205,6 +207,14 @@ def test_saturation_counts_what_is_at_the_bounds():
     assert saturation(actions, low, high, margin=0.0).item() == pytest.approx(1 / 6)
 
 
+def test_of_a_range_that_is_open_only_the_bound_counts():
+    """It has no width to take a share of; the end that is not there is never met."""
+    actions = torch.tensor([[0.0], [0.001], [5.0], [-1.0]])
+    assert saturation(actions, 0.0, math.inf).item() == pytest.approx(2 / 4)
+    assert saturation(actions, -math.inf, 5.0).item() == pytest.approx(1 / 4)
+    assert saturation(actions, -math.inf, math.inf).item() == 0.0
+
+
 def test_noise_sensitivity_of_a_linear_policy():
     """Half the squared scale times the squared norm of its weights."""
     weight = torch.tensor([[1.0, -2.0, 0.0], [0.0, 0.5, 3.0]])
@@ -233,3 +243,5 @@ def test_measures_of_batches_and_what_is_too_short(measure, least):
         torch.testing.assert_close(measure(batch)[1, 2], measure(batch[1, 2]))
     with pytest.raises(ValueError, match=f"T of at least {least}, got"):
         measure(torch.zeros(least - 1, 2))
+    with pytest.raises(ValueError, match=rf"{measure.__name__}: actions must .* got \(9,\)"):
+        measure(torch.zeros(9))

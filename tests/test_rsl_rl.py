@@ -294,6 +294,12 @@ def test_the_environments_final_observations_are_used() -> None:
     assert update(ppo)["cats"] == pytest.approx(term.item(), rel=1e-5)
 
 
+def test_final_observations_that_lack_a_group_are_refused() -> None:
+    """In the step that has them, with what is missing; not later in the update."""
+    with pytest.raises(KeyError, match=r"'final_obs'.* lacks the groups \['privileged'\]"):
+        collected(make(rsl.CATSPPO), final_obs=observations(77).select("policy"))
+
+
 def mirror(env: Any, obs: TensorDict | None, actions: Tensor | None) -> tuple[Any, Any]:
     """Left for right, as rsl_rl's extension asks for it."""
     both_obs = None if obs is None else torch.cat((obs, obs.apply(torch.neg)))
@@ -339,10 +345,11 @@ def test_the_gain_rises_with_the_updates_and_is_resumed() -> None:
     assert update(collected(resumed)) == losses
 
 
-def test_a_checkpoint_of_plain_ppo_is_a_beginning() -> None:
+@pytest.mark.parametrize("before", [PPO, rsl.CATSPPO], ids=["plain", "another regularizer"])
+def test_a_checkpoint_of_another_ppo_is_a_beginning(before: type[PPO]) -> None:
     """Its networks are taken, and the ramp begins."""
     ppo = make(rsl.L2C2PPO, regularizer_cfg={"ramp_updates": 4})
-    ppo.load(make(PPO).save(), None, strict=True)
+    ppo.load(make(before).save(), None, strict=True)
     assert update(collected(ppo))["l2c2_actor"] == 0
 
 

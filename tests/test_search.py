@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -12,9 +13,12 @@ import pytest
 
 optuna = pytest.importorskip("optuna")
 
+from small import own_nodes  # noqa: E402
+
 from tests.test_front import forget  # noqa: E402
 from tests.test_reports import make_config, make_run  # noqa: E402
-from torchrl_l2c2.experiment.search import Search, main, read_space  # noqa: E402
+from torchrl_l2c2.experiment.search import Search, main  # noqa: E402
+from torchrl_l2c2.experiment.search_space import check_settings, read_space  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
 GAINS = ("regularizer.lambda_max=tag(log, interval(0.1, 10))", "regularizer.beta=interval(0,1)")
@@ -24,12 +28,22 @@ SHORT = (
 )  # fmt: skip
 
 
+@pytest.fixture(autouse=True)
+def nodes():
+    """A search checks its settings as the command reads them."""
+    with own_nodes():
+        yield
+
+
 def test_hydras_grammar_says_what_is_searched():
     """Intervals and choices; sweeps are of every trial."""
-    space, fixed = read_space([*GAINS, "regularizer=choice(caps,l2c2)", "seed=0,1", "task=ant"])
+    samples = "regularizer.num_samples=int(interval(1, 4))"
+    choice = "regularizer=choice(caps,l2c2)"
+    space, fixed = read_space([*GAINS, samples, choice, "seed=0,1", "task=ant"])
     assert space == {
         "regularizer.lambda_max": optuna.distributions.FloatDistribution(0.1, 10.0, log=True),
         "regularizer.beta": optuna.distributions.FloatDistribution(0.0, 1.0),
+        "regularizer.num_samples": optuna.distributions.IntDistribution(1, 4),
         "regularizer": optuna.distributions.CategoricalDistribution(("caps", "l2c2")),
     }
     assert fixed == ["seed=0,1", "task=ant"]
@@ -96,6 +110,58 @@ def test_a_trial_without_late_tests_is_scored_by_its_last_policies(tmp_path):
     ]
     with pytest.raises(RuntimeError, match=r"trial 3 has no results; .* test_episodes of"):
         search.tell(2)
+
+
+@pytest.mark.parametrize(
+    ("setting", "told"),
+    [
+        ("regularizer.beta=interval(1,0)", r"'regularizer.beta=.*not smaller, got 1 to 0"),
+        ("regularizer.beta=interval(0,inf)", r"'regularizer.beta=.*finite number .* got 0 to inf"),
+        (
+            "regularizer.beta=tag(log,interval(0,1))",
+            r"'regularizer.beta=.*a logarithmic scale begins above 0, got 0\.",
+        ),
+        ("regularizer.bta=interval(0,1)", r"Could not override 'regularizer.bta'"),
+        ("regularizer.beta=interval(-2,-1)", r"regularizer.beta must be .* got -1.293"),
+        ("regularizer.num_samples=interval(1,3)", "num_samples must be a valid integer, got 2.41"),
+        ("regularizer=choice(l2c2,lipsnet)", "Could not find 'regularizer/lipsnet'"),
+        ("task.noise_scale=-1,0", "task.noise_scale must be .*got -1"),
+    ],
+)
+def test_a_setting_that_cannot_be_is_refused_before_the_first_trial(tmp_path, setting, told):
+    """In a line with its name; neither a folder nor a trial is made for it."""
+    with pytest.raises(SystemExit) as ended:
+        main(["algorithm.tau=interval(0,1)", setting, "--output", str(tmp_path / "search")])
+    assert re.match(f"error: .*{told}", str(ended.value)) and "\n" not in str(ended.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_a_run_can_begin_with_is_searched():
+    """Also up to an open end, and with what is about the launcher."""
+    check_settings(["algorithm.gamma=interval(0,1)", *GAINS, "seed=range(2)", "hydra/launcher=x"])
+    check_settings(["regularizer=glob(l2c2*)", "regularizer.beta=interval(0,1)"])
+    check_settings(["regularizer.num_samples=int(interval(1,2))", "optimizer=choice(adam,adaterm)"])
+
+
+def test_without_optuna_it_says_how_to_get_it(tmp_path, monkeypatch):
+    """In one line."""
+    monkeypatch.setattr("torchrl_l2c2.experiment.search.find_spec", lambda name: None)
+    with pytest.raises(SystemExit, match=r"^error: Optuna is missing: pip install 'torchrl-l2c2"):
+        main([*GAINS, "--output", str(tmp_path / "search")])
+
+
+@pytest.mark.parametrize(
+    ("option", "told"),
+    [
+        (("--trials", "0"), "--trials must be at least 1, got 0"),
+        (("--sampler-seed", "-1"), "--sampler-seed must be at least 0, got -1"),
+    ],
+)
+def test_options_out_of_range_are_named(tmp_path, capsys, option, told):
+    """Before anything is made."""
+    with pytest.raises(SystemExit):
+        main([*GAINS, "--output", str(tmp_path / "search"), *option])
+    assert told in capsys.readouterr().err and not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("setting", ["foo", "regularizer.beta=interval(0,1", "a=interval(b,1)"])

@@ -18,10 +18,12 @@ from torchrl_l2c2.experiment import (
     EpisodeCollector,
     Experiment,
     ExperimentConfig,
+    PPOConfig,
     PPORPEConfig,
     TaskConfig,
     make_env,
 )
+from torchrl_l2c2.experiment.player import SimulatorError
 
 INF = float("inf")
 VECTOR = spaces.Box(-INF, INF, (2,), np.float32)
@@ -190,6 +192,44 @@ def test_actions_without_bounds_are_refused_where_they_are_squashed(monkeypatch,
     with pytest.raises(ValueError, match=r"squashes actions.*algorithm\.squash=none") as refused:
         experiment(name, task())
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("name", CONTINUOUS)
+def test_actions_that_can_take_one_value_alone_are_refused_where_they_are_drawn(monkeypatch, name):
+    """With which they are; a deterministic policy takes that value."""
+    still(monkeypatch, action=spaces.Box(np.array([-1.0, 2.0], "f4"), np.array([1.0, 2.0], "f4")))
+    if name == "td3":
+        experiment(name, task())
+        return
+    with pytest.raises(ValueError, match=r"entries \[1\] of this task's can take one value alone"):
+        experiment(name, task())
+
+
+SEVERAL_ENVS = PPOConfig(frames=20, num_envs=2, epochs=1, hidden=(8,))
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [("sac", {}), ("ppo", {}), ("ppo", {"algorithm": SEVERAL_ENVS, "num_workers": 1})],
+    ids=["frame by frame", "episodes", "rollouts"],
+)
+def test_a_reward_may_be_an_array_of_one_number(monkeypatch, name, settings):
+    """However it is played; of several, the task is named."""
+    step = Still.step
+    for count in (1, 2):
+
+        def paid(self, action, count=count):
+            seen, reward, *rest = step(self, action)
+            return seen, np.full(count, reward), *rest
+
+        monkeypatch.setattr(Still, "step", paid)
+        still(monkeypatch)
+        run = experiment(name, task(episodes=2), **settings)
+        if count == 1:
+            assert all(math.isfinite(row["return"]) for row in run.train())
+            continue
+        with pytest.raises(SimulatorError, match=r"Still-v0 failed .* must be one number, got arr"):
+            run.train()
 
 
 def test_ppo_rpe_acts_without_bounds_where_it_does_not_squash(monkeypatch):

@@ -248,14 +248,42 @@ def test_what_it_cannot_update_is_refused():
         ({"tau": 0.0}, r"tau must be in \(0, 1\], got 0.0"),
         ({"tau": 1.5}, r"tau must be in \(0, 1\], got 1.5"),
         ({"tau": math.nan}, r"tau must be in \(0, 1\]"),
-        ({"nu": 0.0}, "nu must be greater than 0, got 0.0. math.inf gives"),
-        ({"nu": math.nan}, "nu must be greater than 0"),
+        ({"nu": 0.0}, "nu must be at least 1e-30, got 0.0. math.inf gives"),
+        ({"nu": 1e-40}, "nu must be at least 1e-30, got 1e-40"),
+        ({"nu": math.nan}, "nu must be at least 1e-30"),
     ],
 )
 def test_wrong_settings_are_refused(settings, message):
     """At construction, naming the setting and what is allowed."""
     with pytest.raises(ValueError, match=message):
         TSoftUpdate(TwoNetworks(), **settings)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_targets_in_half_precision_follow_as_in_single(dtype):
+    """But for their rounding; 1e-8 is 0 in float16, and its squared distances are."""
+    loss, single = TwoNetworks().to(dtype), TwoNetworks().to(dtype).float()
+    updater, expected = TSoftUpdate(loss), TSoftUpdate(single)
+    start = single.targets()
+    for seed in range(5):
+        for module, one in ((loss, updater), (single, expected)):
+            module.walk(seed, scale=0.05)
+            one.step()
+    resolution = torch.finfo(dtype).eps
+    for half, whole, first in zip(loss.targets(), single.targets(), start, strict=True):
+        torch.testing.assert_close(half.float(), whole, rtol=0.0, atol=10 * resolution)
+        assert not whole.equal(first)
+
+
+def test_the_smallest_nu_leaves_numbers():
+    """Of sources that stand where their targets are, which weigh most, and of a jump."""
+    loss = TwoNetworks()
+    updater = TSoftUpdate(loss, tau=1e-3, nu=1e-30)
+    for jump in (0.0, 1.0, 0.0):
+        loss.walk(0, scale=0.0, jump=jump)
+        updater.step()
+    numbers = [*loss.targets(), updater._weight, updater._scale]
+    assert all(each.isfinite().all() for each in numbers)
 
 
 def test_its_state_resumes_bit_for_bit():

@@ -6,12 +6,12 @@ from typing import Annotated, get_type_hints
 
 import pytest
 from hydra import compose, initialize_config_dir
-from hydra.core.config_store import ConfigStore
 from hydra.errors import HydraException
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 from pydantic import TypeAdapter
+from small import own_nodes
 
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig
 from torchrl_l2c2.experiment.command import CONF, register
@@ -21,21 +21,16 @@ from torchrl_l2c2.experiment.settings import SettingError, describe
 
 @pytest.fixture(scope="module")
 def settings_of():
-    """What the command makes of its overrides; other tests store TorchRL's nodes as well."""
-    store = ConfigStore.instance()
-    stored = store.repo
-    store.repo = {name: nodes for name, nodes in stored.items() if name not in GROUPS}
-    register()
+    """What the command makes of its overrides."""
 
     def read(line):
         plain = OmegaConf.to_container(compose("config", line.split()), resolve=True)
         return ExperimentConfig.from_dict(plain)
 
-    try:
+    with own_nodes():
+        register()
         with initialize_config_dir(str(CONF), version_base="1.3"):
             yield read
-    finally:
-        store.repo = stored
 
 
 @pytest.mark.parametrize(
@@ -44,6 +39,7 @@ def settings_of():
         ("seed=-1", "seed must be greater than or equal to 0, got -1."),
         ("seed=4294967000", "seed must be less than 2147483648, got 4294967000."),
         ("seed=zero", "seed must be a valid integer, got 'zero'."),
+        ("device=mps", "device must be cpu, cuda or cuda:N, a number from 0 up, got 'mps'."),
         ("seed=1.5", "seed must be a valid integer, got 1.5."),
         ("threads=0", "threads must be greater than or equal to 1, got 0."),
         ("num_workers=0", "num_workers must be greater than or equal to 1, got 0."),

@@ -17,6 +17,8 @@ INITIAL_SCALE = 1e-8
 # Squared distances below this are under the resolution of float32 weights. The floor is met only
 # where source and target stay equal: there the scale would decay to 0, and 0 / 0 is NaN.
 SCALE_FLOOR = 1e-16
+# Below, the weight of a source that is where its target is comes near float32's largest number.
+SMALLEST_NU = 1e-30
 
 
 class TSoftUpdate(TargetNetUpdater):
@@ -47,7 +49,7 @@ class TSoftUpdate(TargetNetUpdater):
         loss_module (LossModule): the loss whose ``target_*_params`` are to follow.
         tau (float): pace, in ``(0, 1]``. Larger values make targets follow more closely; at 1 they
             become their sources. Default 0.1.
-        nu (float): degrees of freedom, above 0. Smaller values hold back more against jumps;
+        nu (float): degrees of freedom, at least 1e-30. Smaller values hold back more against jumps;
             ``math.inf`` gives the ordinary soft update. Default 1.0.
 
     Raises:
@@ -81,7 +83,7 @@ class TSoftUpdate(TargetNetUpdater):
     def __init__(self, loss_module: LossModule, tau: float = 0.1, nu: float = 1.0) -> None:
         check_real("TSoftUpdate: tau", tau, above=0, at_most=1)
         hint = "math.inf gives the ordinary soft update."
-        check_real("TSoftUpdate: nu", nu, above=0, finite=False, hint=hint)
+        check_real("TSoftUpdate: nu", nu, at_least=SMALLEST_NU, finite=False, hint=hint)
         self.tau = tau
         self.nu = nu
         super().__init__(loss_module)
@@ -94,8 +96,8 @@ class TSoftUpdate(TargetNetUpdater):
         self._names = list(sources.keys())
         self._source_list = [sources[name] for name in self._names]
         self._target_list = [targets[f"target_{name}"] for name in self._names]
-        first = self._target_list[0]
-        self._weight = first.new_full((len(self._names),), (1.0 - self.tau) / self.tau)
+        first, start = self._target_list[0], (1.0 - self.tau) / self.tau
+        self._weight = first.new_full((len(self._names),), start, dtype=_precise(first))
         self._scale = torch.full_like(self._weight, INITIAL_SCALE)
 
     @torch.no_grad()
@@ -145,8 +147,14 @@ class TSoftUpdate(TargetNetUpdater):
     def _follow_loss_module(self) -> None:
         """Takes the statistics to where the loss was moved."""
         target = self._target_list[0]
-        if (self._weight.device, self._weight.dtype) != (target.device, target.dtype):
-            self._weight, self._scale = self._weight.to(target), self._scale.to(target)
+        place = target.device, _precise(target)
+        if (self._weight.device, self._weight.dtype) != place:
+            self._weight, self._scale = self._weight.to(*place), self._scale.to(*place)
+
+
+def _precise(target: Tensor) -> torch.dtype:
+    """Of the statistics: squared distances of weights in half precision are 0 in that."""
+    return torch.promote_types(target.dtype, torch.float32)
 
 
 def t_soft_update(
@@ -163,8 +171,8 @@ def t_soft_update(
     Args:
         targets (list of Tensor): ``N`` target parameters of one dtype, on one device.
         sources (list of Tensor): what they follow.
-        weight (Tensor): accumulated weights :math:`W`, shape ``[N]``.
-        scale (Tensor): squared scales :math:`s^2`, shape ``[N]``.
+        weight (Tensor): accumulated weights :math:`W`, shape ``[N]``, in float32 or better.
+        scale (Tensor): squared scales :math:`s^2`, likewise.
 
     Keyword Args:
         tau (float): pace.
@@ -173,10 +181,11 @@ def t_soft_update(
     # In terms of 1 / nu, so that nu = inf needs no case of its own.
     rate = 0.0 if math.isinf(nu) else 1.0 / nu
     differences = torch._foreach_sub(sources, targets)
-    squares = torch._foreach_mul(differences, differences)
+    wide = [difference.to(scale.dtype) for difference in differences]
+    squares = torch._foreach_mul(wide, wide)
     distance = torch.stack([square.mean() for square in squares])
     w = (1.0 + rate) / (1.0 + rate * distance / scale)
     pace = w / (weight + w)
-    torch._foreach_addcmul_(targets, differences, pace.unbind())
+    torch._foreach_addcmul_(targets, differences, pace.to(differences[0].dtype).unbind())
     scale.add_(tau / (1.0 + rate) * w * (distance - scale)).clamp_min_(SCALE_FLOOR)
     weight.add_(w).mul_(1.0 - tau)

@@ -23,7 +23,7 @@ from torchrl.envs import (
 )
 
 from torchrl_l2c2.experiment.acting import on_tensors
-from torchrl_l2c2.experiment.frames import Frame, stack_frames
+from torchrl_l2c2.experiment.frames import Frame, as_number, stack_frames
 from torchrl_l2c2.transforms import ObservationNoise
 
 PREVIOUS = "previous_observation"
@@ -166,7 +166,7 @@ class EpisodeCollector(Collector):
         seen, reward, terminated, truncated, _ = self._gymnasium.step(self._to_action(action))
         following = self._observe(seen)
         self._observation = None if terminated or truncated else following
-        return Frame(observation, outputs, following, reward, terminated, truncated)
+        return Frame(observation, outputs, following, as_number(reward), terminated, truncated)
 
     def _rollout_by_torchrl(self) -> TensorDictBase:
         if self.env.batch_size or not self.stop_at_done:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import warnings
 from collections.abc import Mapping
 from functools import partial
@@ -89,7 +90,6 @@ class ExperimentConfig:
     )
     device: str = Field(
         default="cpu",
-        pattern=r"^(cpu|cuda(:\d+)?)$",
         description="of the updates and what they learn from: cpu, cuda or cuda:N; episodes are "
         "played on the CPU, by a copy of the policy",
     )
@@ -155,6 +155,7 @@ class ExperimentConfig:
             object.__setattr__(self, "replay", REPLAYS[self.algorithm.usual_replay])
         if self.optimizer is None:
             object.__setattr__(self, "optimizer", OPTIMIZERS[self.algorithm.usual_optimizer])
+        self._check_device()
         self._check_replay()
         self._check_rounds()
 
@@ -218,6 +219,14 @@ class ExperimentConfig:
         if transform is not None:
             buffer.append_transform(transform)
         return buffer
+
+    def _check_device(self) -> None:
+        # Not a pattern of the field, which pydantic would show as it is written.
+        if not re.fullmatch(r"cpu|cuda(:\d+)?", self.device):
+            raise SettingError(
+                "device",
+                f"must be cpu, cuda or cuda:N, a number from 0 up, got {self.device!r}.",
+            )
 
     def _check_replay(self) -> None:
         on_policy = self.algorithm.usual_replay == "rollout"

@@ -16,7 +16,7 @@ from torchrl_l2c2.experiment.diagnosis import (
     write_page,
 )
 from torchrl_l2c2.experiment.environments import TEST_SEED
-from torchrl_l2c2.experiment.folder import make_folder
+from torchrl_l2c2.experiment.folder import make_folder_of
 from torchrl_l2c2.experiment.reports.paper import method_name
 
 
@@ -29,6 +29,9 @@ def main(arguments: Iterable[str] | None = None) -> None:
     if chosen.names and len(chosen.names) != len(chosen.folders):
         parser.error(f"--names: one for each of the {len(chosen.folders)} runs, got {chosen.names}")
     try:
+        # Before anything is played that could be lost.
+        for given in filter(None, (chosen.output, chosen.actions)):
+            make_folder_of(given)
         names = chosen.names or _names(chosen.folders)
         diagnoses = [
             diagnose_run(
@@ -43,12 +46,9 @@ def main(arguments: Iterable[str] | None = None) -> None:
             for folder, name in zip(chosen.folders, names, strict=True)
         ]
         path = Path(chosen.output or Path(chosen.folders[0]) / "diagnosis.html")
-        make_folder(path.parent)
         write_page(path, diagnoses)
         if chosen.actions:
-            picture = Path(chosen.actions)
-            make_folder(picture.parent)
-            picture.write_bytes(draw_together(diagnoses))
+            Path(chosen.actions).write_bytes(draw_together(diagnoses))
     except (ValueError, OSError, RuntimeError, ImportError) as error:
         sys.exit(f"error: {error}")
     compared = "\n".join(comparison(diagnoses))

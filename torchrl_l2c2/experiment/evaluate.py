@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import statistics
 import sys
@@ -23,7 +22,7 @@ from tqdm import tqdm
 
 from torchrl_l2c2.experiment.collection import EpisodeCollector, check_finite, play_episodes
 from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
-from torchrl_l2c2.experiment.folder import write_json
+from torchrl_l2c2.experiment.folder import make_folder_of, to_json, write_json
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.tasks import TaskConfig
 from torchrl_l2c2.experiment.trained import load_policy
@@ -269,8 +268,11 @@ def main(arguments: Iterable[str] | None = None) -> None:
     if chosen.record and chosen.sampled:
         parser.error("--record shows mean actions; leave it or --sampled out")
     try:
+        # Before anything is played that could be lost.
         if chosen.record:
-            check_video()
+            check_video(chosen.record)
+        if chosen.output:
+            make_folder_of(chosen.output)
         policy, env, max_steps = load_policy(
             chosen.folder, seed=chosen.seed, noise_scale=chosen.noise, best=chosen.best
         )
@@ -283,6 +285,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
                 sampled=chosen.sampled,
                 progress=True,
             )
+        print(to_json(result.summary()), flush=True)
         if chosen.record:
             record_video(
                 chosen.folder,
@@ -296,7 +299,6 @@ def main(arguments: Iterable[str] | None = None) -> None:
             write_json(chosen.output, {**played, "episodes": asdict(result)})
     except (ValueError, OSError, RuntimeError, ImportError) as error:
         sys.exit(f"error: {error}")
-    print(json.dumps(result.summary(), indent=2))
 
 
 if __name__ == "__main__":

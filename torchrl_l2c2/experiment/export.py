@@ -18,19 +18,23 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
+from gymnasium.wrappers import TransformObservation
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import OneHot
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
+from torchrl_l2c2.experiment.algorithms.networks import action_bounds
 from torchrl_l2c2.experiment.collection import play_episodes
 from torchrl_l2c2.experiment.environments import control_rate
 from torchrl_l2c2.experiment.folder import make_folder, versions, write_atomically, write_json
 from torchrl_l2c2.experiment.process import ProcessState
+from torchrl_l2c2.experiment.spaces import CountedFromZero
 from torchrl_l2c2.experiment.trained import load_policy
 
 NEEDED = ("onnx", "onnxruntime", "onnxscript")
@@ -41,24 +45,25 @@ TOLERANCE = 1e-4
 class MeanPolicy(nn.Module):
     """A policy's mean as a function of tensors: observations ``[B, *F]`` to actions ``[B, A]``.
 
-    All that belongs to it is inside: layers, squashing, bounds. Discrete ones are numbers ``[B]``.
+    All that belongs to it is inside: layers, squashing, bounds. Discrete ones are numbers ``[B]``,
+    those of the task.
 
     Args:
         policy (TensorDictModule): acts deterministically under ``ExplorationType.DETERMINISTIC``.
-        discrete (bool): whether its actions are one-hot vectors. Default ``False``.
+        first (int, optional): the number of the first action, where actions are one-hot vectors.
     """
 
-    def __init__(self, policy: TensorDictModule, discrete: bool = False) -> None:
+    def __init__(self, policy: TensorDictModule, first: int | None = None) -> None:
         super().__init__()
         self.policy = policy
-        self.discrete = discrete
+        self.first = first
 
     def forward(self, observation: Tensor) -> Tensor:
         """The mean actions at these observations."""
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             batch = TensorDict({"observation": observation}, observation.shape[:1])
             action: Tensor = self.policy(batch)["action"]
-        return action.argmax(-1) if self.discrete else action
+        return action if self.first is None else self.first + action.argmax(-1)
 
 
 @dataclass(frozen=True)
@@ -80,11 +85,11 @@ def export_policy(
     """Writes the mean policy of a run for use without this package, and proves that it is the same.
 
     ``policy.onnx`` has an input ``observation`` ``[batch, *F]`` and an output ``action``
-    ``[batch, A]`` (``[batch]`` of whole numbers where actions are discrete), float32;
+    ``[batch, A]``, float32, or ``[batch]`` of the task's own numbers where actions are discrete;
     ``policy.pt2`` is the same as a ``torch.export`` program. ``contract.json`` says in which order
-    observations and actions come, their bounds, how often an action is due, what the run's test
-    found, how far the exported policy is from PyTorch's on recorded observations, and how long one
-    action takes.
+    observations and actions come, the actions' bounds, how the task's image becomes an observation,
+    how often an action is due, what the run's test found, how far the exported policy is from
+    PyTorch's on recorded observations, and how long one action takes.
 
     Args:
         run (str or Path): a run's folder.
@@ -111,8 +116,9 @@ def export_policy(
     with ProcessState(0):
         played = play_episodes(policy, env, episodes, max_steps=max_steps)
         observations = torch.cat([episode["observation"] for episode in played])
-    mean = MeanPolicy(policy, isinstance(env.action_spec, OneHot)).eval()
-    program, content = _translate(mean, observations[:2])
+    mean = MeanPolicy(policy, _first_action(env)).eval()
+    # Two rows, also of an episode of one step: torch takes a batch of 1 for a constant.
+    program, content = _translate(mean, observations[[0, -1]])
     act = _onnx_function(content)
     agreement = _compare(mean, act, observations)
     contract = {
@@ -219,7 +225,32 @@ def _describe_observation(env: EnvBase) -> dict[str, Any]:
     described: dict[str, Any] = {"shape": ["batch", *shape], "dtype": "float32"}
     if len(shape) == 1:
         described["entries"] = entry_names(seen, shape[0])
+    else:
+        described["image"] = _describe_image(env)
     return described
+
+
+def _describe_image(env: EnvBase) -> dict[str, Any]:
+    """How the task's image becomes what the policy sees: scaled to 0..1, then its axes moved."""
+    seeing = _wrapper(env, TransformObservation)
+    image: Any = seeing.env.observation_space
+    moved = image.shape != seeing.observation_space.shape and len(image.shape) == 3
+    return {
+        "shape": list(image.shape),
+        "low": float(image.low.min()),
+        "high": float(image.high.max()),
+        "axes": [2, 0, 1] if moved else list(range(len(image.shape))),
+    }
+
+
+def _wrapper(env: EnvBase, kind: type) -> Any:
+    """The outermost wrapper of a kind around the simulator; ``None`` without one."""
+    wrapped = getattr(env, "base_env", env)._env
+    while isinstance(wrapped, gymnasium.Wrapper):
+        if isinstance(wrapped, kind):
+            return wrapped
+        wrapped = wrapped.env
+    return None
 
 
 def entry_names(space: Any, size: int) -> list[str]:
@@ -238,18 +269,26 @@ def entry_names(space: Any, size: int) -> list[str]:
     return names if len(names) == size else [f"observation[{i}]" for i in range(size)]
 
 
+def _first_action(env: EnvBase) -> int | None:
+    """The number that the task gives its first action; ``None`` where these are no numbers."""
+    counted = _wrapper(env, CountedFromZero)
+    first = 0 if counted is None else counted.first
+    return first if isinstance(env.action_spec, OneHot) else None
+
+
 def _describe_action(env: EnvBase) -> dict[str, Any]:
     spec = env.action_spec
-    if isinstance(spec, OneHot):
-        return {"shape": ["batch"], "dtype": "int64", "choices": spec.shape[-1]}
+    if (first := _first_action(env)) is not None:
+        choices = {"choices": spec.shape[-1], "first": first}
+        return {"shape": ["batch"], "dtype": "int64", **choices}
     size = spec.shape[-1]
     described = {
         "shape": ["batch", size],
         "dtype": "float32",
         "entries": [f"action[{i}]" for i in range(size)],
     }
-    low, high = spec.space.low, spec.space.high
-    if low.isfinite().all() and high.isfinite().all():
+    if bounds := action_bounds(env):
+        low, high = bounds
         described |= {"low": low.tolist(), "high": high.tolist()}
     return described
 

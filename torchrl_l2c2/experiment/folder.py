@@ -109,10 +109,20 @@ def make_folder(path: str | Path) -> Path:
             pass
     except OSError as error:
         raise OSError(
-            f"the run's folder {str(folder)!r} cannot be written to ({error.strerror}); "
-            "choose another."
+            f"the folder {str(folder)!r} cannot be written to ({error.strerror}); choose another."
         ) from error
     return folder
+
+
+def make_folder_of(path: str | Path) -> None:
+    """Makes the folder of a file, before there is anything that could be lost with it.
+
+    Raises:
+        OSError: as :func:`make_folder`, or the path is that of a folder.
+    """
+    if Path(path).is_dir():
+        raise OSError(f"{str(path)!r} is a folder; name a file.")
+    make_folder(Path(path).parent)
 
 
 def write_atomically(path: str | Path, content: bytes) -> None:
@@ -147,7 +157,12 @@ def _named(path: Path) -> Iterator[None]:
 
 def write_json(path: str | Path, value: Any) -> None:
     """Writes a value as indented JSON, whole or not at all; what is no number is ``null`` there."""
-    write_atomically(path, (json.dumps(_strict(value), indent=2) + "\n").encode())
+    write_atomically(path, (to_json(value) + "\n").encode())
+
+
+def to_json(value: Any) -> str:
+    """A value as indented JSON; what is no number is ``null`` there."""
+    return json.dumps(_strict(value), indent=2)
 
 
 def _strict(value: Any) -> Any:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
@@ -54,6 +55,20 @@ class Frame(NamedTuple):
         # One number each: looking at every element takes several operations.
         tensors = (self.observation, self.outputs["action"], self.following)
         return math.isfinite(self.reward + sum(float(tensor.sum()) for tensor in tensors))
+
+
+def as_number(reward: Any) -> float:
+    """A reward as Gymnasium has it; an array or a tensor of one number is taken as well.
+
+    Raises:
+        ValueError: it is something else, such as a number for each of several goals.
+    """
+    if isinstance(reward, float):  # NumPy's float64 among them
+        return reward
+    given = np.asarray(reward)
+    if given.size != 1 or given.dtype.kind not in "biuf":
+        raise ValueError(f"the reward of a step must be one number, got {reward!r}.")
+    return float(given.item())
 
 
 def stack_frames(frames: Sequence[Frame]) -> TensorDictBase:

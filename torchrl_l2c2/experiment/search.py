@@ -15,13 +15,11 @@ import subprocess
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import ChoiceSweep, IntervalSweep, Override
-from hydra.errors import OverrideParseException
 
 from torchrl_l2c2.experiment.folder import make_folder
 from torchrl_l2c2.experiment.lock import FolderInUseError, lock_folder
@@ -29,17 +27,18 @@ from torchrl_l2c2.experiment.reports import find_runs, write_report
 from torchrl_l2c2.experiment.reports.comparison import SIGNS
 from torchrl_l2c2.experiment.reports.front import front_figure, front_table
 from torchrl_l2c2.experiment.reports.groups import group_records
+from torchrl_l2c2.experiment.search_space import check_settings, read_space, short
 from torchrl_l2c2.experiment.sweep import start_guard
 
 if TYPE_CHECKING:
     from optuna import Study
-    from optuna.distributions import BaseDistribution
 
 DESCRIPTION = """\
 Searches for settings with a large return and a small action variation, and writes a report with the
 Pareto front. Settings are those of the main command, and of Hydra's grammar:
 
   name=interval(0,1)            searched, a real number
+  name=int(interval(1,4))       searched, a whole number
   name=tag(log,interval(1,9))   searched on a logarithmic scale
   name=choice(a,b)              searched, one of these
   seed=0,1,2                    every trial runs all of them; its figures are their means
@@ -52,7 +51,6 @@ example:
   python -m torchrl_l2c2.experiment.search --trials 30 --output outputs/search \
     seed=0,1 'regularizer.lambda_max=tag(log,interval(.1,10))' 'regularizer.beta=interval(0,1)'
 """
-DIGITS = 4
 UNTESTED = "a trial is scored by tests of its policies: choose test_episodes of at least 1"
 MARK = "TORCHRL_L2C2_SEARCH"  # of the environment, by which the processes of a search are known
 
@@ -69,15 +67,19 @@ class Search:
 
     Raises:
         ImportError: Optuna is not installed.
-        ValueError: nothing is searched, nothing is tested, or the folder is of another search.
+        ValueError: nothing is searched, nothing is tested, a setting cannot be, or the folder is of
+            another search.
     """
 
     def __init__(self, folder: Path, overrides: Sequence[str], *, seed: int = 0) -> None:
+        if find_spec("optuna") is None:
+            raise ImportError("Optuna is missing: pip install 'torchrl-l2c2[search]' brings it.")
         self.space, self.fixed = read_space(overrides)
         if not self.space:
             raise ValueError("nothing is searched; give a setting interval(a,b) or choice(a,b).")
         if "test_episodes=0" in self.fixed:
             raise ValueError(f"{UNTESTED}, got 0.")
+        check_settings(overrides)
         self.folder, self._seed = make_folder(folder), seed
         self.study = self._open()
         settings = [each for each in self.fixed if not each.startswith("hydra")]
@@ -113,7 +115,7 @@ class Search:
 
     def command(self, number: int, values: Mapping[str, Any]) -> list[str]:
         """A trial as a sweep of the main command."""
-        found = [f"{name}={_short(value)}" for name, value in values.items()]
+        found = [f"{name}={short(value)}" for name, value in values.items()]
         main = (sys.executable, "-m", "torchrl_l2c2.experiment", "-m")
         return [*main, *self.fixed, *found, f"outputs={self._of(number)}"]
 
@@ -139,13 +141,9 @@ class Search:
         self.study.tell(number, state=TrialState.FAIL, skip_if_finished=True)
 
     def _open(self) -> Study:
-        try:
-            import optuna
-            from optuna.storages.journal import JournalFileBackend
-        except ImportError as error:
-            raise ImportError(
-                f"{error}; pip install 'torchrl-l2c2[search]' installs Optuna."
-            ) from error
+        import optuna
+        from optuna.storages.journal import JournalFileBackend
+
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         journal = JournalFileBackend(str(self.folder / "journal.log"))
         return optuna.create_study(
@@ -170,45 +168,6 @@ class Search:
         return self.folder / f"trial_{number:04d}"
 
 
-def read_space(overrides: Sequence[str]) -> tuple[dict[str, BaseDistribution], list[str]]:
-    """What is searched, as Optuna has it, and what is not.
-
-    Raises:
-        ValueError: what Hydra cannot read, or a range that cannot be.
-    """
-    from optuna.distributions import CategoricalDistribution, FloatDistribution
-
-    space: dict[str, BaseDistribution] = {}
-    fixed = []
-    try:
-        parsed = OverridesParser.create().parse_overrides([*overrides])
-    except OverrideParseException as error:
-        raise ValueError(
-            f"{error.override!r} cannot be read: settings are NAME=VALUE in Hydra's grammar, such "
-            "as regularizer.beta=interval(0,1)."
-        ) from error
-    for override in parsed:
-        name, value = override.get_key_element(), override.value()
-        if isinstance(value, IntervalSweep):
-            assert value.start is not None and value.end is not None
-            space[name] = FloatDistribution(value.start, value.end, log="log" in value.tags)
-        elif isinstance(value, ChoiceSweep) and not value.simple_form:
-            space[name] = CategoricalDistribution(_choices(override))
-        else:
-            assert override.input_line is not None
-            fixed.append(override.input_line)
-    return space, fixed
-
-
-def _choices(override: Override) -> list[str]:
-    return [str(choice) for choice in override.sweep_string_iterator()]
-
-
-def _short(value: Any) -> Any:
-    """Names of folders have it in them; more digits change nothing that a search could find."""
-    return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
-
-
 def run_sweep(command: Sequence[str]) -> int:
     """Runs a sweep in a process of its own, which hears the signals that this one gets.
 
@@ -229,12 +188,16 @@ def main(arguments: Iterable[str] | None = None) -> None:
     """Does what the command line says; an error is one line."""
     parser = _parser()
     chosen = parser.parse_args(None if arguments is None else list(arguments))
+    if chosen.trials < 1:
+        parser.error(f"--trials must be at least 1, got {chosen.trials}")
+    if chosen.sampler_seed < 0:
+        parser.error(f"--sampler-seed must be at least 0, got {chosen.sampler_seed}")
     try:
         search = Search(Path(chosen.output), chosen.settings, seed=chosen.sampler_seed)
         os.environ[MARK] = mark = f"{search.folder.resolve()} {os.getpid()}"
         start_guard(mark)
         for number, values in search.trials(chosen.trials):
-            told = ", ".join(f"{name}={_short(value)}" for name, value in values.items())
+            told = ", ".join(f"{name}={short(value)}" for name, value in values.items())
             print(f"trial {number + 1} of {chosen.trials}: {told}", flush=True)
             status = run_sweep(search.command(number, values))
             if status == 1:
@@ -268,7 +231,10 @@ def _report(folder: Path) -> None:
     found = find_runs([folder])
     records = [run.record for run in found.runs]
     if not records:
-        raise RuntimeError(f"no trial has finished; see train.log below {str(folder)!r}.")
+        raise RuntimeError(
+            "no trial has finished: above it is said why, and in the train.log of those runs below "
+            f"{str(folder)!r} that began."
+        )
     page = write_report(folder / "report", records, found.runs, found.notes)
     groups = group_records(records)
     front = front_table(groups, front_figure(groups))

@@ -106,8 +106,7 @@ def taking_vector(env: Env) -> Env:
     """
     space: Any = env.action_space
     if isinstance(space, spaces.Discrete):
-        start, n = int(space.start), int(space.n)
-        return TransformAction(env, lambda a: start + a, spaces.Discrete(n)) if start else env
+        return CountedFromZero(env) if space.start else env
     vector = isinstance(space, spaces.Box) and len(space.shape) == 1
     if not vector or not np.issubdtype(space.dtype, np.floating):
         raise ValueError(
@@ -123,6 +122,15 @@ def taking_vector(env: Env) -> Env:
         lambda action: np.clip(action.astype(dtype), low, high),
         _float32(space),
     )
+
+
+class CountedFromZero(TransformAction[Any, Any, Any]):
+    """The same task, its Discrete actions counted from 0, where it counts them from ``first``."""
+
+    def __init__(self, env: Env) -> None:
+        space: Any = env.action_space
+        self.first = int(space.start)
+        super().__init__(env, lambda action: self.first + action, spaces.Discrete(int(space.n)))
 
 
 def _float32(space: Any) -> Any:

@@ -19,20 +19,33 @@ from tensordict import TensorDictBase
 
 from torchrl_l2c2.experiment.collection import play_episodes
 from torchrl_l2c2.experiment.environments import control_rate
+from torchrl_l2c2.experiment.folder import make_folder_of
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.trained import load_policy
 
 Picture = NDArray[np.uint8]
+# Of the files that H.264, the encoder's default, fits into.
+ENDINGS = (".avi", ".m4v", ".mkv", ".mov", ".mp4")
 
 
-def check_video() -> None:
-    """Refuses to record where there is nothing to encode with.
+def check_video(path: str | Path | None = None) -> None:
+    """Refuses to record what could not be written afterwards.
+
+    Args:
+        path (str or Path, optional): of the file, where it is known; its folder is made.
 
     Raises:
         ImportError: the ``video`` extra is missing.
+        ValueError: the file's ending is none of a video's.
+        OSError: its folder cannot be written to.
     """
     if find_spec("imageio_ffmpeg") is None:
         raise ImportError('imageio-ffmpeg is missing: pip install "torchrl-l2c2[video]" brings it.')
+    if path is None:
+        return
+    if Path(path).suffix.lower() not in ENDINGS:
+        raise ValueError(f"a video's file ends in {', '.join(ENDINGS)}, got {str(path)!r}.")
+    make_folder_of(path)
 
 
 def record_video(
@@ -48,8 +61,8 @@ def record_video(
 
     Args:
         run (str or Path): a run's folder.
-        path (str or Path, optional): of the file; its ending, such as ``.mp4``, says what it is.
-            Default: ``video.mp4`` in the folder.
+        path (str or Path, optional): of the file; its ending, ``.mp4``, ``.m4v``, ``.mkv``,
+            ``.mov`` or ``.avi``, says what it is. Default: ``video.mp4`` in the folder.
 
     Keyword Args:
         episodes (int): how many, one after the other, at least 1. Default 1.
@@ -63,10 +76,12 @@ def record_video(
 
     Raises:
         ImportError: the ``video`` extra is missing.
-        ValueError: the task draws no pictures, or fewer than one episode.
+        ValueError: the task draws no pictures, fewer than one episode, or a file with another
+            ending.
         FileNotFoundError: the folder holds no run, or no policy yet.
+        OSError: the file cannot be written.
     """
-    check_video()
+    check_video(path)
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}.")
     path = Path(path or Path(run) / "video.mp4")

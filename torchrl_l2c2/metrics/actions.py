@@ -183,7 +183,8 @@ def saturation(
         actions (Tensor): mean actions, shape ``[*B, T, A]``.
         low (Tensor or float): lower bounds, broadcast over the actions.
         high (Tensor or float): upper bounds.
-        margin (float): share of the range that counts as its end, at least 0. Default .01.
+        margin (float): share of the range that counts as its end, at least 0; a range that is open
+            on a side has none. Default .01.
 
     Returns:
         Tensor: of each episode, shape ``[*B]``, over its steps and dimensions.
@@ -200,6 +201,7 @@ def saturation(
     check_real("saturation: margin", margin, at_least=0)
     low, high = torch.as_tensor(low), torch.as_tensor(high)
     width = margin * (high - low)
+    width = width.where(width.isfinite(), 0.0)
     return ((actions <= low + width) | (actions >= high - width)).float().mean((-2, -1))
 
 

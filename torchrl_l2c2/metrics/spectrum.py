@@ -96,6 +96,7 @@ def spectral_smoothness(actions: Tensor, form: Literal["caps", "asap"] = "caps")
         tensor(0.)
     """
     check_choice("spectral_smoothness: form", form, ("caps", "asap"))
+    check_episodes("spectral_smoothness", actions, 4)
     bins = actions.shape[-2] // 2
     frequencies, amplitudes = amplitude_spectrum(actions)
     frequencies, amplitudes = frequencies[:bins], amplitudes[..., :bins, :]
@@ -136,6 +137,7 @@ def roughness(actions: Tensor, sampling_rate: float = 1.0) -> Tensor:
         >>> roughness(torch.tensor([[1.0], [-1.0], [1.0], [-1.0]]))
         tensor(0.5000)
     """
+    check_episodes("roughness", actions, 4)
     # The constant part is taken off first: its rounding errors would move where nothing does.
     moved = actions - actions[..., :1, :]
     frequencies, amplitudes = amplitude_spectrum(moved, sampling_rate)

@@ -105,8 +105,8 @@ class L2C2Loss(RegularizedLoss):
             each time with torch's global generator. Smaller ones cost less, pay in large batches,
             and are noisier; the terms' expectation stays: a drawn transition counts
             ``1 / fraction`` times and the others 0, also with ``reduction="none"``. Defaults to 1.
-        moved_keys (sequence of NestedKey, optional): which observations neighbors drawn here differ
-            in, such as those that carry noise. Defaults to ``None``, all that can.
+        moved_keys (str or sequence of NestedKey, optional): which observations neighbors drawn here
+            differ in, such as those that carry noise. Defaults to ``None``, all that can.
         policy_distance (str or callable): :math:`d_\pi`. ``"hellinger"``, the paper's, is in [0, 1]
             and relative to how wide the policies are; ``"mean"``
             (:func:`~torchrl_l2c2.policy_distances.mean_distance`) is neither; ``"kl"``
@@ -161,7 +161,7 @@ class L2C2Loss(RegularizedLoss):
         num_samples: int = 1,
         over_neighbors: Literal["mean", "max"] = "mean",
         fraction: float = 1.0,
-        moved_keys: Sequence[NestedKey] | None = None,
+        moved_keys: str | Sequence[NestedKey] | None = None,
         policy_distance: Literal["hellinger", "mean", "kl"] | PolicyDistance = "hellinger",
         hellinger_samples: int | None = None,
         neighbor_key: NestedKey = "neighbor",
@@ -183,7 +183,7 @@ class L2C2Loss(RegularizedLoss):
         self.l2c2_num_samples = num_samples
         self.l2c2_over_neighbors: Literal["mean", "max"] = over_neighbors
         self.l2c2_fraction = float(fraction)
-        self.l2c2_moved_keys = None if moved_keys is None else unravel_key_list(list(moved_keys))
+        self.l2c2_moved_keys = None if moved_keys is None else _read_keys(moved_keys)
         self.l2c2_hellinger_samples = hellinger_samples
         self.l2c2_neighbor_key = neighbor_key
         self._l2c2_compared = False
@@ -287,7 +287,9 @@ class L2C2Loss(RegularizedLoss):
             neighbor = at_rows(neighbor, rows)
         states, distance, drawn = read_neighbors(neighbor, self.l2c2_neighbor_key)
         if drawn is not None and not (self._l2c2_compared or torch.compiler.is_compiling()):
-            self._compare(drawn.flatten(1)[:, :1].flatten().tolist(), len(distance))
+            # Of the first transition; a batch may be a single one, with no dimension.
+            first = drawn.unsqueeze(-1).flatten(1)[:, :1]
+            self._compare(first.flatten().tolist(), len(distance))
         return Neighbors(states, distance, rows)
 
     def _draw(self, tensordict: TensorDictBase, rows: Tensor | None) -> TensorDictBase:
@@ -310,6 +312,17 @@ class L2C2Loss(RegularizedLoss):
             "l2c2_distance": self._diagnostic(finite, near, tensordict),
             "l2c2_gain": self._diagnostic(gain, near, tensordict),
         }
+
+
+def _read_keys(moved_keys: str | Sequence[NestedKey]) -> list[NestedKey]:
+    """A string is one key, as TorchRL's transforms have it, and not its letters."""
+    keys = [moved_keys] if isinstance(moved_keys, str) else list(moved_keys)
+    if not keys:
+        raise ValueError(
+            "moved_keys must name at least one observation, got none: leave it at None for all "
+            "that can be moved, or pass coeff=0 for no regularization."
+        )
+    return unravel_key_list(keys)
 
 
 def _value_term(network: str) -> str:

@@ -67,6 +67,8 @@ class RegularizedPPO(PPO):
     def process_env_step(
         self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]
     ) -> None:
+        if FINAL in extras:
+            _check_final(extras[FINAL], list(obs.keys()))
         super().process_env_step(obs, rewards, dones, extras)
         if FINAL in extras:
             final = TensorDict({**extras[FINAL]}, [self.storage.num_envs], device=self.device)
@@ -90,11 +92,20 @@ class RegularizedPPO(PPO):
     def load(
         self, loaded_dict: dict[str, Any], load_cfg: dict[str, bool] | None, strict: bool
     ) -> bool:
-        """As rsl_rl's; a checkpoint of the plain PPO is the beginning of a regularized one."""
+        """As rsl_rl's; a checkpoint of the plain PPO, or of another regularizer, is a beginning."""
         resumes = super().load(loaded_dict, load_cfg, strict)
         if resumes and "regularization_state_dict" in loaded_dict:
             self.regularization.load_state_dict(loaded_dict["regularization_state_dict"])
         return resumes
+
+
+def _check_final(final: Any, groups: list[str]) -> None:
+    missing = [group for group in groups if group not in final.keys()]
+    if missing:
+        raise KeyError(
+            f"extras[{FINAL!r}] lacks the groups {missing}: let the environment give all that it "
+            f"observes, {groups}, or leave {FINAL!r} out."
+        )
 
 
 class L2C2PPO(RegularizedPPO):

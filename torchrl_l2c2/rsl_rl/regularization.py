@@ -104,8 +104,10 @@ class Regularization:
         """Restores what :meth:`state_dict` gave."""
         self.updates = state["updates"]
         self._set_gain()
-        if self.neighbors is not None and self.neighbors.generator is not None:
-            self.neighbors.generator.set_state(state["generator"].cpu())
+        generator = None if self.neighbors is None else self.neighbors.generator
+        # A regularizer that draws nothing has saved none: this one's begins as it would anew.
+        if generator is not None and "generator" in state:
+            generator.set_state(state["generator"].cpu())
 
     def _set_gain(self) -> None:
         progress = self.updates / self.ramp_updates if self.ramp_updates else 1.0

@@ -28,13 +28,23 @@ from torchrl_l2c2.modules import EncodedNetwork
 
 
 def check_actions(
-    env: EnvBase, algorithm: str, *, continuous: bool, squashed: bool = False
+    env: EnvBase,
+    algorithm: str,
+    *,
+    continuous: bool,
+    squashed: bool = False,
+    drawn: bool = True,
 ) -> None:
     """Refuses actions that an algorithm cannot take.
 
+    Keyword Args:
+        continuous (bool): whether they are to be.
+        squashed (bool): whether they are squashed into their bounds. Default ``False``.
+        drawn (bool): whether they are drawn from a distribution between these. Default ``True``.
+
     Raises:
         ValueError: they are discrete where continuous ones are needed, or the other way round, or
-            have no bounds to be squashed into.
+            have no bounds to be squashed into, or none to draw between.
     """
     if env.action_spec.dtype.is_floating_point != continuous:
         raise ValueError(
@@ -47,6 +57,13 @@ def check_actions(
             f"algorithm={algorithm} squashes actions into their bounds, and this task's have none: "
             "use algorithm=ppo_rpe with algorithm.squash=none, or register the task with a "
             "gymnasium.ActionWrapper that has bounds."
+        )
+    bounds = action_bounds(env) if squashed and drawn else ()
+    if bounds and (still := (bounds[0] >= bounds[1]).nonzero().flatten().tolist()):
+        raise ValueError(
+            f"algorithm={algorithm} squashes actions into their bounds, and entries {still} of "
+            "this task's can take one value alone: register the task with a "
+            "gymnasium.ActionWrapper that leaves them out."
         )
 
 

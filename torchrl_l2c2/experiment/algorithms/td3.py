@@ -57,7 +57,7 @@ class TD3Config(PerStepConfig):
             sharing,
         )
 
-        check_actions(env, self.name, continuous=True, squashed=True)
+        check_actions(env, self.name, continuous=True, squashed=True, drawn=False)
         spec = env.action_spec
         network = perceptron(env, spec.shape[-1], self.hidden, nn.ReLU)
         bounds = spec.to(torch.get_default_device())
