@@ -25,7 +25,7 @@ from torchrl_l2c2.experiment.folder import (
     write_settings,
 )
 from torchrl_l2c2.experiment.player import SimulatorError
-from torchrl_l2c2.experiment.reports.runs import finished_run
+from torchrl_l2c2.experiment.reports.runs import tested_run
 from torchrl_l2c2.experiment.tasks import Budget, TaskConfig
 
 MISSING = "none, as it is a setting since"
@@ -167,7 +167,7 @@ def begin_folder(folder: Path, settings: dict[str, Any], *, ended: bool) -> None
 
     A test that was of other settings is removed before, and of a shorter run that goes on the end:
     killed at any moment, the folder is that of the older run or of an unfinished one, and never a
-    longer one's with an older policy.
+    longer one's with an older policy. A test of the same policy stays till another one replaces it.
 
     Args:
         folder (Path): of the run.
@@ -176,7 +176,7 @@ def begin_folder(folder: Path, settings: dict[str, Any], *, ended: bool) -> None
     Keyword Args:
         ended (bool): whether its training is over.
     """
-    if not ended or finished_run(folder, settings) is None:
+    if not ended or tested_run(folder, settings) is None:
         (folder / "evaluation.json").unlink(missing_ok=True)
     if not ended:
         for name in OF_THE_END:

@@ -12,6 +12,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from torchrl_l2c2.experiment.config import FREE_SETTINGS
 from torchrl_l2c2.experiment.folder import write_json
 from torchrl_l2c2.experiment.reports.differences import differences, fingerprint, write_differences
 from torchrl_l2c2.experiment.reports.records import QUANTITIES, Record
@@ -62,6 +63,11 @@ class FinishedRun:
     def solved_at(self) -> float | None:
         solved: float | None = self.config["task"].get("solved_at")
         return solved
+
+    @property
+    def test_episodes(self) -> int:
+        """Of the test with mean actions."""
+        return int(self.evaluation.get("summary", {}).get("episodes", 0))
 
     def column(self, name: str) -> list[float]:
         """A column of the metrics, a number per episode; NaN where it was not measured."""
@@ -180,14 +186,29 @@ def write_evaluation(
     return FinishedRun.read(folder)
 
 
-def finished_run(folder: str | Path, settings: dict[str, Any]) -> FinishedRun | None:
-    """The finished run of these very settings in a folder; ``None`` where there is none."""
+def tested_run(folder: str | Path, settings: dict[str, Any]) -> FinishedRun | None:
+    """The run in a folder whose test is of these settings; ``None`` where there is none.
+
+    Settings that change none of the numbers may differ.
+    """
     folder = Path(folder)
     if not (folder / "evaluation.json").exists():
         return None
     saved = json.loads((folder / "config.json").read_text())
-    # As JSON, where a tuple and a list are the same.
-    return FinishedRun.read(folder) if saved == json.loads(json.dumps(settings)) else None
+    return FinishedRun.read(folder) if _deciding(saved) == _deciding(settings) else None
+
+
+def finished_run(folder: str | Path, settings: dict[str, Any]) -> FinishedRun | None:
+    """The same where the test has as many episodes as the settings ask for, or they want none."""
+    run = tested_run(folder, settings)
+    if run is None or settings["test_episodes"] in (0, run.test_episodes):
+        return run
+    return None
+
+
+def _deciding(settings: dict[str, Any]) -> Any:
+    """What decides a run's numbers, as JSON, where a tuple and a list are the same."""
+    return json.loads(json.dumps({k: v for k, v in settings.items() if k not in FREE_SETTINGS}))
 
 
 @dataclass(frozen=True)
