@@ -1,6 +1,7 @@
 """Tests during training, and evaluate: the policy that was best, and the figures of any."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -14,7 +15,9 @@ from torchrl_l2c2.experiment import (
     TaskConfig,
     diagnose,
     evaluate_policy,
+    export,
     load_policy,
+    video,
 )
 from torchrl_l2c2.experiment.evaluate import main
 
@@ -130,6 +133,26 @@ def test_evaluate_refuses_what_cannot_be(folder, tmp_path):
     for command in (main, diagnose.main):
         with pytest.raises(SystemExit, match="error: seed must be at least 0 and below"):
             command([str(folder), "--seed", "-1"])
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("policy.pt", b""),
+        ("policy.pt", b"hello\n"),
+        ("config.json", b""),
+        ("config.json", b"[]"),
+        ("config.json", b'{"seed": 0}'),
+        ("config.json", b"\xff"),
+    ],
+)
+def test_a_damaged_file_is_named(folder, tmp_path, name, content):
+    """In one line, by every command that loads a policy."""
+    shutil.copytree(folder, tmp_path / "run")
+    (tmp_path / "run" / name).write_bytes(content)
+    for command in (main, diagnose.main, video.main, export.main):
+        with pytest.raises(SystemExit, match=rf"error: .*run/{name} .*restore it"):
+            command([str(tmp_path / "run")])
 
 
 def test_the_folder_says_how_to_load_its_policy(folder):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import statistics
@@ -16,6 +15,13 @@ from torchrl_l2c2.experiment.config import FREE_SETTINGS
 from torchrl_l2c2.experiment.folder import write_json
 from torchrl_l2c2.experiment.reports.differences import differences, fingerprint, write_differences
 from torchrl_l2c2.experiment.reports.records import QUANTITIES, Record
+from torchrl_l2c2.experiment.saved import (
+    REMEDY,
+    read_config,
+    read_evaluation,
+    read_json,
+    read_rows,
+)
 
 if TYPE_CHECKING:
     from torchrl_l2c2.experiment.config import ExperimentConfig
@@ -33,15 +39,23 @@ class FinishedRun:
 
     @classmethod
     def read(cls, folder: Path) -> FinishedRun:
-        """Reads a run's folder; ``evaluation.json`` marks it as finished."""
-        with open(folder / "metrics.csv", newline="") as file:
-            metrics = list(csv.DictReader(file))
-        config, evaluation = (
-            json.loads((folder / name).read_text()) for name in ("config.json", "evaluation.json")
-        )
+        """Reads a run's folder; ``evaluation.json`` marks it as finished.
+
+        Raises:
+            ValueError: names the file that is damaged, or cut short since the test.
+        """
+        config, evaluation = read_config(folder), read_evaluation(folder)
         versions = folder / "versions.json"
-        known = json.loads(versions.read_text()) if versions.exists() else {}
-        return cls(folder, config, evaluation, metrics, known)
+        known = read_json(versions) if versions.exists() else {}
+        _, metrics = read_rows(folder / "metrics.csv")
+        # Tests of earlier releases do not say.
+        least = (evaluation.get("training") or {}).get("episodes", 1)
+        if len(metrics) < least:
+            raise ValueError(
+                f"{folder / 'metrics.csv'} has {len(metrics)} episodes, fewer than the {least} "
+                f"that were tested after: {REMEDY}"
+            )
+        return cls(folder, config, evaluation, metrics, {n: str(v) for n, v in known.items()})
 
     @property
     def task(self) -> str:
@@ -79,10 +93,7 @@ class FinishedRun:
 
         Raises:
             SettingError: a setting that is not known.
-            ValueError: the run has no episode.
         """
-        if not self.metrics:
-            raise ValueError("metrics.csv has no episode.")
         end = self.metrics[-1]
         frames, speed = int(end["frames"]), self.column("frames_per_second")[-1]
         numbers = {
@@ -194,7 +205,7 @@ def tested_run(folder: str | Path, settings: dict[str, Any]) -> FinishedRun | No
     folder = Path(folder)
     if not (folder / "evaluation.json").exists():
         return None
-    saved = json.loads((folder / "config.json").read_text())
+    saved = read_config(folder)
     return FinishedRun.read(folder) if _deciding(saved) == _deciding(settings) else None
 
 
@@ -238,7 +249,7 @@ def find_runs(folders: Iterable[str | Path]) -> Found:
         try:
             run = FinishedRun.read(folder)
             _ = run.record
-        except (OSError, ValueError, KeyError) as error:
+        except (OSError, ValueError, KeyError, TypeError) as error:
             unread.append(f"{folder} ({error})")
         else:
             runs.append(run)
