@@ -32,6 +32,7 @@ from torchrl_l2c2.experiment import (
 from torchrl_l2c2.experiment.config import GROUPS, OtherRunError
 from torchrl_l2c2.experiment.continuation import check_same_settings
 from torchrl_l2c2.experiment.folder import list_checkpoints, load_checkpoint, save_checkpoint
+from torchrl_l2c2.experiment.reports import results
 from torchrl_l2c2.experiment.reports.runs import find_runs, finished_run
 from torchrl_l2c2.experiment.trained import load_policy
 
@@ -190,6 +191,30 @@ def test_what_changes_no_number_leaves_a_run_finished(tmp_path, settings):
     Experiment(small(**settings), tmp_path).close()
     assert (tmp_path / "evaluation.json").read_bytes() == test
     assert finished_run(tmp_path, small().to_dict()) is not None
+
+
+def test_a_run_is_finished_when_all_of_its_files_are_there(tmp_path, monkeypatch):
+    """Killed while its picture is drawn, it is not."""
+
+    def draw(runs, path):
+        assert runs[0].record.episodes == 6 and not (tmp_path / "evaluation.json").exists()
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(results, "draw_learning_curves", draw)
+        finished(tmp_path)
+    assert finished_run(tmp_path, small().to_dict()) is None
+
+
+def test_what_only_training_reads_is_told_when_that_is_over(tmp_path):
+    """And not where the run goes on."""
+    Experiment(small(), tmp_path).train()
+    told = "evaluate_every=2 changes nothing: it is of training, which is over .* Choose another"
+    with pytest.warns(UserWarning, match=told):
+        Experiment(small(evaluate_every=2), tmp_path).close()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Experiment(small(evaluate_every=2, task=replace(SWINGUP, episodes=8)), tmp_path).close()
 
 
 def test_a_test_of_other_length_replaces_the_old_one_when_it_has_ended(tmp_path):

@@ -77,7 +77,10 @@ def load_policy(
     if saved.exists():
         _load_weights(agent.policy, saved)
     elif best:
-        raise FileNotFoundError(f"{str(saved)!r} does not exist; evaluate_every=N makes it.")
+        raise FileNotFoundError(
+            f"{str(saved)!r} does not exist; evaluate_every=N makes it "
+            "while a run is trained: of one that has ended, train it in another folder."
+        )
     elif newest := load_newest(folder):
         agent.load_networks(newest[1])
     else:

@@ -9,10 +9,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from torchrl_l2c2.experiment.config import FREE_SETTINGS
-from torchrl_l2c2.experiment.folder import write_json
 from torchrl_l2c2.experiment.reports.differences import differences, fingerprint, write_differences
 from torchrl_l2c2.experiment.reports.records import QUANTITIES, Record
 from torchrl_l2c2.experiment.saved import (
@@ -22,9 +21,6 @@ from torchrl_l2c2.experiment.saved import (
     read_json,
     read_rows,
 )
-
-if TYPE_CHECKING:
-    from torchrl_l2c2.experiment.config import ExperimentConfig
 
 
 @dataclass(frozen=True)
@@ -38,13 +34,18 @@ class FinishedRun:
     versions: dict[str, str]
 
     @classmethod
-    def read(cls, folder: Path) -> FinishedRun:
+    def read(cls, folder: Path, evaluation: dict[str, Any] | None = None) -> FinishedRun:
         """Reads a run's folder; ``evaluation.json`` marks it as finished.
+
+        Args:
+            folder (Path): of the run.
+            evaluation (dict, optional): what that file is to have. Default: what it has.
 
         Raises:
             ValueError: names the file that is damaged, or cut short since the test.
         """
-        config, evaluation = read_config(folder), read_evaluation(folder)
+        config = read_config(folder)
+        evaluation = read_evaluation(folder) if evaluation is None else evaluation
         versions = folder / "versions.json"
         known = read_json(versions) if versions.exists() else {}
         _, metrics = read_rows(folder / "metrics.csv")
@@ -174,27 +175,6 @@ class FinishedRun:
             "late_sampled_action_variation": average("action_variation"),
             "policy_scale": average("policy_scale"),
         }
-
-
-def write_evaluation(
-    folder: Path, config: ExperimentConfig, tests: dict[str, dict[str, Any]]
-) -> FinishedRun:
-    """Writes a finished run's test episodes.
-
-    Args:
-        folder (Path): of the run.
-        config (ExperimentConfig): its settings.
-        tests (dict): ``"mean"`` and ``"sampled"``, where there is one: ``"summary"`` and
-            ``"episodes"`` of the test with the policy's mean and with samples.
-
-    Returns:
-        FinishedRun: the folder, read back.
-    """
-    named = {group: getattr(config, group).name for group in ("task", "algorithm", "regularizer")}
-    run = {**named, "seed": config.seed, "solved_at": config.task.solved_at}
-    rest = {name: test for name, test in tests.items() if name != "mean"}
-    write_json(folder / "evaluation.json", {"run": run, **tests.get("mean", {}), **rest})
-    return FinishedRun.read(folder)
 
 
 def tested_run(folder: str | Path, settings: dict[str, Any]) -> FinishedRun | None:
