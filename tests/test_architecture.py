@@ -37,7 +37,7 @@ rsl_rl.__init__
 trainers __init__
 experiment.settings experiment.compilation experiment.spaces experiment.guard
 experiment.tracing experiment.priorities experiment.frames experiment.row_writer
-experiment.loggers experiment.acting
+experiment.loggers experiment.acting experiment.saved
 experiment.folder
 experiment.environments experiment.lock experiment.signals
 experiment.process experiment.progress experiment.sweep experiment.optimizers

@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -16,6 +17,7 @@ from torchrl_l2c2.experiment import (
     diagnose,
     evaluate,
     evaluate_policy,
+    export,
     load_policy,
     video,
 )
@@ -178,6 +180,26 @@ def test_evaluate_refuses_what_cannot_be(folder, tmp_path):
             command([str(folder), "--seed", "-1"])
 
 
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("policy.pt", b""),
+        ("policy.pt", b"hello\n"),
+        ("config.json", b""),
+        ("config.json", b"[]"),
+        ("config.json", b'{"seed": 0}'),
+        ("config.json", b"\xff"),
+    ],
+)
+def test_a_damaged_file_is_named(folder, tmp_path, name, content):
+    """In one line, by every command that loads a policy."""
+    shutil.copytree(folder, tmp_path / "run")
+    (tmp_path / "run" / name).write_bytes(content)
+    for command in (main, diagnose.main, video.main, export.main):
+        with pytest.raises(SystemExit, match=rf"error: .*run/{name} .*restore it"):
+            command([str(tmp_path / "run")])
+
+
 def test_the_folder_says_how_to_load_its_policy(folder):
     """Its own lines run, and name every file."""
     text = (folder / "README.txt").read_text()
@@ -197,5 +219,5 @@ def test_the_best_policy_is_loaded_where_there_is_one(folder, tmp_path):
     policy = load_policy(folder, best=True)[0]
     assert all(kept[k].equal(v) for k, v in policy.state_dict().items())
     run(tmp_path)
-    with pytest.raises(FileNotFoundError, match="evaluate_every=N makes it"):
+    with pytest.raises(FileNotFoundError, match="evaluate_every=N makes it .* in another folder"):
         load_policy(tmp_path, best=True)

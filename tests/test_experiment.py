@@ -476,6 +476,11 @@ def test_a_run_from_the_command_line_leaves_everything_behind(tmp_path):
     assert list((run.folder / "tensorboard").glob("events*"))
     policy = torch.load(run.folder / "policy.pt", weights_only=True)
     make_actor(3, make_env(PENDULUM, 0).action_spec).load_state_dict(policy)
+    (run.folder / "learning_curves.png").unlink()
+    again = run_train(*PENDULUM_OVERRIDES, "evaluate_every=1", folder=tmp_path)
+    assert again.stdout.count("2 test episodes, seed 0") == 2
+    assert "evaluate_every=1 changes nothing: it is of training, which is over" in again.stderr
+    assert (run.folder / "learning_curves.png").exists()
 
 
 def test_without_a_terminal_there_are_a_few_plain_lines(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+import re
 import warnings
 
 import pytest
@@ -22,6 +23,7 @@ from torchrl_l2c2.experiment import (
     RolloutReplayConfig,
     SACConfig,
     TaskConfig,
+    TD3Config,
     UniformReplayConfig,
 )
 from torchrl_l2c2.experiment.influence import gradient_shares
@@ -341,13 +343,39 @@ class TestRollouts:
 
 
 class TestRefusals:
-    def test_a_column_that_is_not_logged_is_named(self):
-        """With those that are."""
-        run = Experiment(small(L2C2Config(gain="target", gain_target=1.0, gain_of="jerk")))
-        with pytest.raises(
-            SettingError, match=r"gain_of must be one of .*'action_variation'.*'jerk'"
-        ):
-            run.train(1)
+    @pytest.mark.parametrize(
+        ("column", "settings"),
+        [
+            ("jerk", {}),
+            ("test_return", {"late_share": 0.0}),
+            ("policy_scale", {"algorithm": TD3Config(hidden=(8,), random_frames=10)}),
+        ],
+    )
+    def test_a_column_without_numbers_is_refused(self, column, settings):
+        """Before anything is played, with those that have some."""
+        regularizer = L2C2Config(gain="target", gain_target=1.0, gain_of=column)
+        told = rf"gain_of must be one of .*'action_variation'.*got '{column}' \(test_\* need a"
+        with pytest.raises(SettingError, match=told):
+            Experiment(small(regularizer, **settings))
+
+    def test_every_column_that_may_be_followed_is_there(self):
+        """Those of a refusal are logged, with numbers from the first update on."""
+        with pytest.raises(SettingError) as refused:
+            Experiment(small(L2C2Config(gain="target", gain_target=1.0, gain_of="jerk")))
+        named = set(re.findall(r"'(\w+)'", str(refused.value))) - {"jerk"}
+        row = Experiment(small(late_share=1.0)).train(1)[0]
+        assert {"return", "test_return", "loss_l2c2_actor", "policy_scale"} <= named
+        assert all(math.isfinite(row[name]) for name in named)
+
+    @pytest.mark.parametrize("column", ["test_return", "return"])
+    def test_a_column_that_has_no_fitting_number_yet_is_told_once(self, column):
+        """NaN before the policies are late, and returns below 0."""
+        run = Experiment(small(L2C2Config(gain="target", gain_target=1.0, gain_of=column)))
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            run.train(3)
+        told = [str(w.message) for w in caught if f"gain_of={column} is" in str(w.message)]
+        assert len(told) == 1 and "numbers of at least 0" in told[0]
 
     @pytest.mark.parametrize(
         ("settings", "message"),

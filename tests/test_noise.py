@@ -45,21 +45,25 @@ def runs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs")
     for beta in (0.0, 0.1):
         for seed in (0, 1):
-            config = ExperimentConfig(
-                task=TaskConfig("p", "Pendulum-v1", episodes=2, max_steps=40, noise_scale=0.1),
-                algorithm=PPOConfig(hidden=(8,), frames=40, epochs=1),
-                regularizer=L2C2Config(beta=beta),
-                replay=RolloutReplayConfig(batch_size=20),
-                optimizer=AdamConfig(),
-                compile=False,
-                seed=seed,
-                late_share=0.0,
-            )
-            run = Experiment(config, folder / f"{beta}_{seed}")
-            run.train()
-            run.finish(run.test(3))
-            run.close()
+            make_run(folder / f"{beta}_{seed}", beta, seed)
     return folder
+
+
+def make_run(folder, beta=0.1, seed=0, max_steps=40):
+    config = ExperimentConfig(
+        task=TaskConfig("p", "Pendulum-v1", episodes=2, max_steps=max_steps, noise_scale=0.1),
+        algorithm=PPOConfig(hidden=(8,), frames=40, epochs=1),
+        regularizer=L2C2Config(beta=beta),
+        replay=RolloutReplayConfig(batch_size=20),
+        optimizer=AdamConfig(),
+        compile=False,
+        seed=seed,
+        late_share=0.0,
+    )
+    run = Experiment(config, folder)
+    run.train()
+    run.finish(run.test(3))
+    run.close()
 
 
 @pytest.fixture(scope="module")
@@ -113,6 +117,23 @@ class TestCommand:
         assert (output / "noise.md").read_text().split("\n\n![")[0] in printed
         tests = json.loads((output / "noise.json").read_text())["runs"]
         assert len(tests) == 4 and list(tests[0]["levels"]) == ["0", "1"]
+
+    def test_what_is_too_short_to_be_measured_is_unknown(self, tmp_path):
+        """Sm of three steps: the table and the picture are of what is known."""
+        make_run(tmp_path / "run", max_steps=3)
+        output = tmp_path / "noise"
+        main([str(tmp_path), "--levels", "0,0.1", "--episodes", "1", "--output", str(output)])
+        table = (output / "noise.md").read_text()
+        assert "| Sm | - | - |" in table and "| return | -" in table
+        levels = json.loads((output / "noise.json").read_text())["runs"][0]["levels"]
+        assert levels["0"]["sm_asap_mean"] is None and levels["0.1"]["return_mean"] < 0.0
+        assert (output / "noise_p_ppo.svg").exists()
+
+    def test_a_single_state_has_no_deviation(self, tmp_path):
+        """Which is told before anything is played with noise."""
+        make_run(tmp_path / "run", max_steps=1)
+        with pytest.raises(SystemExit, match=r"error: noise is in .* one in 1 episodes: play more"):
+            main([str(tmp_path), "--episodes", "1"])
 
     def test_the_cells_are_means_over_seeds(self, played):
         """Of the two runs of a method."""

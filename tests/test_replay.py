@@ -206,6 +206,21 @@ def test_a_rollout_s_smaller_last_batch_is_learned_from_without_a_graph(monkeypa
     same(*seen, rtol=1e-3, atol=1e-4)
 
 
+def test_a_rollout_that_is_shorter_than_a_batch_is_learned_from_whole():
+    """One batch of it in each pass; the example that is kept has each of its rows once."""
+    case = replace(
+        CASES["rollout"],
+        algorithm=PPOConfig(hidden=(8,), frames=60, epochs=2),
+        regularizer=L2C2Config(policy_distance="mean"),
+        replay=RolloutReplayConfig(batch_size=4096),
+    )
+    experiment = Experiment(case)
+    experiment.train()
+    example = experiment.learner.example()
+    assert experiment.learner.updates == 2 and len(example) == 60
+    assert len(example["observation"].unique(dim=0)) == 60
+
+
 def begin(experiment, state):
     """At a state, with the random numbers that SAC's actions are drawn with."""
     experiment.load_state_dict(copy.deepcopy(state))

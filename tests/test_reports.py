@@ -441,6 +441,36 @@ class TestGroups:
         summary = sweep_summary([tmp_path])
         assert "| vanilla | 0 |" in summary and all(note in summary for note in found.notes)
 
+    @pytest.mark.parametrize(
+        ("name", "content"),
+        [
+            ("config.json", b"[]"),
+            ("config.json", b"{}"),
+            ("config.json", b'{"task": 3, "algorithm": {}, "regularizer": {}}'),
+            ("versions.json", b"[]"),
+            ("evaluation.json", b"null"),
+            ("evaluation.json", b"[1]"),
+            ("evaluation.json", b""),
+            ("evaluation.json", b'{"summary": {"return_mean": "much"}}'),
+            ("evaluation.json", b'{"sampled": 3}'),
+            ("evaluation.json", b'{"training": 3}'),
+            ("evaluation.json", b'{"training": {"episodes": 21}}'),
+            ("metrics.csv", b""),
+            ("metrics.csv", b"\xff"),
+            ("metrics.csv", b"episode,frames,updates,return\n1,100,10\n"),
+        ],
+    )
+    def test_whatever_a_damaged_file_holds_is_told_with_its_name(self, tmp_path, name, content):
+        """Twenty episodes were trained; and another run is read all the same."""
+        for seed, folder in enumerate(("good", "bad")):
+            make_run(tmp_path / folder, make_config(seed=seed), 1.0, 0.1)
+        (tmp_path / "bad" / name).write_bytes(content)
+        found = find_runs([tmp_path])
+        assert [run.folder.name for run in found.runs] == ["good"]
+        named = "metrics.csv" if b"episodes" in content else name
+        (note,) = found.notes
+        assert note.startswith("1 unreadable: ") and str(tmp_path / "bad" / named) in note
+
     def test_a_measure_that_could_not_be_taken_is_no_number(self, tmp_path):
         """Of test episodes that are too short, where evaluation.json has null."""
         make_run(tmp_path / "run", make_config(), 1.0, 0.1)
@@ -757,6 +787,15 @@ class TestRecords:
         path.write_text(path.read_text().replace(",2000,", ",many,"))
         with pytest.raises(ValueError, match=r"runs\.csv, line 2: .*many"):
             read_records(path)
+        write_records(path, records[:2])
+        whole = path.read_text()
+        for cut in (whole.rpartition(",")[0] + "\n", whole.rstrip("\n") + ",more\n"):
+            path.write_text(cut)
+            with pytest.raises(ValueError, match=r"runs\.csv, line 3: 2[35] cells, .* has 24"):
+                read_records(path)
+        path.write_text(whole.rstrip("\n") + " algorithm.repl\n")
+        with pytest.raises(ValueError, match=r"runs\.csv, line 3: .* got 'algorithm.repl'"):
+            read_records(path)
 
 
 class TestPictures:
@@ -878,6 +917,9 @@ class TestReport:
             main([str(tmp_path)])
         with pytest.raises(SystemExit, match=r"error: there is no file"):
             main(["--from", str(tmp_path / "runs.csv")])
+        write_records(tmp_path / "none.csv", [])
+        with pytest.raises(SystemExit, match=r"error: no record of a run in '.*none\.csv'"):
+            main(["--from", str(tmp_path / "none.csv"), "--output", str(tmp_path / "rep")])
         make_run(tmp_path / "run", make_config(), 1.0, 0.1)
         with pytest.raises(SystemExit, match="error: no run is as long as 30 episodes"):
             main([str(tmp_path), "--length", "30"])
@@ -969,9 +1011,14 @@ class TestReadme:
         readme, file, given = tmp_path / "README.md", tmp_path / "runs.csv", tmp_path / "given.csv"
         before = f"{START}\nold\n{END}\n"
         readme.write_text(before)
-        for none in ([], [replace(records[0], task="pendulum", algorithm="sac")]):
+        for none, told in (
+            ([], "no record of a run in"),
+            (
+                [replace(records[0], task="pendulum", algorithm="sac")],
+                "none of 1 records is of the paper.s .* by --from or --csv",
+            ),
+        ):
             write_records(given, none)
-            told = f"error: none of {len(none)} records is of the paper.s .* by --from or --csv"
             with pytest.raises(SystemExit, match=told):
                 main(["--from", str(given), "--readme", str(readme)])
         make_run(tmp_path / "run", make_config(task="pendulum", algorithm=SACConfig()), 1.0, 0.1)

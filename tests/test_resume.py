@@ -32,7 +32,8 @@ from torchrl_l2c2.experiment import (
 from torchrl_l2c2.experiment.config import GROUPS, OtherRunError
 from torchrl_l2c2.experiment.continuation import check_same_settings
 from torchrl_l2c2.experiment.folder import list_checkpoints, load_checkpoint, save_checkpoint
-from torchrl_l2c2.experiment.reports.runs import finished_run
+from torchrl_l2c2.experiment.reports import results
+from torchrl_l2c2.experiment.reports.runs import find_runs, finished_run
 from torchrl_l2c2.experiment.trained import load_policy
 
 ROOT = Path(__file__).parent.parent
@@ -164,18 +165,69 @@ def test_a_finished_run_that_goes_on_is_unfinished(tmp_path, monkeypatch, steps)
     assert len(again.train()) == 8
 
 
-def test_a_finished_run_that_is_tested_anew_is_unfinished(tmp_path):
-    """Till it has been; what was trained stays, and so does the test of the same settings."""
-    run = Experiment(small(), tmp_path)
+def finished(folder, **settings):
+    run = Experiment(small(**settings), folder)
     run.train()
     run.finish(run.test())
     run.close()
-    Experiment(small(), tmp_path).close()
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"test_episodes": 0},
+        {"threads": 2},
+        {"logger": GROUPS["logger"]["tensorboard"]},
+        {"record": True},
+        {"checkpoint_interval": 5.0},
+    ],
+    ids=lambda settings: next(iter(settings)),
+)
+def test_what_changes_no_number_leaves_a_run_finished(tmp_path, settings):
+    """And its test, also where something is made of such settings."""
+    finished(tmp_path)
+    test = (tmp_path / "evaluation.json").read_bytes()
+    assert finished_run(tmp_path, small(**settings).to_dict()) is not None
+    Experiment(small(**settings), tmp_path).close()
+    assert (tmp_path / "evaluation.json").read_bytes() == test
     assert finished_run(tmp_path, small().to_dict()) is not None
+
+
+def test_a_run_is_finished_when_all_of_its_files_are_there(tmp_path, monkeypatch):
+    """Killed while its picture is drawn, it is not."""
+
+    def draw(runs, path):
+        assert runs[0].record.episodes == 6 and not (tmp_path / "evaluation.json").exists()
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(results, "draw_learning_curves", draw)
+        finished(tmp_path)
+    assert finished_run(tmp_path, small().to_dict()) is None
+
+
+def test_what_only_training_reads_is_told_when_that_is_over(tmp_path):
+    """And not where the run goes on."""
+    Experiment(small(), tmp_path).train()
+    told = "evaluate_every=2 changes nothing: it is of training, which is over .* Choose another"
+    with pytest.warns(UserWarning, match=told):
+        Experiment(small(evaluate_every=2), tmp_path).close()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Experiment(small(evaluate_every=2, task=replace(SWINGUP, episodes=8)), tmp_path).close()
+
+
+def test_a_test_of_other_length_replaces_the_old_one_when_it_has_ended(tmp_path):
+    """Interrupted, the old one is still there, and the same command plays the new one."""
+    finished(tmp_path)
     more = small(test_episodes=3)
-    Experiment(more, tmp_path).close()
+    run = Experiment(more, tmp_path)
+    assert find_runs([tmp_path]).runs[0].test_episodes == 1
     assert finished_run(tmp_path, more.to_dict()) is None
-    assert (tmp_path / "policy.pt").exists()
+    run.finish(run.test())
+    run.close()
+    assert finished_run(tmp_path, more.to_dict()).test_episodes == 3
+    assert finished_run(tmp_path, small().to_dict()) is None
 
 
 def test_changed_settings_are_refused_and_nothing_is_overwritten(tmp_path):

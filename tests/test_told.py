@@ -91,7 +91,12 @@ def test_a_run_without_an_update_says_so(tmp_path):
     assert run.metrics[-1]["updates"] == 0
     run.finish(run.test())
     written = json.loads((tmp_path / "evaluation.json").read_text())["training"]
-    assert written == {"frames": 80, "updates": 0, "untrained": message}
+    assert written == {
+        "episodes": len(run.metrics),
+        "frames": 80,
+        "updates": 0,
+        "untrained": message,
+    }
 
 
 def test_a_run_of_random_actions_alone_says_so(tmp_path):

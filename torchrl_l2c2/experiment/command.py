@@ -212,10 +212,15 @@ def run(values: dict[str, Any], standing: str = "", patience: float = 0.0) -> Fi
     check_preset(values, HydraConfig.get().runtime.choices.get("preset"))
     config = ExperimentConfig.from_dict(values)
     # Here, as settings are checked before anything waits for torch.
+    from torchrl_l2c2.experiment.continuation import tell_past
     from torchrl_l2c2.experiment.folder import save_policy
     from torchrl_l2c2.experiment.lock import wait_for_folder
     from torchrl_l2c2.experiment.process import keep_freed_memory
-    from torchrl_l2c2.experiment.reports import compare_with_paper, finished_run
+    from torchrl_l2c2.experiment.reports import (
+        compare_with_paper,
+        draw_learning_curves,
+        finished_run,
+    )
     from torchrl_l2c2.experiment.training import Experiment
     from torchrl_l2c2.experiment.video import check_video, record_video
 
@@ -233,7 +238,9 @@ def run(values: dict[str, Any], standing: str = "", patience: float = 0.0) -> Fi
     tell_tuned(config)
     wait_for_folder(folder, patience)
     finished = finished_run(folder, config.to_dict())
-    if finished is None:
+    if finished is not None:
+        tell_past(finished.config, config.to_dict())
+    else:
         going_on = {name: values[name] for name in ("resume", "allow_other_versions")}
         with closing(Experiment(config, folder, **going_on)) as experiment, _end_logged(folder):
             experiment.train(progress=standing or True)
@@ -248,7 +255,10 @@ def run(values: dict[str, Any], standing: str = "", patience: float = 0.0) -> Fi
         record_video(folder, video)
     if finished is not None:
         print(compare_with_paper(finished))
-        print(f"picture: {folder / 'learning_curves.png'}", flush=True)
+        picture = folder / "learning_curves.png"
+        if not picture.exists():
+            draw_learning_curves([finished], picture)
+        print(f"picture: {picture}", flush=True)
     if video.exists():
         print(f"video: {video}", flush=True)
     return finished

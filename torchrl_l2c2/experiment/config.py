@@ -267,6 +267,8 @@ class ExperimentConfig:
 
 def _read_group(group: str, values: Mapping[str, Any]) -> Any:
     """The settings of a group that a mapping's ``name`` chooses, with its other values."""
+    if not isinstance(values, Mapping):
+        raise SettingError(group, f"must have settings by their names, got {values!r}.")
     choices, name = GROUPS[group], str(values.get("name"))
     if name in choices:
         return read(partial(dataclasses.replace, choices[name]), values, group)

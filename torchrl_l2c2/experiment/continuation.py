@@ -25,10 +25,12 @@ from torchrl_l2c2.experiment.folder import (
     write_settings,
 )
 from torchrl_l2c2.experiment.player import SimulatorError
-from torchrl_l2c2.experiment.reports.runs import finished_run
+from torchrl_l2c2.experiment.reports.runs import tested_run
 from torchrl_l2c2.experiment.tasks import Budget, TaskConfig
 
 MISSING = "none, as it is a setting since"
+# Free settings that only episodes of training read.
+OF_TRAINING = ("evaluate_every", "late_share")
 # What the end of a training leaves, beside the test that marks a run as finished.
 OF_THE_END = ("video.mp4", "policy.pt", "learning_curves.png")
 
@@ -96,6 +98,21 @@ def check_length(asked: Budget, before: Budget, played: int) -> None:
         )
 
 
+def tell_past(saved: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Says which settings come too late, as the training that reads them is over.
+
+    Warns:
+        UserWarning: names each one that differs.
+    """
+    for name in OF_TRAINING:
+        if saved.get(name, now[name]) != now[name]:  # Earlier releases lack some.
+            warnings.warn(
+                f"{name}={now[name]} changes nothing: it is of training, which is over in this "
+                f"folder, with {name}={saved[name]}. Choose another folder to train with it.",
+                stacklevel=2,
+            )
+
+
 def find_checkpoint(
     folder: Path | None, elsewhere: str | Path | None
 ) -> tuple[Path, dict[str, Any]] | None:
@@ -128,13 +145,16 @@ def check_continuable(
         OtherRunError: other settings, a shorter training than it is, or other versions.
 
     Warns:
-        UserWarning: another length, by which the learning rate falls or a gain rises.
+        UserWarning: another length, by which the learning rate falls or a gain rises; settings of a
+            training that is over.
     """
     saved, asked = json.loads(state["config"]), config.task.budget
     check_same_settings(saved, config.to_dict())
     before = TaskConfig(**saved["task"]).budget
     played = asked.spent(len(json.loads(state["metrics"])), state["counters"][0])
     check_length(asked, before, played)
+    if played >= asked.total:
+        tell_past(saved, config.to_dict())
     followed = {
         "optimizer.linear=true": getattr(config.optimizer, "linear", False),
         "regularizer.gain=ramp": getattr(config.regularizer, "gain", "") == "ramp",
@@ -167,7 +187,7 @@ def begin_folder(folder: Path, settings: dict[str, Any], *, ended: bool) -> None
 
     A test that was of other settings is removed before, and of a shorter run that goes on the end:
     killed at any moment, the folder is that of the older run or of an unfinished one, and never a
-    longer one's with an older policy.
+    longer one's with an older policy. A test of the same policy stays till another one replaces it.
 
     Args:
         folder (Path): of the run.
@@ -176,7 +196,7 @@ def begin_folder(folder: Path, settings: dict[str, Any], *, ended: bool) -> None
     Keyword Args:
         ended (bool): whether its training is over.
     """
-    if not ended or finished_run(folder, settings) is None:
+    if not ended or tested_run(folder, settings) is None:
         (folder / "evaluation.json").unlink(missing_ok=True)
     if not ended:
         for name in OF_THE_END:

@@ -49,6 +49,8 @@ MEASURES: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
     "sm_asap": partial(spectral_smoothness, form="asap"),
     "previous_action_gain": previous_action_gain,
 }
+# Of one episode of a late policy, by their names in metrics.csv.
+TESTED = ("test_return", "test_action_variation")
 LEAST_STEPS = 4  # that each of them can be taken of
 NOISE = 0.01  # standard deviation, that sensitivity is measured with: that of the paper's tasks
 
@@ -223,11 +225,11 @@ class LateTests:
             episode = self._collector.rollout()
         check_finite(episode, 0)
         total = episode["next", "reward"].sum().item()
-        return {"test_return": total, "test_action_variation": _variation(episode["action"])}
+        return dict(zip(TESTED, (total, _variation(episode["action"])), strict=True))
 
     def none(self) -> dict[str, float]:
         """The same entries where no episode is played."""
-        return {"test_return": math.nan, "test_action_variation": math.nan}
+        return dict.fromkeys(TESTED, math.nan)
 
     def close(self) -> None:
         """Closes the environment."""

@@ -34,6 +34,7 @@ from torchrl_l2c2.experiment.collection import play_episodes
 from torchrl_l2c2.experiment.environments import control_rate
 from torchrl_l2c2.experiment.folder import make_folder, versions, write_atomically, write_json
 from torchrl_l2c2.experiment.process import ProcessState
+from torchrl_l2c2.experiment.saved import read_config, read_evaluation
 from torchrl_l2c2.experiment.spaces import CountedFromZero
 from torchrl_l2c2.experiment.trained import load_policy
 
@@ -197,7 +198,7 @@ def _microseconds(function: Callable[[], Any], repeats: int = 200) -> float:
 
 
 def _origin(run: Path, best: bool) -> dict[str, Any]:
-    config = json.loads((run / "config.json").read_text())
+    config = read_config(run)
     return {
         "task": config["task"]["env_id"],
         "noise_scale": config["task"]["noise_scale"],
@@ -211,12 +212,11 @@ def _origin(run: Path, best: bool) -> dict[str, Any]:
 
 def _expected(run: Path, best: bool) -> dict[str, Any]:
     """What the run's own test found of the policy, where it had one."""
-    path = run / "evaluation.json"
-    if best or not path.exists():
+    if best or not (run / "evaluation.json").exists():
         return {}
-    summary = json.loads(path.read_text())["summary"]
+    summary = read_evaluation(run).get("summary", {})
     names = ("episodes", "return_mean", "return_std", "action_variation_mean")
-    return {"test": {name: summary[name] for name in names}}
+    return {"test": {name: summary.get(name) for name in names}}
 
 
 def _describe_observation(env: EnvBase) -> dict[str, Any]:

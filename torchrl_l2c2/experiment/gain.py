@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
 from torchrl_l2c2.experiment.config import ExperimentConfig
+from torchrl_l2c2.experiment.evaluate import TESTED
 from torchrl_l2c2.experiment.influence import gradient_shares
 from torchrl_l2c2.experiment.learner import Learner
+from torchrl_l2c2.experiment.player import MEASURES
 from torchrl_l2c2.experiment.regularizers import GainConfig
 from torchrl_l2c2.experiment.settings import SettingError
 from torchrl_l2c2.gains import ConstantGain, GradientGain, RampGain, TargetGain
@@ -21,6 +25,9 @@ class GainControl:
             is; a constant gain is none of this class's business.
         learner (Learner): whose loss has the gains.
 
+    Raises:
+        SettingError: the regularizer's gain is to follow what is not measured.
+
     Attributes:
         gains: of the networks that have one of their own, ``"policy"`` and ``"value"``, or of all.
     """
@@ -29,10 +36,13 @@ class GainControl:
         regularizer = config.regularizer
         self._learner, self._updates, self._budget = learner, 0, config.task.budget
         self._config = regularizer if isinstance(regularizer, GainConfig) else None
+        self._tells_measured = True
         self.gains: dict[str, ConstantGain] = {}
         if self._config is not None and self._config.gain != "constant":
             names = self._terms() if self._config.gain == "gradient" else ["all"]
             self.gains = {name: _make_gain(self._config, name) for name in names}
+            if self._config.gain == "target":
+                self._check_column(self._config.gain_of, tested=config.late_share > 0)
             # A gain that is faint for now is no mistake.
             learner.tells_faint_regularizer = False
             self._apply()
@@ -62,6 +72,7 @@ class GainControl:
             for name, gain in self.gains.items():
                 gain.step(measured[name])
             self._apply()
+            self._tell_measured(measured)
         return logged
 
     def state_dict(self) -> dict[str, Any]:
@@ -100,7 +111,7 @@ class GainControl:
             spent = self._budget.spent(int(row["episode"]), int(row["frames"]))
             return {"all": spent / self._budget.total}
         if self._config.gain == "target":
-            return {"all": self._column(row, self._config.gain_of)}
+            return {"all": row[self._config.gain_of]}
         if self._learner.updates == self._updates:
             return dict.fromkeys(self.gains, float("nan"))
         shares = gradient_shares(self._learner.agent.loss, self._learner.example())
@@ -111,13 +122,32 @@ class GainControl:
             for name, keys in self._terms().items()
         }
 
-    @staticmethod
-    def _column(row: Mapping[str, float], name: str) -> float:
-        if name not in row:
+    def _check_column(self, name: str, *, tested: bool) -> None:
+        """Which columns will have numbers is known before anything is played."""
+        columns = {*MEASURES, *self._learner.report(0), *(TESTED if tested else ())}
+        if "scale" not in self._learner.agent.policy.out_keys:
+            columns.remove("policy_scale")
+        if name not in columns:
             raise SettingError(
-                "regularizer.gain_of", f"must be one of {sorted(row)}, got {name!r}."
+                "regularizer.gain_of",
+                f"must be one of {sorted(columns)}, got {name!r} (test_* need a late_share, and "
+                "policy_scale a policy that has a scale).",
             )
-        return row[name]
+
+    def _tell_measured(self, measured: Mapping[str, float]) -> None:
+        """Says once that a target is not followed, as its column has no fitting number."""
+        assert self._config is not None
+        if self._config.gain != "target" or 0.0 <= measured["all"] < math.inf:
+            return
+        if self._tells_measured:
+            self._tells_measured = False
+            warnings.warn(
+                f"regularizer.gain_of={self._config.gain_of} is {measured['all']:g} after update "
+                f"{self._updates}: the gain stays where that is no number, and falls where it is "
+                "below 0, whatever gain_target is. Choose a column of numbers of at least 0; "
+                "test_* have some in the last late_share of training alone.",
+                stacklevel=4,
+            )
 
 
 def _make_gain(config: GainConfig, name: str) -> ConstantGain:

@@ -94,7 +94,7 @@ def play_with_noise(
         progress (bool): whether to show a progress bar.
 
     Raises:
-        ValueError: a level below 0, or fewer than one episode.
+        ValueError: a level below 0, fewer than one episode, or a single state in all of them.
         FileNotFoundError: a run's policy is not there.
     """
     if bad := [level for level in levels if not 0 <= level < float("inf")]:
@@ -147,8 +147,9 @@ def draw_noise(played: Sequence[Played], path: str | Path) -> None:
             places, look = [x for x, _ in known], looks[group.name]
             axis.plot(places, [each.value for _, each in known], label=group.name, **look)
             ends = [each.interval or (each.value, each.value) for _, each in known]
+            lower, upper = [low for low, _ in ends], [high for _, high in ends]
             band = {"color": look["color"], "alpha": 0.18, "linewidth": 0}
-            axis.fill_between(places, *zip(*ends, strict=True), **band)
+            axis.fill_between(places, lower, upper, **band)
         axis.set_xlabel("noise, in deviations of each feature")
         axis.set_ylabel(name)
     first = groups[0].first
@@ -166,13 +167,11 @@ def write_noise(folder: str | Path, played: Sequence[Played]) -> list[Path]:
         list: of the files.
     """
     folder = make_folder(folder)
-    kinds = dict.fromkeys((each.run.task, each.run.algorithm) for each in played)
-    pictures = []
-    for task, algorithm in kinds:
-        together = [p for p in played if (p.run.task, p.run.algorithm) == (task, algorithm)]
-        pictures.append(folder / f"noise_{task.replace('/', '_')}_{algorithm}.svg")
-        draw_noise(together, pictures[-1])
-    table = folder / "noise.md"
+    kinds: dict[Path, list[Played]] = {}
+    for each in played:
+        named = f"noise_{each.run.task.replace('/', '_')}_{each.run.algorithm}.svg"
+        kinds.setdefault(folder / named, []).append(each)
+    pictures, table = list(kinds), folder / "noise.md"
     shown = [f"![{path.stem.replace('_', ' ')}]({path.name})" for path in pictures]
     write_atomically(table, "\n\n".join([noise_table(played).markdown(), *shown, ""]).encode())
     tests = [
@@ -183,6 +182,9 @@ def write_noise(folder: str | Path, played: Sequence[Played]) -> list[Path]:
         for run, summaries in played
     ]
     write_json(folder / "noise.json", {"runs": tests})
+    # Last: whatever comes of them, what was played is there.
+    for picture, together in kinds.items():
+        draw_noise(together, picture)
     return [table, folder / "noise.json", *pictures]
 
 
@@ -195,7 +197,13 @@ def _visited_scale(runs: Iterable[FinishedRun], episodes: int) -> Tensor:
             for episode in play_episodes(policy, env, episodes, max_steps=max_steps):
                 states.append(episode["observation"])
         env.close()
-    return torch.cat(states).std(0)
+    visited = torch.cat(states)
+    if len(visited) < 2:
+        raise ValueError(
+            "noise is in standard deviations of the states that are visited, of which there was "
+            f"one in {episodes} episodes: play more."
+        )
+    return visited.std(0)
 
 
 def _test(run: FinishedRun, scale: Tensor, episodes: int) -> dict[str, float]:

@@ -20,6 +20,9 @@ from torchrl_l2c2.metrics import action_variation
 
 Played = TypeVar("Played")
 
+# Of every episode, by their names in metrics.csv.
+MEASURES = ("return", "action_variation", "policy_scale", "length")
+
 
 class SimulatorError(RuntimeError):
     """The environment or the policy in it raised an error; the cause is chained."""
@@ -147,10 +150,11 @@ class Player:
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             written = self._agent.policy(transitions.select("observation"))
         mean, scale = written["action"].float(), written.get("scale", None)
-        measures = {
-            "return": transitions["next", "reward"].sum().item(),
-            "action_variation": action_variation(mean).item() if len(mean) > 1 else 0.0,
-            "policy_scale": float("nan") if scale is None else scale.mean().item(),
-            "length": transitions.numel(),
-        }
+        values = (
+            transitions["next", "reward"].sum().item(),
+            action_variation(mean).item() if len(mean) > 1 else 0.0,
+            float("nan") if scale is None else scale.mean().item(),
+            transitions.numel(),
+        )
+        measures = dict(zip(MEASURES, values, strict=True))
         return Episode(transitions, last_frame, measures, ends_round)

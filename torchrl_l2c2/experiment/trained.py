@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +11,8 @@ from torchrl.envs import EnvBase
 
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
-from torchrl_l2c2.experiment.folder import load_newest
+from torchrl_l2c2.experiment.folder import CheckpointError, load_newest
+from torchrl_l2c2.experiment.saved import REMEDY, read_config
 from torchrl_l2c2.experiment.settings import SettingError
 
 
@@ -46,7 +46,8 @@ def load_policy(
 
     Raises:
         FileNotFoundError: the folder is not a run's, or holds no such policy nor a checkpoint.
-        CheckpointError: its checkpoints are damaged.
+        CheckpointError: its policy, or all of its checkpoints, are damaged.
+        ValueError: its ``config.json`` is damaged.
         SettingError: a scale of noise below zero, or a seed that NumPy does not take.
 
     Examples:
@@ -66,7 +67,7 @@ def load_policy(
         raise SettingError("seed", f"must be at least 0 and below 2 ** 32, got {seed}.")
     if not (folder / "config.json").exists():
         raise FileNotFoundError(f"{str(folder)!r} is not the folder of a run: no config.json.")
-    config = ExperimentConfig.from_dict(json.loads((folder / "config.json").read_text()))
+    config = ExperimentConfig.from_dict(read_config(folder))
     config = replace(config, device="cpu")
     noise = config.task.noise_scale if noise_scale is None else noise_scale
     task = replace(config.task, noise_scale=noise)
@@ -74,11 +75,25 @@ def load_policy(
     agent = config.make_agent(env)
     saved = folder / ("policy_best.pt" if best else "policy.pt")
     if saved.exists():
-        agent.policy.load_state_dict(torch.load(saved, weights_only=True))
+        _load_weights(agent.policy, saved)
     elif best:
-        raise FileNotFoundError(f"{str(saved)!r} does not exist; evaluate_every=N makes it.")
+        raise FileNotFoundError(
+            f"{str(saved)!r} does not exist; evaluate_every=N makes it "
+            "while a run is trained: of one that has ended, train it in another folder."
+        )
     elif newest := load_newest(folder):
         agent.load_networks(newest[1])
     else:
         raise FileNotFoundError(f"{str(folder)!r} holds neither policy.pt nor a checkpoint yet.")
     return agent.policy, env, config.task.time_limit
+
+
+def _load_weights(policy: TensorDictModule, path: Path) -> None:
+    try:
+        policy.load_state_dict(torch.load(path, "cpu", weights_only=True))
+    except OSError:
+        raise
+    # Of damaged bytes torch raises errors of many kinds, on many lines.
+    except Exception as error:
+        what = f"{path} does not hold this run's policy ({type(error).__name__})"
+        raise CheckpointError(f"{what}: {REMEDY}") from error

@@ -274,13 +274,13 @@ class Experiment:
         if self.folder is None:
             raise ValueError("this experiment has no folder to write to; give it one when made.")
         save_policy(self.agent.policy, self.folder / "policy.pt")
-        tests = {"mean": result, "sampled": sampled}
         written: dict[str, dict[str, Any]] = {
             name: {"summary": test.summary(), "episodes": asdict(test)}
-            for name, test in tests.items()
+            for name, test in {"mean": result, "sampled": sampled}.items()
             if test is not None
         }
         written["mean"]["training"] = {
+            "episodes": len(self.metrics),
             "frames": self.player.frames,
             "updates": self.learner.updates,
             "untrained": self._untrained(),

@@ -219,7 +219,8 @@ class ReplayUpdate:
 
     def example(self) -> TensorDictBase:
         """A batch from all over the storage, for which nothing that runs depend on is drawn."""
-        size, device = self._batch_size, self._device
+        # All of it where a rollout is shorter than a batch.
+        size, device = min(self._batch_size, len(self._storage)), self._device
         rows = torch.linspace(0, len(self._storage) - 1, size, device=device).long()
         weight = torch.ones(size, device=device) if self._prioritized else None
         uniform = self._uniform(size, torch.Generator(device).manual_seed(0))

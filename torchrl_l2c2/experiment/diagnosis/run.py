@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
 import statistics
 from collections.abc import Iterable, Mapping
@@ -27,6 +26,7 @@ from torchrl_l2c2.experiment.export import entry_names
 from torchrl_l2c2.experiment.folder import load_newest
 from torchrl_l2c2.experiment.influence import gradient_shares
 from torchrl_l2c2.experiment.process import ProcessState
+from torchrl_l2c2.experiment.saved import read_config
 from torchrl_l2c2.experiment.trained import load_policy
 from torchrl_l2c2.experiment.video import play_pictures
 from torchrl_l2c2.objectives.evaluation import Evaluation, is_ensemble
@@ -68,7 +68,7 @@ def diagnose_run(
     """
     folder = Path(folder)
     policy, env, max_steps = load_policy(folder, seed=seed, noise_scale=noise_scale, best=best)
-    config = ExperimentConfig.from_dict(json.loads((folder / "config.json").read_text()))
+    config = ExperimentConfig.from_dict(read_config(folder))
     noise = config.task.noise_scale if noise_scale is None else noise_scale
     agent = _trained(folder, config, env)
     with ProcessState(seed):

@@ -70,7 +70,8 @@ class GainConfig(RegularizerConfig):
     )
     gain_of: str = Field(
         default="action_variation",
-        description="of gain=target: the column of metrics.csv that is to be at most gain_target",
+        description="of gain=target: the column of metrics.csv, of numbers of at least 0, that is "
+        "to be at most gain_target",
     )
     gain_rate: float = Field(
         default=0.1,

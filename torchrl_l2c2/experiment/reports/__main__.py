@@ -116,7 +116,11 @@ def _read(
         for file in chosen.records:
             if not Path(file).exists():
                 raise FileNotFoundError(f"there is no file {file!r}; make it with --csv.")
-        return merge([], chain.from_iterable(map(read_records, chosen.records))), [], []
+        records = merge([], chain.from_iterable(map(read_records, chosen.records)))
+        if not records:
+            named = ", ".join(map(repr, chosen.records))
+            raise ValueError(f"no record of a run in {named}; make them with --csv.")
+        return records, [], []
     found = find_runs(chosen.folders)
     if not found.runs:
         named = ", ".join(map(repr, chosen.folders))

@@ -79,8 +79,15 @@ def write_differences(values: Mapping[str, str]) -> str:
 
 
 def read_differences(line: str) -> dict[str, str]:
-    """Reads :func:`write_differences` back."""
-    return dict(pair.split("=", 1) for pair in line.split())
+    """Reads :func:`write_differences` back.
+
+    Raises:
+        ValueError: a word that is no setting with its value.
+    """
+    pairs = [word.partition("=") for word in line.split()]
+    if cut := [name for name, equals, _ in pairs if not equals]:
+        raise ValueError(f"differences must be words such as a=1, got {cut[0]!r}")
+    return {name: value for name, _, value in pairs}
 
 
 def _names(config: Mapping[str, Any], groups: Any) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from typing import Any
 from torchrl_l2c2.experiment.folder import make_folder, write_atomically
 from torchrl_l2c2.experiment.reports.differences import BUDGETS, read_differences
 from torchrl_l2c2.experiment.reports.paper import Published, method_order, paper_of
+from torchrl_l2c2.experiment.saved import read_rows
 from torchrl_l2c2.experiment.tasks import TASKS
 
 # Which policies act, and how: the last policy's test episodes, or one episode of every policy
@@ -119,14 +120,14 @@ def read_records(path: str | Path) -> list[Record]:
     """Reads what :func:`write_records` wrote; an empty or absent file has none.
 
     Raises:
-        ValueError: the file has other columns, or a cell that is no number where one must be.
+        ValueError: the file has other columns, a line that is cut, or a cell that is no number
+            where one must be.
     """
     path = Path(path)
-    text = path.read_text() if path.exists() else ""
-    lines = csv.DictReader(io.StringIO(text))
+    columns, lines = read_rows(path) if path.exists() else ([], [])
     names = [field.name for field in fields(Record)]
-    if text and list(lines.fieldnames or ()) != names:
-        raise ValueError(f"{path} has the columns {lines.fieldnames}; they must be {names}.")
+    if columns and columns != names:
+        raise ValueError(f"{path} has the columns {columns}; they must be {names}.")
     return merge([], (_parse(path, number, line) for number, line in enumerate(lines, start=2)))
 
 
@@ -167,6 +168,7 @@ def _parse(path: Path, number: int, line: dict[str, str]) -> Record:
         "str": str,
     }
     try:
+        read_differences(line["differences"])
         return Record(**{f.name: readers[str(f.type)](line[f.name]) for f in fields(Record)})
-    except (TypeError, ValueError) as error:
+    except ValueError as error:
         raise ValueError(f"{path}, line {number}: {error}.") from None

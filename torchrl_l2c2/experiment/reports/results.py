@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from torchrl_l2c2.experiment.folder import write_json
 from torchrl_l2c2.experiment.reports.choice import choice_table
 from torchrl_l2c2.experiment.reports.field import field_table
 from torchrl_l2c2.experiment.reports.figures import draw_learning_curves
@@ -13,7 +14,7 @@ from torchrl_l2c2.experiment.reports.groups import group_records
 from torchrl_l2c2.experiment.reports.pairwise import pairwise_tables
 from torchrl_l2c2.experiment.reports.paper_table import paper_table
 from torchrl_l2c2.experiment.reports.records import QUANTITIES, Record
-from torchrl_l2c2.experiment.reports.runs import FinishedRun, find_runs, write_evaluation
+from torchrl_l2c2.experiment.reports.runs import FinishedRun, find_runs
 from torchrl_l2c2.experiment.reports.tables import Table, results_tables
 
 if TYPE_CHECKING:
@@ -34,9 +35,14 @@ def write_results(
     Returns:
         FinishedRun: the folder, read back.
     """
-    finished = write_evaluation(folder, config, tests)
-    draw_learning_curves([finished], folder / "learning_curves.png")
-    return finished
+    named = {group: getattr(config, group).name for group in ("task", "algorithm", "regularizer")}
+    run = {**named, "seed": config.seed, "solved_at": config.task.solved_at}
+    rest = {name: test for name, test in tests.items() if name != "mean"}
+    evaluation = {"run": run, **tests.get("mean", {}), **rest}
+    draw_learning_curves([FinishedRun.read(folder, evaluation)], folder / "learning_curves.png")
+    # Last, as it marks the run as finished.
+    write_json(folder / "evaluation.json", evaluation)
+    return FinishedRun.read(folder)
 
 
 def compare_with_paper(run: FinishedRun) -> str:

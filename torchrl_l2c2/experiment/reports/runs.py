@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import statistics
@@ -10,14 +9,18 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from torchrl_l2c2.experiment.folder import write_json
+from torchrl_l2c2.experiment.config import FREE_SETTINGS
 from torchrl_l2c2.experiment.reports.differences import differences, fingerprint, write_differences
 from torchrl_l2c2.experiment.reports.records import QUANTITIES, Record
-
-if TYPE_CHECKING:
-    from torchrl_l2c2.experiment.config import ExperimentConfig
+from torchrl_l2c2.experiment.saved import (
+    REMEDY,
+    read_config,
+    read_evaluation,
+    read_json,
+    read_rows,
+)
 
 
 @dataclass(frozen=True)
@@ -31,16 +34,29 @@ class FinishedRun:
     versions: dict[str, str]
 
     @classmethod
-    def read(cls, folder: Path) -> FinishedRun:
-        """Reads a run's folder; ``evaluation.json`` marks it as finished."""
-        with open(folder / "metrics.csv", newline="") as file:
-            metrics = list(csv.DictReader(file))
-        config, evaluation = (
-            json.loads((folder / name).read_text()) for name in ("config.json", "evaluation.json")
-        )
+    def read(cls, folder: Path, evaluation: dict[str, Any] | None = None) -> FinishedRun:
+        """Reads a run's folder; ``evaluation.json`` marks it as finished.
+
+        Args:
+            folder (Path): of the run.
+            evaluation (dict, optional): what that file is to have. Default: what it has.
+
+        Raises:
+            ValueError: names the file that is damaged, or cut short since the test.
+        """
+        config = read_config(folder)
+        evaluation = read_evaluation(folder) if evaluation is None else evaluation
         versions = folder / "versions.json"
-        known = json.loads(versions.read_text()) if versions.exists() else {}
-        return cls(folder, config, evaluation, metrics, known)
+        known = read_json(versions) if versions.exists() else {}
+        _, metrics = read_rows(folder / "metrics.csv")
+        # Tests of earlier releases do not say.
+        least = (evaluation.get("training") or {}).get("episodes", 1)
+        if len(metrics) < least:
+            raise ValueError(
+                f"{folder / 'metrics.csv'} has {len(metrics)} episodes, fewer than the {least} "
+                f"that were tested after: {REMEDY}"
+            )
+        return cls(folder, config, evaluation, metrics, {n: str(v) for n, v in known.items()})
 
     @property
     def task(self) -> str:
@@ -63,6 +79,11 @@ class FinishedRun:
         solved: float | None = self.config["task"].get("solved_at")
         return solved
 
+    @property
+    def test_episodes(self) -> int:
+        """Of the test with mean actions."""
+        return int(self.evaluation.get("summary", {}).get("episodes", 0))
+
     def column(self, name: str) -> list[float]:
         """A column of the metrics, a number per episode; NaN where it was not measured."""
         return [float(row.get(name) or "nan") for row in self.metrics]
@@ -73,10 +94,7 @@ class FinishedRun:
 
         Raises:
             SettingError: a setting that is not known.
-            ValueError: the run has no episode.
         """
-        if not self.metrics:
-            raise ValueError("metrics.csv has no episode.")
         end = self.metrics[-1]
         frames, speed = int(end["frames"]), self.column("frames_per_second")[-1]
         numbers = {
@@ -159,35 +177,29 @@ class FinishedRun:
         }
 
 
-def write_evaluation(
-    folder: Path, config: ExperimentConfig, tests: dict[str, dict[str, Any]]
-) -> FinishedRun:
-    """Writes a finished run's test episodes.
+def tested_run(folder: str | Path, settings: dict[str, Any]) -> FinishedRun | None:
+    """The run in a folder whose test is of these settings; ``None`` where there is none.
 
-    Args:
-        folder (Path): of the run.
-        config (ExperimentConfig): its settings.
-        tests (dict): ``"mean"`` and ``"sampled"``, where there is one: ``"summary"`` and
-            ``"episodes"`` of the test with the policy's mean and with samples.
-
-    Returns:
-        FinishedRun: the folder, read back.
+    Settings that change none of the numbers may differ.
     """
-    named = {group: getattr(config, group).name for group in ("task", "algorithm", "regularizer")}
-    run = {**named, "seed": config.seed, "solved_at": config.task.solved_at}
-    rest = {name: test for name, test in tests.items() if name != "mean"}
-    write_json(folder / "evaluation.json", {"run": run, **tests.get("mean", {}), **rest})
-    return FinishedRun.read(folder)
-
-
-def finished_run(folder: str | Path, settings: dict[str, Any]) -> FinishedRun | None:
-    """The finished run of these very settings in a folder; ``None`` where there is none."""
     folder = Path(folder)
     if not (folder / "evaluation.json").exists():
         return None
-    saved = json.loads((folder / "config.json").read_text())
-    # As JSON, where a tuple and a list are the same.
-    return FinishedRun.read(folder) if saved == json.loads(json.dumps(settings)) else None
+    saved = read_config(folder)
+    return FinishedRun.read(folder) if _deciding(saved) == _deciding(settings) else None
+
+
+def finished_run(folder: str | Path, settings: dict[str, Any]) -> FinishedRun | None:
+    """The same where the test has as many episodes as the settings ask for, or they want none."""
+    run = tested_run(folder, settings)
+    if run is None or settings["test_episodes"] in (0, run.test_episodes):
+        return run
+    return None
+
+
+def _deciding(settings: dict[str, Any]) -> Any:
+    """What decides a run's numbers, as JSON, where a tuple and a list are the same."""
+    return json.loads(json.dumps({k: v for k, v in settings.items() if k not in FREE_SETTINGS}))
 
 
 @dataclass(frozen=True)
@@ -217,7 +229,7 @@ def find_runs(folders: Iterable[str | Path]) -> Found:
         try:
             run = FinishedRun.read(folder)
             _ = run.record
-        except (OSError, ValueError, KeyError) as error:
+        except (OSError, ValueError, KeyError, TypeError) as error:
             unread.append(f"{folder} ({error})")
         else:
             runs.append(run)

@@ -1,0 +1,89 @@
+"""Files that are read back, and may be damaged by then: what cannot be read is named."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+REMEDY = "it was changed or cut since it was written; restore it."
+
+
+def read_json(path: str | Path) -> dict[str, Any]:
+    """Reads a JSON object.
+
+    Raises:
+        ValueError: names the file, which is no JSON or no object.
+    """
+    try:
+        value = json.loads(_read_text(path))
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path} is no JSON ({error}): {REMEDY}") from None
+    if not isinstance(value, dict):
+        raise ValueError(f"{path} must hold an object, {{...}}, got {value!r:.40}: {REMEDY}")
+    return value
+
+
+def read_rows(path: str | Path) -> tuple[list[str], list[dict[str, str]]]:
+    """Reads the header of a CSV file, and its lines by the names in it.
+
+    Raises:
+        ValueError: names the file, and the line that has fewer or more cells than the header.
+    """
+    lines = csv.reader(io.StringIO(_read_text(path)))
+    rows = []
+    try:
+        header = next(lines, [])
+        for cells in filter(None, lines):
+            if len(cells) != len(header):
+                many = f"{len(cells)} cells, where the header has {len(header)}"
+                raise ValueError(f"{path}, line {lines.line_num}: {many}: {REMEDY}")
+            rows.append(dict(zip(header, cells, strict=True)))
+    except csv.Error as error:
+        raise ValueError(f"{path}, line {lines.line_num}: {error}: {REMEDY}") from None
+    return header, rows
+
+
+def read_config(run: str | Path) -> dict[str, Any]:
+    """Reads a run's ``config.json``; what it lacks of newer settings have their defaults.
+
+    Raises:
+        ValueError: as :func:`read_json`; or it does not say what was run, which no default may.
+    """
+    path = Path(run) / "config.json"
+    config = read_json(path)
+    for group in ("task", "algorithm", "regularizer"):
+        chosen = config.get(group)
+        if not isinstance(chosen, dict) or "name" not in chosen:
+            raise ValueError(f"{path} does not name its {group}: {REMEDY}")
+    return config
+
+
+def read_evaluation(run: str | Path) -> dict[str, Any]:
+    """Reads a run's ``evaluation.json``.
+
+    Raises:
+        ValueError: as :func:`read_json`; or its tests have other than numbers in their summaries.
+    """
+    path = Path(run) / "evaluation.json"
+    evaluation = read_json(path)
+    for test in (evaluation, evaluation.get("sampled") or {}):
+        summary = test.get("summary", {}) if isinstance(test, dict) else None
+        # Of what could not be measured there is null.
+        numbers = isinstance(summary, dict) and all(
+            value is None or isinstance(value, int | float) for value in summary.values()
+        )
+        if not numbers:
+            raise ValueError(f"{path} has no numbers where it must, but {test!r:.40}: {REMEDY}")
+    if not isinstance(evaluation.get("training", {}), dict):
+        raise ValueError(f"{path} must say of training what is known: {REMEDY}")
+    return evaluation
+
+
+def _read_text(path: str | Path) -> str:
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} is no text in UTF-8 ({error.reason}): {REMEDY}") from None
