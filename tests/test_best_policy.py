@@ -219,5 +219,5 @@ def test_the_best_policy_is_loaded_where_there_is_one(folder, tmp_path):
     policy = load_policy(folder, best=True)[0]
     assert all(kept[k].equal(v) for k, v in policy.state_dict().items())
     run(tmp_path)
-    with pytest.raises(FileNotFoundError, match="evaluate_every=N makes it .* in another folder"):
+    with pytest.raises(FileNotFoundError, match=r"evaluate_every=N makes it .* in another folder"):
         load_policy(tmp_path, best=True)
