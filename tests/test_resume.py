@@ -172,25 +172,21 @@ def finished(folder, **settings):
     run.close()
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
+def test_what_changes_no_number_leaves_a_run_finished(tmp_path):
+    """And its test, also where something is made of such settings."""
+    finished(tmp_path)
+    test = (tmp_path / "evaluation.json").read_bytes()
+    for settings in (
         {"test_episodes": 0},
         {"threads": 2},
         {"logger": GROUPS["logger"]["tensorboard"]},
         {"record": True},
         {"checkpoint_interval": 5.0},
-    ],
-    ids=lambda settings: next(iter(settings)),
-)
-def test_what_changes_no_number_leaves_a_run_finished(tmp_path, settings):
-    """And its test, also where something is made of such settings."""
-    finished(tmp_path)
-    test = (tmp_path / "evaluation.json").read_bytes()
-    assert finished_run(tmp_path, small(**settings).to_dict()) is not None
-    Experiment(small(**settings), tmp_path).close()
-    assert (tmp_path / "evaluation.json").read_bytes() == test
-    assert finished_run(tmp_path, small().to_dict()) is not None
+    ):
+        assert finished_run(tmp_path, small(**settings).to_dict()) is not None
+        Experiment(small(**settings), tmp_path).close()
+        assert (tmp_path / "evaluation.json").read_bytes() == test
+        assert finished_run(tmp_path, small().to_dict()) is not None
 
 
 def test_a_run_is_finished_when_all_of_its_files_are_there(tmp_path, monkeypatch):

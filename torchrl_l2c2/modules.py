@@ -63,7 +63,8 @@ class SigmoidNormal(TanhNormal):
         \sigma(x) = \tfrac{1}{2} \big(1 + \tanh \tfrac{x}{2}\big)
 
     Takes what :class:`~torchrl.modules.TanhNormal` takes; its base distribution has half the
-    location and half the scale that were given.
+    location and half the scale that were given. So distances of means, which are taken of that,
+    are half as large as those of the key ``loc``, which CAPS compares.
 
     Examples:
         >>> import torch

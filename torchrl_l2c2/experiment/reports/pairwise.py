@@ -43,8 +43,9 @@ def pairwise_tables(records: Sequence[Record]) -> list[Table]:
 
 def _table(title: str, quantity: str, methods: dict[str, list[Group]]) -> Table:
     def cell(name: str, other: str) -> str:
-        better = improvement(methods[name], methods[other], "last_mean", quantity)
-        return "" if name == other else probability(better)
+        if name == other:
+            return ""
+        return probability(improvement(methods[name], methods[other], "last_mean", quantity))
 
     rows = [[name, *(cell(name, other) for other in methods)] for name in methods]
     return Table(title, ["method", *methods], rows, [LEGEND])
