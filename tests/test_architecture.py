@@ -37,7 +37,7 @@ rsl_rl.__init__
 trainers __init__
 experiment.settings experiment.compilation experiment.spaces experiment.guard
 experiment.tracing experiment.priorities experiment.frames experiment.row_writer
-experiment.loggers experiment.acting experiment.saved
+experiment.loggers experiment.acting
 experiment.folder
 experiment.environments experiment.lock experiment.signals
 experiment.process experiment.progress experiment.sweep experiment.optimizers
@@ -54,7 +54,7 @@ experiment.algorithms.ppo_rpe experiment.algorithms.sac experiment.algorithms.td
 experiment.algorithms.dqn experiment.algorithms.ppo
 experiment.algorithms.__init__
 experiment.config
-experiment.naming
+experiment.naming experiment.saved
 experiment.reports.statistics experiment.reports.paper experiment.reports.differences
 experiment.reports.records experiment.reports.document
 experiment.reports.runs experiment.reports.groups

@@ -10,7 +10,14 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.modules import IndependentNormal, NormalParamExtractor, ProbabilisticActor
 
-from torchrl_l2c2 import PPORPELoss, TSoftUpdate, make_actor, make_critic
+from torchrl_l2c2 import (
+    CAPSLoss,
+    L2C2Loss,
+    PPORPELoss,
+    TSoftUpdate,
+    make_actor,
+    make_critic,
+)
 from torchrl_l2c2.objectives.relative_pearson import of_each_transition
 
 
@@ -183,6 +190,28 @@ def test_priority_weights_are_divided_by_their_largest_or_their_mean(importance,
     for key in ("loss_actor", "loss_critic"):
         expected = (weights[0] * each[key][0] + weights[1] * each[key][1]) / 2
         torch.testing.assert_close(terms[key], expected)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("wrap", [L2C2Loss, CAPSLoss])
+def test_a_sum_is_the_mean_times_the_transitions_that_count(wrap, masked):
+    """With priority weights: of its own terms, which they scale down, and a regularizer's."""
+    found = {}
+    for reduction in ("mean", "sum", "none"):
+        torch.manual_seed(0)
+        loss = wrap(make_loss(reduction=reduction))
+        batch = make_batch(loss, ratios=[1.5, 0.7, 1.1], rewards=[0.3, -2.0, 1.0])
+        batch["next", "observation"] = batch["observation"] + torch.tensor([[0.1], [0.2], [0.4]])
+        batch["priority_weight"] = torch.tensor([2.0, 0.1, 0.5])
+        if masked:
+            batch["collector", "mask"] = torch.tensor([True, True, False])
+        terms = loss(batch)
+        found[reduction] = {k: v for k, v in terms.items() if k.startswith("loss_")}
+    assert len(found["sum"]) > 2
+    for key, mean in found["mean"].items():
+        count = 2 if masked else 3
+        torch.testing.assert_close(found["sum"][key], count * mean, rtol=1e-5, atol=0)
+        torch.testing.assert_close(found["none"][key].sum(), count * mean, rtol=1e-5, atol=0)
 
 
 def test_the_target_baseline_takes_the_ratio_to_the_target_policy():

@@ -40,6 +40,7 @@ from torchrl_l2c2.experiment.reports.pairwise import pairwise_tables
 from torchrl_l2c2.experiment.reports.paper_table import paper_table
 from torchrl_l2c2.experiment.reports.readme import END, START, fill
 from torchrl_l2c2.experiment.reports.records import FIGURES, merge
+from torchrl_l2c2.experiment.reports.runs import FinishedRun, finished_run
 from torchrl_l2c2.experiment.reports.score import readings
 from torchrl_l2c2.experiment.reports.statistics import (
     bootstrap_interval,
@@ -545,6 +546,24 @@ class TestSettings:
         plain["regularizer"]["policy_distance"] = "mean"
         assert fingerprint(plain) != code
 
+    def test_a_run_of_before_a_setting_is_as_that_was_then(self, tmp_path):
+        """And not as its default is by now: it is no run of today's, and no two are pooled."""
+        today = make_config(episodes=2, test_episodes=2)
+        then = make_config(episodes=2, test_episodes=2, algorithm=PPORPEConfig(reduction="mean"))
+        for name, config in (("now", today), ("then", then), ("older", today)):
+            make_run(tmp_path / name, config, 1.0, 0.1)
+        older = tmp_path / "older" / "config.json"
+        config = json.loads(older.read_text())
+        del config["algorithm"]["reduction"], config["device"]
+        older.write_text(json.dumps(config))
+        found = {name: FinishedRun.read(tmp_path / name) for name in ("now", "then", "older")}
+        told = {name: run.record for name, run in found.items()}
+        assert told["older"].settings == told["then"].settings != told["now"].settings
+        assert told["older"].differences.split() == ["algorithm.reduction=mean", "task.episodes=2"]
+        assert told["now"].differences == "task.episodes=2"
+        assert finished_run(tmp_path / "older", then.to_dict()) is not None
+        assert finished_run(tmp_path / "older", today.to_dict()) is None
+
     def test_differences_are_from_the_defaults_of_what_is_chosen_by_name(self):
         """Another replay's own defaults are none; a task of one's own is its id."""
         config = ExperimentConfig.from_dict(
@@ -941,6 +960,14 @@ def test_the_fields_pages_are_those_of_their_records():
         # Of three seeds of each gain, each against each other one tells little.
         told += [] if name == "field_gains" else pairwise_tables(records)
         assert all(table.markdown() in page for table in told)
+
+
+def test_the_page_of_the_mean_is_that_of_its_records():
+    """What the paper's table was before the loss was summed over the batch."""
+    records = read_records(ROOT / "results" / "runs.csv")
+    of_the_mean = [r for r in records if r.other_settings.get("algorithm.reduction") == "mean"]
+    page = (ROOT / "results" / "batch_mean.md").read_text()
+    assert paper_table(group_records(of_the_mean)).markdown() in page
 
 
 # A row of the README's first table: whose records, of which length, policies and measure.

@@ -359,7 +359,7 @@ def test_a_setting_that_changes_nothing_may_be_new():
     saved = small().to_dict()
     del saved["regularizer"]["policy_distance"]
     check_same_settings(saved, small().to_dict())
-    with pytest.raises(OtherRunError, match=r"regularizer.policy_distance=none, as it is"):
+    with pytest.raises(OtherRunError, match=r"regularizer.policy_distance=hellinger, not mean"):
         now = small(regularizer=L2C2Config(policy_distance="mean"))
         check_same_settings(saved, now.to_dict())
 

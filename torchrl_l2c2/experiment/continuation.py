@@ -12,6 +12,7 @@ from typing import Any
 from torchrl_l2c2.experiment.config import (
     FREE_SETTINGS,
     FREE_TASK_SETTINGS,
+    NEUTRAL_SETTINGS,
     ExperimentConfig,
     OtherRunError,
     is_neutral,
@@ -42,12 +43,15 @@ def check_same_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> Non
         OtherRunError: names the first setting that differs, with both values.
     """
     for group in sorted((saved.keys() | now.keys()) - FREE_SETTINGS):
-        was, is_now = saved.get(group, MISSING), now.get(group, MISSING)
+        was, is_now = saved.get(group, _as_before(group)), now.get(group, MISSING)
         pairs = {group: (was, is_now)}
         if isinstance(was, Mapping) and isinstance(is_now, Mapping):
             free = FREE_TASK_SETTINGS if group == "task" else set()
             names = sorted((was.keys() | is_now.keys()) - free)
-            pairs = {f"{group}.{n}": (was.get(n, MISSING), is_now.get(n, MISSING)) for n in names}
+            pairs = {
+                name: (was.get(key, _as_before(name)), is_now.get(key, MISSING))
+                for key, name in ((key, f"{group}.{key}") for key in names)
+            }
         for name, (before, after) in pairs.items():
             since = before == MISSING and is_neutral(name, after)
             # As JSON, where a tuple and a list are the same; 10 and 10.0 are, too.
@@ -56,6 +60,10 @@ def check_same_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> Non
                     f"this folder's checkpoint was made with {name}={before}, not {after}: "
                     "choose another folder, or delete this one. Nothing was changed."
                 )
+
+
+def _as_before(name: str) -> Any:
+    return NEUTRAL_SETTINGS.get(name, MISSING)
 
 
 def check_same_versions(saved: Mapping[str, str], now: Mapping[str, str]) -> None:

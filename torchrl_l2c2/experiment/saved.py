@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import json
 from pathlib import Path
 from typing import Any
+
+from torchrl_l2c2.experiment.config import GROUPS, NEUTRAL_SETTINGS
 
 REMEDY = "it was changed or cut since it was written; restore it."
 
@@ -47,7 +50,9 @@ def read_rows(path: str | Path) -> tuple[list[str], list[dict[str, str]]]:
 
 
 def read_config(run: str | Path) -> dict[str, Any]:
-    """Reads a run's ``config.json``; what it lacks of newer settings have their defaults.
+    """Reads a run's ``config.json``, with newer settings as they were before they were settings.
+
+    Their defaults may be others by now.
 
     Raises:
         ValueError: as :func:`read_json`; or it does not say what was run, which no default may.
@@ -58,6 +63,11 @@ def read_config(run: str | Path) -> dict[str, Any]:
         chosen = config.get(group)
         if not isinstance(chosen, dict) or "name" not in chosen:
             raise ValueError(f"{path} does not name its {group}: {REMEDY}")
+    for setting, value in NEUTRAL_SETTINGS.items():
+        group, _, name = setting.rpartition(".")
+        values = config[group] if group else config
+        if not group or _has(group, values["name"], name):
+            values.setdefault(name, value)
     return config
 
 
@@ -80,6 +90,11 @@ def read_evaluation(run: str | Path) -> dict[str, Any]:
     if not isinstance(evaluation.get("training", {}), dict):
         raise ValueError(f"{path} must say of training what is known: {REMEDY}")
     return evaluation
+
+
+def _has(group: str, chosen: Any, setting: str) -> bool:
+    settings = GROUPS[group].get(str(chosen))  # None: a name that is not known, refused elsewhere.
+    return settings is not None and setting in {f.name for f in dataclasses.fields(settings)}
 
 
 def _read_text(path: str | Path) -> str:

@@ -52,7 +52,7 @@ class TaskConfig:
         ".01 for Swingup, none for other ids [paper]",
     )
     episodes: int = Field(
-        default=300,
+        default=350,
         ge=1,
         description="to train for, unless frames are given [inferred: the paper states none]",
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -83,7 +83,8 @@ class PPORPELoss(SharedEvaluation):
             ``"max"``, the batch's largest, so that they only scale the loss down; ``"mean"``, their
             mean, as TorchRL's own losses do, which leaves the loss at full strength beside a
             regularizer. [inferred] Default ``"max"``.
-        reduction (str): ``"mean"``, ``"sum"`` or ``"none"``. Default ``"mean"``.
+        reduction (str): ``"mean"``, ``"sum"`` or ``"none"``; over a batch a sum is ``B`` times the
+            mean, a regularizer's terms included. Default ``"mean"``.
 
     Raises:
         TypeError: a setting of another type.
@@ -201,16 +202,10 @@ class PPORPELoss(SharedEvaluation):
     def in_keys(self) -> list[NestedKey]:
         if self._in_keys is None:
             states = [*self.actor_network.in_keys, *self.critic_network.in_keys]
-            keys = [self.tensor_keys.action]
-            if self.baseline == "stored":
-                keys.append(self.tensor_keys.sample_log_prob)
-            outcome = (
-                self.tensor_keys.reward,
-                self.tensor_keys.done,
-                self.tensor_keys.terminated,
-                *self.critic_network.in_keys,
-            )
-            self._in_keys = list(dict.fromkeys([*states, *keys, *map(_next, outcome)]))
+            keys = self.tensor_keys
+            taken = [keys.action] + ([keys.sample_log_prob] if self.baseline == "stored" else [])
+            outcome = (keys.reward, keys.done, keys.terminated, *self.critic_network.in_keys)
+            self._in_keys = list(dict.fromkeys([*states, *taken, *map(_next, outcome)]))
         return self._in_keys
 
     @in_keys.setter
@@ -287,6 +282,13 @@ class PPORPELoss(SharedEvaluation):
                 "ratio_threshold": threshold,
             }
         )
+
+    def _reduce_loss(self, loss: Tensor, tensordict: TensorDictBase, **kwargs: Any) -> Tensor:
+        """Only regularizers give weights: with a mean of 1 their gain is that beside any mean."""
+        weights = kwargs.get("weights")
+        if weights is not None and kwargs["reduction"] != "mean":  # A mean divides by it anyway.
+            kwargs["weights"] = importance_weight(weights, "mean", self._mask(tensordict, weights))
+        return super()._reduce_loss(loss, tensordict, **kwargs)
 
     def _mask(self, tensordict: TensorDictBase, like: Tensor) -> Tensor | None:
         """Which transitions count, of the shape of a tensor; ``None``: all."""

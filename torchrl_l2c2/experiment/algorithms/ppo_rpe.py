@@ -51,9 +51,9 @@ class PPORPEConfig(OffPolicyConfig):
         description="what the weights of prioritized replay are divided by [inferred: max]",
     )
     reduction: Literal["mean", "sum"] = Field(
-        default="mean",
+        default="sum",
         description="of losses and regularization over the batch; a sum lifts gradients above the "
-        "optimizer's eps [inferred: mean]",
+        "optimizer's eps [inferred: sum]",
     )
     acting_policy: Literal["target", "online"] = Field(
         default="target", description="which copy of the policy acts [inferred: target]"

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from torchrl_l2c2.experiment.folder import write_atomically
+from torchrl_l2c2.experiment.reports.differences import BUDGETS
 from torchrl_l2c2.experiment.reports.figures import draw_plane
 from torchrl_l2c2.experiment.reports.groups import Group, group_records
 from torchrl_l2c2.experiment.reports.paper import PAPER, is_of_paper
@@ -22,7 +23,8 @@ PICTURE = Path("docs") / "results.svg"
 def results_text(records: Sequence[Record]) -> str:
     """What stands between the marks: a picture and the paper's table.
 
-    Where a task has runs of its default length, others are not told: they compare lengths.
+    Where a task has runs of its default length and settings, others are not told: they compare
+    lengths and readings of the paper. Regularizers' settings may be others.
 
     Raises:
         ValueError: no record is of the paper's tasks with its algorithm.
@@ -66,10 +68,11 @@ def fill_readme(path: str | Path, records: Sequence[Record]) -> None:
 
 def _groups(records: Sequence[Record]) -> list[Group]:
     records = [r for r in records if is_of_paper(r.task, r.algorithm)]
-    as_usual = {r.task for r in records if _is_as_long_as_usual(r)}
-    return group_records(r for r in records if _is_as_long_as_usual(r) or r.task not in as_usual)
+    as_usual = {r.task for r in records if _is_as_usual(r)}
+    return group_records(r for r in records if _is_as_usual(r) or r.task not in as_usual)
 
 
-def _is_as_long_as_usual(record: Record) -> bool:
+def _is_as_usual(record: Record) -> bool:
     task = TASKS.get(record.task)
-    return task is not None and record.length == f"{task.episodes} episodes"
+    others = {k for k in record.other_settings if not k.startswith("regularizer.")} - {*BUDGETS}
+    return task is not None and record.length == f"{task.episodes} episodes" and not others
