@@ -78,6 +78,12 @@ class SigmoidNormal(TanhNormal):
         """Sets the location and the scale of the normal, before it is squashed."""
         super().update(loc / 2, scale / 2)
 
+    def get_mode(self) -> Tensor:
+        """Estimates the mode by Adam, as :class:`~torchrl.modules.TanhNormal` does its own."""
+        bounds = {"low": self.low, "high": self.high, "event_dims": self._event_dims}
+        mode: Tensor = TanhNormal(self.loc, self.scale, **bounds).get_mode()  # Halved already.
+        return mode
+
 
 # How a sample of the normal is kept in the action's bounds.
 DISTRIBUTIONS = {"tanh": TanhNormal, "sigmoid": SigmoidNormal, "none": IndependentNormal}
