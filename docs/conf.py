@@ -7,16 +7,22 @@ browsers draw themselves with a font that comes along, and other projects are no
 from __future__ import annotations
 
 import inspect
+import re
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 from docutils import nodes
 from math_core import LatexError, LatexToMathML
+from sphinx.addnodes import pending_xref
 from sphinx.application import Sphinx
+from sphinx.transforms.post_transforms import SphinxPostTransform
 from sphinx.util import logging
 from sphinx.util.inspect import stringify_signature
 
 from torchrl_l2c2 import __version__
+
+ROOT = Path(__file__).parents[1]
 
 project = "torchrl_l2c2"
 author = "The torchrl_l2c2 authors"
@@ -79,6 +85,33 @@ def show_constructor(
     return None
 
 
+class LinksToParts(SphinxPostTransform):
+    """A link to a file of ``results/`` leads to the part of a page here that this file is."""
+
+    default_priority = 8  # Before MyST looks for the file among the pages.
+
+    def run(self, **kwargs: Any) -> None:
+        parts = {
+            Path(included).stem: (page, ROOT / included)
+            for page in self.env.found_docs
+            if (path := Path(self.env.doc2path(page))).suffix == ".md"
+            for included in re.findall(r"{include} \.\./(results/\S+\.md)", path.read_text())
+        }
+        for link in self.document.findall(pending_xref):
+            target, _, anchor = link["reftarget"].partition("#")
+            name = Path(target).name.removesuffix(".md")
+            if link["reftype"] == "myst" and target not in self.env.found_docs and name in parts:
+                page, path = parts[name]
+                anchor = anchor or link.get("reftargetid") or slug(path.read_text().splitlines()[0])
+                link.attributes |= {"refdomain": "doc", "reftarget": page, "reftargetid": anchor}
+
+
+def slug(heading: str) -> str:
+    """The anchor of a heading, as GitHub and MyST name it."""
+    return re.sub(r"[^\w\- ]", "", heading.lstrip("# ").lower()).replace(" ", "-")
+
+
 def setup(app: Sphinx) -> None:
+    app.add_post_transform(LinksToParts)
     app.add_html_math_renderer("mathml", (draw_inline, None), (draw_block, None))
     app.connect("autodoc-process-signature", show_constructor)

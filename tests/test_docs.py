@@ -105,13 +105,25 @@ def test_every_public_name_has_a_section_that_uses_it(components: dict[str, Any]
         assert components[name] is getattr(torchrl_l2c2, name)
 
 
-def test_the_table_of_contents_leads_to_sections() -> None:
-    """Every link into the page has its heading, as GitHub names it."""
-    text = COMPONENTS.read_text()
-    headings = re.findall(r"^## (.*)$", text, re.M)
-    anchors = {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
-    links = set(re.findall(r"\]\(#([^)]*)\)", text))
-    assert links and links <= anchors
+WRITTEN = sorted(
+    path for folder in (ROOT, FOLDER, ROOT / "results") for path in folder.glob("*.md")
+)
+
+
+@pytest.mark.parametrize("page", WRITTEN, ids=lambda path: str(path.relative_to(ROOT)))
+def test_every_link_leads_to_a_file_and_its_heading(page: Path) -> None:
+    """From the file itself, with headings as GitHub names them; the site finds the same parts."""
+    for path, _, heading in re.findall(r"\]\((?!https?:)([^#)\s]*)(#?)([^)\s]*)\)", prose(page)):
+        target = (page.parent / path if path else page).resolve()
+        assert target.exists(), path
+        headings = re.findall(r"^#+ (.*)$", prose(target), re.M) if heading else []
+        anchors = {re.sub(r"[^\w\- ]", "", each.lower()).replace(" ", "-") for each in headings}
+        assert not heading or heading in anchors, (path, heading)
+
+
+def prose(page: Path) -> str:
+    """A page without its blocks of code."""
+    return re.sub(r"^```.*?^```", "", page.read_text(), flags=re.M | re.S)
 
 
 def test_the_mean_gains_are_right(components: dict[str, Any]) -> None:

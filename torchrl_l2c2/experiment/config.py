@@ -119,8 +119,8 @@ class ExperimentConfig:
     test_episodes: int = Field(
         default=100,
         ge=0,
-        description="episodes played with the policy's mean after training; 0: none, and no "
-        "evaluation.json",
+        description="episodes played with the policy's mean, and as many with samples, after "
+        "training; 0: none, and no evaluation.json",
     )
     evaluate_every: int = Field(
         default=0,

@@ -63,7 +63,9 @@ def _about(name: str, chosen: Any, first: Any) -> str:
     doc = (chosen.__doc__ or "").splitlines()[0]
     tuned = TUNED.items() if name in BEGIN_TUNED else ()
     begins = (f" (With algorithm={a} from {_together(values)}.)" for a, values in tuned)
-    return (f"{first.name} with {differing}" if differing else doc) + "".join(begins)
+    # Where the first begins elsewhere with some algorithms, the paper's does not.
+    like = "l2c2_paper" if first.name in BEGIN_TUNED and name not in BEGIN_TUNED else first.name
+    return (f"{like} with {differing}" if differing else doc) + "".join(begins)
 
 
 def _together(values: Mapping[str, Any]) -> str:

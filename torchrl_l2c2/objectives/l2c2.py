@@ -59,9 +59,9 @@ class L2C2Loss(RegularizedLoss):
     the other, through both :math:`s` and :math:`\tilde s`, and nowhere else: not into targets,
     nor from a value into the policy except through a trunk that the plain loss trains so as well.
     Both terms are reduced as the loss reduces its own: with its ``reduction``, its masks and, where
-    it uses them, the weights of prioritized replay, in TorchRL's weighted mean. That mean keeps the
-    terms at their full gain also beside :class:`PPORPELoss`, which scales its own terms down by the
-    weights [inferred: the paper weights neither or both].
+    it uses them, the weights of prioritized replay, in TorchRL's weighted mean or sum. Beside
+    :class:`PPORPELoss`, which scales its own terms down by the weights, theirs have a mean of 1, so
+    that the terms keep their full gain [inferred: the paper weights neither or both].
 
     Neighbors are read from the batch where :class:`~torchrl_l2c2.NeighborTransform` has written
     them (give it the same neighborhood and ``num_samples``; a difference is told once, as a

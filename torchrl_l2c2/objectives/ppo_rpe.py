@@ -55,7 +55,8 @@ class PPORPELoss(SharedEvaluation):
 
     [inferred] Only the abstracts of the algorithm's papers could be read, so these are settings:
     all heads share one target; ``threshold``, ``critic_weighting``, ``baseline`` and
-    ``importance`` each have the reading that was seen to work as their default.
+    ``importance`` each have the reading that was seen to work as their default. Of ``reduction``
+    the default is TorchRL's mean; the experiment's is ``"sum"``, for :class:`~.AdaTerm`'s ``eps``.
 
     Args:
         actor_network (ProbabilisticTensorDictSequential): the policy. A target copy is kept.

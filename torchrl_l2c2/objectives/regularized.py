@@ -274,8 +274,9 @@ class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
         """Reduces as the loss does its own terms: its reduction, masks and priority weights.
 
         Losses that ignore priority weights, ignore them here too. Weights make it TorchRL's
-        weighted mean, whose strength does not depend on them; :class:`PPORPELoss` scales its own
-        terms down by them, so that beside those a regularizer is at its full gain.
+        weighted mean, whose strength does not depend on them, or its weighted sum, whose strength
+        does, as the loss's own. :class:`PPORPELoss` scales its own terms down by them, and gives
+        those of a regularizer a mean of 1: beside it a regularizer is at its full gain.
 
         Args:
             value: ``[*B, ...]``; the term is ``[]`` or, with ``reduction="none"``, like it.

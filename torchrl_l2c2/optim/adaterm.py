@@ -53,8 +53,9 @@ class AdaTerm(Optimizer):
         beta (float): decay of the moments, in ``(0, 1)``. Larger values average over more
             gradients: steadier and slower to follow a change. Default 0.9.
         eps (float): smallest scale of a gradient's deviation, above 0. Larger values limit the
-            steps where gradients hardly vary (to ``lr * |g| / eps``) and shorten the warm-up;
-            smaller ones do the opposite. Default 1e-5.
+            steps where gradients hardly vary (to ``lr * |g| / eps``: so much that losses whose
+            gradients are below it hardly learn) and shorten the warm-up; smaller ones do the
+            opposite. Default 1e-5.
         nu_min (float): lowest degrees of freedom, above 0. Smaller values discard outliers more
             strongly; towards infinity none is discarded. Default 1.0.
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @settings
 class PPORPEConfig(OffPolicyConfig):
-    """PPO-RPE with target networks, the paper's algorithm; (.5, .5, .999, .1) are its values."""
+    """PPO-RPE with target networks, the paper's algorithm and kappa, beta, decay, delta_min."""
 
     usual_replay: ClassVar[str] = "prioritized"
     usual_optimizer: ClassVar[str] = "adaterm"

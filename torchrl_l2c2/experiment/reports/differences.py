@@ -30,7 +30,7 @@ def fingerprint(config: Mapping[str, Any]) -> str:
     as older runs had it) does not count: one that is added later leaves the codes of older runs.
 
     Args:
-        config (Mapping): of ``config.json``; settings that it lacks have their defaults.
+        config (Mapping): of :func:`~.saved.read_config`; settings that it lacks have defaults.
 
     Raises:
         SettingError: a setting that is not known.
@@ -47,7 +47,7 @@ def differences(config: Mapping[str, Any]) -> dict[str, str]:
     """The settings that differ from the defaults of what the run's names choose.
 
     Args:
-        config (Mapping): of ``config.json``.
+        config (Mapping): of :func:`~.saved.read_config`.
 
     Returns:
         dict: such as ``{"algorithm.replay_ratio": "10", "task.episodes": "400"}``, sorted; without
