@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from small import ALGORITHMS, replay_of
 from tensordict.nn import TensorDictModule
 from torchrl.envs import GymEnv
 
@@ -21,7 +22,9 @@ from torchrl_l2c2.experiment import (
     load_policy,
     video,
 )
+from torchrl_l2c2.experiment.acting import exploring_in
 from torchrl_l2c2.experiment.evaluate import main
+from torchrl_l2c2.experiment.regularizers import REGULARIZERS
 
 # What each command begins with.
 LOADS = {evaluate: "load_policy", diagnose: "diagnose_run", video: "play_pictures"}
@@ -169,6 +172,18 @@ def test_sensitivity_to_noise_is_among_the_measures():
     assert first == pytest.approx(0.5 * (0.3 * 0.01) ** 2, rel=0.2)
 
 
+def test_numbers_that_are_not_finite_end_every_command_in_one_line(folder, monkeypatch):
+    """As what the task or the policy gave is not the command's fault."""
+
+    def diverged(*_, **__):
+        raise FloatingPointError("reward is not finite at frame 5")
+
+    for module, name in LOADS.items():
+        monkeypatch.setattr(module, name, diverged)
+        with pytest.raises(SystemExit, match="error: reward is not finite at frame 5"):
+            module.main([str(folder)])
+
+
 def test_evaluate_refuses_what_cannot_be(folder, tmp_path):
     """In one line."""
     with pytest.raises(SystemExit, match=r"error: .*noise_scale must be greater"):
@@ -211,6 +226,22 @@ def test_the_folder_says_how_to_load_its_policy(folder):
     for path in folder.iterdir():
         if not path.name.startswith((".", "checkpoint", "result", "README")):
             assert path.name in text
+
+
+def test_a_policy_of_a_checkpoint_explores_as_the_run_does(tmp_path):
+    """Not as at its beginning, where DQN takes any action."""
+    chosen = replace(ALGORITHMS["dqn"], random_frames=0, epsilon_end=0.25, epsilon_frames=20)
+    task = TaskConfig("cartpole", "CartPole-v1", episodes=6, max_steps=40)
+    settings = {
+        "algorithm": chosen,
+        "replay": replay_of("dqn"),
+        "regularizer": REGULARIZERS["none"],
+    }
+    experiment = Experiment(ExperimentConfig(task=task, compile=False, **settings), tmp_path)
+    experiment.train()
+    rate = exploring_in(load_policy(tmp_path)[0]).eps.item()
+    assert rate == exploring_in(experiment.agent.policy).eps.item() == 0.25
+    experiment.close()
 
 
 def test_the_best_policy_is_loaded_where_there_is_one(folder, tmp_path):

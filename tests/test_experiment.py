@@ -126,10 +126,13 @@ def test_every_alternative_changes_the_run(settings):
 
 def test_a_sum_over_the_batch_is_a_smaller_eps():
     """To AdaTerm: its steps know no other scale of a gradient. The regularizer is summed, too."""
+    # So strong that its gain shows, also where the weights of prioritized replay differ.
+    strong = L2C2Config(lambda_min=10.0, lambda_max=1000.0)
 
     def learn(reduction, eps):
-        algorithm = PPORPEConfig(reduction=reduction, updates=3, hidden=(8,))
-        experiment = Experiment(small(algorithm=algorithm, optimizer=AdaTermConfig(eps=eps)))
+        chosen = {"algorithm": PPORPEConfig(reduction=reduction, updates=3, hidden=(8,))}
+        optimizer = AdaTermConfig(eps=eps)
+        experiment = Experiment(small(**chosen, regularizer=strong, optimizer=optimizer))
         experiment.train()
         return torch.cat([p.detach().flatten() for p in experiment.agent.loss.parameters()])
 
@@ -380,6 +383,19 @@ def test_a_longer_run_begins_as_a_shorter_one():
         [known({**row, **dict.fromkeys(tests, math.nan)}) for row in run] for run in runs
     )
     assert long[:4] == short and "test_return" in known(runs[0][-1])
+
+
+def test_a_training_in_parts_is_the_one_in_one_go():
+    """Also beside tests; the learning rate falls over all of it, whose last part has late tests."""
+    task, adam = replace(PENDULUM, episodes=6), AdamConfig(linear=True)
+    settings = small(task=task, algorithm=PPORPEConfig(hidden=(8,)), optimizer=adam, late_share=0.5)
+    whole, parts = Experiment(settings), Experiment(settings)
+    for episodes in (2, 4, None):
+        parts.train(episodes)
+        parts.test(1, sampled=True)
+    assert [*map(known, parts.metrics)] == [*map(known, whole.train())]
+    rates = [each.agent.optimizer.param_groups[0]["lr"] for each in (whole, parts)]
+    assert rates == [0.0, 0.0]
 
 
 ALGORITHMS = {

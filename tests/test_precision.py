@@ -13,7 +13,7 @@ from tests.losses import (
     on_policy,
     qvalue,
 )
-from torchrl_l2c2 import CATSLoss, L2C2Loss, PPORPELoss
+from torchrl_l2c2 import ASAPLoss, CATSLoss, L2C2Loss, PPORPELoss
 from torchrl_l2c2.objectives import evaluation
 
 
@@ -68,6 +68,14 @@ def test_the_terms_and_gradients_are_those_without_autocast(make, compiling, bat
     torch.testing.assert_close(found, added)
     torch.testing.assert_close(its_gradients, gradients)
     assert (its_own != own).any()
+
+
+def test_what_is_a_copy_of_the_policy_predicts_it_under_autocast_too(batch):
+    """ASAP's terms are 0 then, where its predictor is evaluated as the policy is."""
+    batch["previous_observation"] = batch["observation"].clone()
+    added, *_ = evaluate(ASAPLoss(ppo(), previous_key="previous_observation"), batch, autocast=True)
+    for kind in ("spatial", "temporal"):
+        assert added[f"loss_asap_{kind}"].item() == 0.0
 
 
 def test_rounded_the_term_would_be_another_number(batch):

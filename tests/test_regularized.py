@@ -65,6 +65,7 @@ from torchrl.objectives.llm import DAPO, DistillationLoss, GRPOLoss, SFTLoss
 
 from torchrl_l2c2 import (
     CAPSLoss,
+    CATSLoss,
     L2C2Loss,
     Neighborhood,
     NeighborTransform,
@@ -212,6 +213,19 @@ class TestTheClass:
 
 
 class TestAttributes:
+    @pytest.mark.parametrize("wrap", [L2C2Loss, CAPSLoss, CATSLoss])
+    def test_what_has_no_last_dimension_is_refused(self, wrap):
+        """Its differences would be summed over the batch, and count as often as it is large."""
+        actor = TensorDictModule(lambda s: s.sum(-1).tanh(), ["observation"], ["action"])
+        value = TensorDictModule(
+            lambda s, a: s.sum(-1) + a, ["observation", "action"], ["state_action_value"]
+        )
+        batch = with_neighbors(on_policy(4))
+        batch["action"] = batch["action"][:, 0]
+        message = r"each of the \((1, )?4,?\) states by itself, got differences of shape"
+        with pytest.raises(ValueError, match=message):
+            wrap(DDPGLoss(actor, value)).policy_regularizer(batch)
+
     def test_the_losss_own_settings_can_be_assigned(self):
         """Writes reach the one object: scheduled buffers, plain attributes, train and eval."""
         loss = L2C2Loss(ClipPPOLoss(gaussian_actor(), critic(), clip_epsilon=0.2))

@@ -110,6 +110,21 @@ def test_the_batch_has_the_entries_and_neighbors_that_the_buffer_gives():
     assert isinstance(transform, NeighborTransform)
 
 
+@pytest.mark.parametrize("name", ["prioritized", "sac"])
+def test_where_a_transition_lies_says_nothing_of_its_neighbor(name):
+    """Neither of one number for a neighbor, as many as the sampler draws."""
+    regularizer = L2C2Config(shared=True)
+    replay = PrioritizedReplayConfig(capacity=50, batch_size=8)
+    chosen = replace(CASES[name], regularizer=regularizer, replay=replay)
+    experiment = Experiment(chosen)
+    experiment.train()
+    draws = [experiment.learner.update.draw() for _ in range(40)]
+    rows = torch.cat([draw.rows for draw in draws]).double()
+    uniform = torch.cat([draw.uniform.flatten() for draw in draws]).double()
+    assert uniform.std() > 0.25  # of a uniform number: .29, or .58 from -1 to 1
+    assert torch.corrcoef(torch.stack([rows, uniform]))[0, 1].abs() < 0.2
+
+
 @pytest.mark.skipif(not compiler_available(), reason="no C++ compiler")
 # The rollout's, below, is the quick one with Adam.
 @pytest.mark.parametrize("name", ["prioritized", pytest.param("sac", marks=pytest.mark.slow)])

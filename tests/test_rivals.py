@@ -370,6 +370,23 @@ class TestLCP:
             found += loss.policy_regularizer(batch).values()
         assert found[0] > 0 and found[0] == found[1] == found[2]
 
+    @pytest.mark.parametrize("regularizer", [LCPLoss, lambda base: SR2LLoss(base, steps=2)])
+    def test_a_part_of_the_state_that_the_policy_does_not_use_does_not_matter(self, regularizer):
+        """It has no gradient, which is one of zero."""
+        torch.manual_seed(0)
+        net = nn.Sequential(nn.Linear(3, 4), NormalParamExtractor())
+        batch, terms = transitions(8).set("goal", torch.ones(8, 1)), []
+        for keys in (["observation"], ["observation", "goal"]):
+            module = TensorDictModule(lambda s, *_: net(s), keys, ["loc", "scale"])
+            actor = ProbabilisticActor(
+                module, in_keys=["loc", "scale"], distribution_class=IndependentNormal
+            )
+            loss = regularizer(PPOLoss(actor, None))
+            torch.manual_seed(1)
+            terms += loss.policy_regularizer(batch).values()
+        assert terms[0] > 0
+        torch.testing.assert_close(terms[0], terms[1])
+
     def test_its_gradient_is_that_of_the_penalty(self):
         """A second derivative, against differences."""
         batch, base = transitions(8), linear_normal()

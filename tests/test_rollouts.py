@@ -22,7 +22,9 @@ from torchrl_l2c2.experiment import (
     make_env,
 )
 from torchrl_l2c2.experiment.diagnosis.run import value_function
+from torchrl_l2c2.experiment.evaluate import evaluate_policy
 from torchrl_l2c2.experiment.rollouts import RolloutCollector
+from torchrl_l2c2.metrics import saturation
 
 NOISY = TaskConfig("pendulum", "Pendulum-v1", noise_scale=0.1, max_steps=9)
 LANDER = TaskConfig("lunarlander", "LunarLanderContinuous-v3")
@@ -187,6 +189,16 @@ def test_the_task_gets_clipped_actions_and_the_loss_those_that_were_drawn():
         written = run.agent.policy(frames.select("observation"))
     assert not written["loc"].equal(written["action"])
     assert written["action"].equal(written["loc"].clamp(-0.1, 0.2))
+
+
+def test_a_test_with_samples_gives_the_task_clipped_actions():
+    """As training does; they are what is measured."""
+    run = experiment(MOODY, clip_actions=True, log_scale=0.0)
+    env = run.config.make_env()
+    result = evaluate_policy(run.agent.policy, env, 1, sampled=True)
+    taken = torch.from_numpy(np.stack(env._env.unwrapped.taken))
+    assert taken.max() == np.float32(0.2) and taken.min() == np.float32(-0.1)
+    assert result.measures["sampled_saturation"] == [saturation(taken, -0.1, 0.2).item()]
 
 
 def test_what_a_cut_leaves_is_bootstrapped(monkeypatch):

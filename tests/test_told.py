@@ -8,6 +8,7 @@ import pytest
 import torch
 from small import ALGORITHMS, env_id_of, replay_of
 from tensordict import TensorDict
+from torchrl.envs import GymEnv
 from torchrl.modules import MLP, Actor, ValueOperator
 from torchrl.objectives import DDPGLoss
 
@@ -18,8 +19,10 @@ from torchrl_l2c2.experiment import (
     Experiment,
     ExperimentConfig,
     L2C2Config,
+    NoRegularizerConfig,
     SACConfig,
     TaskConfig,
+    TD3Config,
 )
 from torchrl_l2c2.experiment.influence import gradient_shares
 
@@ -157,6 +160,22 @@ def test_neighbors_of_ones_own_making_are_not_compared():
     loss, batch = L2C2Loss(ddpg()), NeighborTransform(Neighborhood(sigma=2.0))(ddpg_batch())
     del batch["neighbor", "neighborhood"]
     assert not warned(lambda: loss(batch))
+
+
+def test_actions_of_several_ranges_are_told_of_td3s_noise():
+    """Which has one deviation for all of them."""
+    env = GymEnv("LunarLanderContinuous-v3")
+    space = env.action_spec.space
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        make_td3(env)
+    space.high[1], space.low[1] = 0.1, -0.1
+    with pytest.warns(UserWarning, match=r"half their ranges, got \[1.0, 0.1.*RescaleAction"):
+        make_td3(env)
+
+
+def make_td3(env):
+    return TD3Config(hidden=(8,)).make_agent(env, NoRegularizerConfig(), AdamConfig())
 
 
 def test_an_experiment_compares_before_anything_is_compiled(monkeypatch):

@@ -1,4 +1,4 @@
-"""What a setting may be: a positive integer, a real number in a range, one of some choices."""
+"""What a setting may be: a positive integer, a real number in a range, ...; and a difference."""
 
 from __future__ import annotations
 
@@ -99,3 +99,17 @@ def _range(
         return f"in {brackets[0]}{low:.4g}, {high:.4g}{brackets[1]}"
     bound = f"greater than {low:.4g}" if at_least is None else f"at least {low:.4g}"
     return f"finite and {bound}" if finite else bound
+
+
+def check_of_each(shape: Sequence[int], batch: Sequence[int]) -> None:
+    """Refuses differences that a network without a last dimension has summed over the batch.
+
+    Raises:
+        ValueError: their shape does not begin with the batch's.
+    """
+    if tuple(shape[: len(batch)]) != tuple(batch):
+        raise ValueError(
+            f"a regularizer compares each of the {tuple(batch)} states by itself, got differences "
+            f"of shape {tuple(shape)}: give what the network writes a last dimension, "
+            "of 1 for a value or an action of one number."
+        )

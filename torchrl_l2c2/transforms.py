@@ -156,9 +156,9 @@ class NeighborTransform(_RandomTransform):
         num_samples: neighbors ``K`` per state, at least 1. More give a less noisy regularization
             at ``K`` times its network evaluations. Defaults to ``1``.
         generator: source of the randomness, on the device of the batches, saved and restored with
-            the ``state_dict`` of the buffer. Defaults to PyTorch's global generator. A buffer's own
-            does not reach its transforms: one that prefetches needs a generator here to be
-            reproducible, and a ``prefetch`` of 1, as several threads draw in any order.
+            the ``state_dict`` of the buffer. Defaults to PyTorch's global generator. It needs
+            another seed than the buffer's own, whose numbers it would draw, and which does not
+            reach transforms: one that prefetches needs a generator here, and a ``prefetch`` of 1.
 
     Raises:
         TypeError: if ``neighborhood``, ``num_samples`` or ``generator`` is of another type, or, in

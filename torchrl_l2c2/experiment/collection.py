@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -111,6 +111,8 @@ class EpisodeCollector(Collector):
         self._observation: Tensor | None = self._carrier.get("observation")
         self._policy_keys = [key for key in policy.out_keys if not key.startswith("_")]
         self._act = on_tensors(policy, self._policy_keys, compile_policy)
+        # Of a policy whose samples go beyond the bounds: frames have these, the task what it takes.
+        self._taken: Callable[[Tensor], Tensor] | None = getattr(policy, "taken", None)
         if self._simulator is not None:
             self._gymnasium = self._simulator._env
             self._dtype = self._simulator.observation_spec["observation"].dtype
@@ -163,7 +165,8 @@ class EpisodeCollector(Collector):
         if self._random_frames_left > 0:
             self._random_frames_left -= 1
             action.copy_(simulator.action_spec.rand())
-        seen, reward, terminated, truncated, _ = self._gymnasium.step(self._to_action(action))
+        taken = action if self._taken is None else self._taken(action)
+        seen, reward, terminated, truncated, _ = self._gymnasium.step(self._to_action(taken))
         following = self._observe(seen)
         self._observation = None if terminated or truncated else following
         return Frame(observation, outputs, following, as_number(reward), terminated, truncated)

@@ -53,6 +53,8 @@ GROUPS: dict[str, Mapping[str, Any]] = {
     "optimizer": OPTIMIZERS,
     "logger": LOGGERS,
 }
+# Added to a run's seed for its neighbors: no other generator of any run begins there.
+NEIGHBOR_SEED = 32_452_843
 # What steers where and how often runs happen, and is no setting of a run.
 STEERING = {"outputs", "experiment", "preset", "resume", "allow_other_versions"}
 
@@ -215,7 +217,10 @@ class ExperimentConfig:
         # The last episodes may go past the rollout's frames.
         longest = getattr(self.algorithm, "frames", 0) + self.num_workers * self.task.time_limit
         buffer = self.replay.make(torch.Generator().manual_seed(self.seed), longest, self.device)
-        transform = self.regularizer.transform(torch.Generator(self.device).manual_seed(self.seed))
+        # Another seed than the sampler's: with one number for a neighbor both draw as many at a
+        # time, and where a transition lies would say which neighbor it gets.
+        neighbors = torch.Generator(self.device).manual_seed(self.seed + NEIGHBOR_SEED)
+        transform = self.regularizer.transform(neighbors)
         if transform is not None:
             buffer.append_transform(transform)
         return buffer

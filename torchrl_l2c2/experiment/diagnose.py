@@ -49,7 +49,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
         write_page(path, diagnoses)
         if chosen.actions:
             Path(chosen.actions).write_bytes(draw_together(diagnoses))
-    except (ValueError, OSError, RuntimeError, ImportError) as error:
+    except (ValueError, OSError, RuntimeError, ArithmeticError, ImportError) as error:
         sys.exit(f"error: {error}")
     compared = "\n".join(comparison(diagnoses))
     parts = [*map(_told, diagnoses), *([compared] if compared else []), f"page: {path}"]

@@ -149,7 +149,8 @@ def evaluate_policy(
         actions = mean_actions(policy, episode) if sampled else episode["action"]
         returns.append(episode["next", "reward"].sum().item())
         variations.append(_variation(actions))
-        played = {"": actions, "sampled_": episode["action"]} if sampled else {"": actions}
+        taken = getattr(policy, "taken", lambda samples: samples)(episode["action"])
+        played = {"": actions, "sampled_": taken} if sampled else {"": actions}
         for prefix, kind in played.items():
             for name, value in measure(kind, env.action_spec).items():
                 measures.setdefault(prefix + name, []).append(value)
@@ -299,7 +300,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
         if chosen.output:
             played = {"arguments": vars(chosen), "summary": result.summary()}
             write_json(chosen.output, {**played, "episodes": asdict(result)})
-    except (ValueError, OSError, RuntimeError, ImportError) as error:
+    except (ValueError, OSError, RuntimeError, ArithmeticError, ImportError) as error:
         sys.exit(f"error: {error}")
 
 

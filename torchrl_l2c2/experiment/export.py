@@ -312,7 +312,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
         exported = export_policy(
             chosen.folder, chosen.output, best=chosen.best, episodes=chosen.episodes
         )
-    except (ValueError, OSError, RuntimeError, ImportError) as error:
+    except (ValueError, OSError, RuntimeError, ArithmeticError, ImportError) as error:
         sys.exit(f"error: {error}")
     print(json.dumps(exported.contract, indent=2))
     print(f"policy.onnx, policy.pt2 and contract.json: {exported.folder}", file=sys.stderr)

@@ -19,7 +19,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 from tqdm import tqdm
 
-from torchrl_l2c2.experiment.collection import play_episodes
+from torchrl_l2c2.experiment.collection import check_finite, play_episodes
 from torchrl_l2c2.experiment.environments import TEST_SEED
 from torchrl_l2c2.experiment.evaluate import evaluate_policy
 from torchrl_l2c2.experiment.folder import make_folder, write_atomically, write_json
@@ -195,6 +195,7 @@ def _visited_scale(runs: Iterable[FinishedRun], episodes: int) -> Tensor:
         policy, env, max_steps = load_policy(run.folder, noise_scale=0.0)
         with ProcessState(run.seed):
             for episode in play_episodes(policy, env, episodes, max_steps=max_steps):
+                check_finite(episode, 0)
                 states.append(episode["observation"])
         env.close()
     visited = torch.cat(states)
@@ -271,7 +272,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
             raise FileNotFoundError(f"no finished run (evaluation.json) below {named}.")
         played = play_with_noise(found.runs, chosen.levels, episodes=chosen.episodes, progress=True)
         written = write_noise(chosen.output or Path(chosen.folders[0]) / "noise", played)
-    except (ValueError, OSError, RuntimeError, ImportError) as error:
+    except (ValueError, OSError, RuntimeError, ArithmeticError, ImportError) as error:
         sys.exit(f"error: {error}")
     paths = [f"written: {path}" for path in written]
     print("\n\n".join([noise_table(played).markdown(), *found.notes, "\n".join(paths)]))

@@ -121,5 +121,5 @@ def _set_states(states: _States) -> None:
     random.setstate(states[0])
     np.random.set_state(states[1])
     torch.set_rng_state(states[2])
-    if states[3] and torch.cuda.is_available():
-        torch.cuda.set_rng_state_all(states[3])
+    if torch.cuda.is_available():  # Of a machine with more devices there are more states.
+        torch.cuda.set_rng_state_all(states[3][: torch.cuda.device_count()])

@@ -208,7 +208,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
                 scores = (f"{name} {score:.4g}" for name, score in search.tell(number).items())
                 print(f"trial {number + 1}: {', '.join(scores)}", flush=True)
         _report(search.folder)
-    except (ValueError, OSError, RuntimeError, ImportError) as error:
+    except (ValueError, OSError, RuntimeError, ArithmeticError, ImportError) as error:
         sys.exit(f"error: {error}")
 
 

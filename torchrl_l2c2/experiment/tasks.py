@@ -27,6 +27,10 @@ class Budget:
     total: int
     unit: Literal["episode", "frame"] = "episode"
 
+    def at_least(self, other: Budget) -> Budget:
+        """The longer of the two; this one where they are not of the same unit."""
+        return other if other.unit == self.unit and other.total > self.total else self
+
     def spent(self, episodes: int, frames: int) -> int:
         """What a training of so many episodes and frames has used of it."""
         return episodes if self.unit == "episode" else frames

@@ -153,17 +153,18 @@ class Experiment:
             UserWarning: no update was made, or every action was random: there is no trained policy;
                 or a regularizer's terms are too small to matter.
         """
-        budget = self.config.task.budget if episodes is None else Budget(episodes)
-        check_length(budget, self.config.task.budget, self._spent(budget))
+        full = self.config.task.budget
+        budget = full if episodes is None else Budget(episodes)
+        check_length(budget, full, self._spent(budget))
+        full = full.at_least(budget)  # Of which a part is trained now.
         algorithm, saved = self.config.algorithm, time.monotonic()
         schedule = SCHEDULES[algorithm.schedule](self.player, self.learner, algorithm)
-        compiles = self.learner.compiles and not self.learner.updates
         bar = Progress(
             budget.total,
             self._spent(budget),
             self.player.frames,
             shown=progress,
-            compiles=compiles,
+            compiles=self.learner.compiles and not self.learner.updates,
             unit=budget.unit,
             folder=self.folder,
         )
@@ -171,9 +172,8 @@ class Experiment:
         with self._process, bar, stop_on_signals() as signals, checkpoint_named(self.folder):
             while not ended:
                 episode = next(schedule)
-                self._write(self._row(episode, budget), bar)
-                done = self._spent(budget) / budget.total
-                anneal(self.config.optimizer, self.agent.optimizer, done)
+                self._write(self._row(episode, full), bar)
+                anneal(self.config.optimizer, self.agent.optimizer, self._spent(full) / full.total)
                 self._best_policy.after(len(self.metrics))
                 if not episode.ends_round:
                     continue
@@ -233,7 +233,7 @@ class Experiment:
     def test(
         self, episodes: int | None = None, *, sampled: bool = False, progress: bool = False
     ) -> Evaluation:
-        """Plays test episodes with the policy's mean, in a fresh environment with its own seed.
+        """Plays test episodes with the policy's mean, with environment and seed of their own.
 
         Args:
             episodes (int, optional): how many. Default: the settings' ``test_episodes``.
@@ -244,7 +244,7 @@ class Experiment:
             Evaluation: give it to :meth:`finish` to have it written.
         """
         config = self.config
-        with self._process:
+        with ProcessState(config.seed + TEST_SEED, config.threads):
             env = make_env(config.task, config.seed + TEST_SEED)
             result = evaluate_policy(
                 self.agent.policy,

@@ -185,7 +185,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
             noise_scale=chosen.noise,
             best=chosen.best,
         )
-    except (ValueError, OSError, RuntimeError, ImportError) as error:
+    except (ValueError, OSError, RuntimeError, ArithmeticError, ImportError) as error:
         sys.exit(f"error: {error}")
     print(path)
 

@@ -12,6 +12,7 @@ from torchrl.objectives import LossModule
 
 from torchrl_l2c2.distances import squared_error
 from torchrl_l2c2.objectives.grad_caps import GradCAPSLoss
+from torchrl_l2c2.objectives.precision import in_full_precision
 from torchrl_l2c2.objectives.wiring import POLICY_NETWORK
 from torchrl_l2c2.policy_distances import policy_mean
 
@@ -118,10 +119,11 @@ class ASAPLoss(GradCAPSLoss):
         rows = tensordict.select(*predictor.in_keys, strict=False).detach()
         rows.update(self.states_around(tensordict)[0])
         squashed = self.grad_caps_mean == "action"
-        if not self.has_stochastic_policy():
-            return policy_mean(predictor(rows)[self.policy_action()], squashed=squashed)
-        predicted = predictor.build_dist_from_params(predictor.get_dist_params(rows))
-        return policy_mean(predicted, squashed=squashed)
+        with in_full_precision(rows):
+            if not self.has_stochastic_policy():
+                return policy_mean(predictor(rows)[self.policy_action()], squashed=squashed)
+            predicted = predictor.build_dist_from_params(predictor.get_dist_params(rows))
+            return policy_mean(predicted, squashed=squashed)
 
 
 def _copy_of_policy(loss: LossModule) -> TensorDictModuleBase:

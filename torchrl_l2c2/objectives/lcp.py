@@ -104,6 +104,9 @@ def lcp_term(
         >>> lcp_term(state.square().sum(-1), [state], 1)
         tensor([100.], grad_fn=<SumBackward1>)
     """
-    gradients = torch.autograd.grad(log_prob.sum(), states, create_graph=True)
+    # Zero where the policy does not use a part of the state.
+    gradients = torch.autograd.grad(
+        log_prob.sum(), states, create_graph=True, materialize_grads=True
+    )
     squares = [gradient.square().flatten(batch_dims).sum(-1) for gradient in gradients]
     return torch.stack(squares).sum(0)

@@ -12,6 +12,7 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
+from torchrl_l2c2._checks import check_of_each
 from torchrl_l2c2.neighborhood import Neighborhood
 
 
@@ -117,12 +118,17 @@ def l2c2_penalty(
             gives it.
         over_neighbors: ``"max"`` takes the largest of the ``K`` in the place of their mean.
 
+    Raises:
+        ValueError: the differences are not of each transition.
+
     Examples:
         >>> import torch
         >>> from torchrl_l2c2.objectives.neighbors import l2c2_penalty
-        >>> l2c2_penalty(torch.tensor([[1.0, 2.0], [3.0, 4.0]]), torch.tensor([[1.0], [0.5]]))
+        >>> gain = torch.tensor([[1.0, 1.0], [0.5, 0.5]])
+        >>> l2c2_penalty(torch.tensor([[1.0, 2.0], [3.0, 4.0]]), gain)
         tensor([1.2500, 2.0000])
     """
+    check_of_each(difference.shape, gain.shape)
     gain = gain[(...,) + (None,) * (difference.ndim - gain.ndim)]
     penalty = gain * difference
     return penalty.mean(0) if over_neighbors == "mean" else penalty.amax(0)

@@ -10,6 +10,7 @@ from tensordict.nn import dispatch
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from torchrl_l2c2._checks import check_of_each
 from torchrl_l2c2.objectives.declarations import DeclaredTerms
 from torchrl_l2c2.objectives.evaluation import Evaluation, ForwardPass, Policy, is_ensemble
 from torchrl_l2c2.objectives.shared_evaluation import SharedEvaluation
@@ -282,6 +283,7 @@ class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
             value: ``[*B, ...]``; the term is ``[]`` or, with ``reduction="none"``, like it.
             tensordict: the batch, ``[*B]``.
         """
+        check_of_each(value.shape, tensordict.batch_size)
         weights = None
         if hasattr(self.tensor_keys, "priority_weight"):
             weights = self._maybe_get_priority_weight(tensordict)

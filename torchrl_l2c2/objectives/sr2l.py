@@ -154,7 +154,10 @@ def ascend(
     for _ in range(steps):
         with torch.enable_grad():
             moved = {key: state.detach().requires_grad_() for key, state in moved.items()}
-            gradients = torch.autograd.grad(distance(moved).sum(), list(moved.values()))
+            # Zero where the policy does not use a part of the state.
+            gradients = torch.autograd.grad(
+                distance(moved).sum(), list(moved.values()), materialize_grads=True
+            )
         for (key, state), gradient in zip(states.items(), gradients, strict=True):
             found = moved[key].detach() + 2.5 * epsilon / steps * gradient.sign()
             moved[key] = found.clamp(state - epsilon, state + epsilon)

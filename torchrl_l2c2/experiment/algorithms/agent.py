@@ -63,8 +63,10 @@ class Agent:
         return next(self.loss.parameters()).device
 
     def load_networks(self, state: Mapping[str, Any]) -> None:
-        """Restores the networks, and what they are normalized by, of a run's checkpoint."""
+        """Restores what a policy acts by: networks, their inputs' scales, exploration."""
         self.loss.load_state_dict(state["loss"])
+        if self.exploration is not None and "exploration" in state:
+            self.exploration.load_state_dict(state["exploration"])
         if self.normalization is not None:
             self.normalization.load_state_dict(state["normalization"])
 

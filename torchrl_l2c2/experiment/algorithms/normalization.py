@@ -204,10 +204,11 @@ class ActingPolicy(TensorDictModuleBase):
         for key in self.out_keys:
             tensordict.set(key, written.get(key))
         if exploration_type() is not ExplorationType.RANDOM:
-            tensordict.set("action", self._bounded(tensordict.get("action")))
+            tensordict.set("action", self.taken(tensordict.get("action")))
         return tensordict
 
-    def _bounded(self, action: Tensor) -> Tensor:
+    def taken(self, action: Tensor) -> Tensor:
+        """The action that the task gets: a sample ``[*B, A]``, clipped into the bounds."""
         if self.low is None or self.high is None:
             return action
         return torch.maximum(torch.minimum(action, self.high), self.low)

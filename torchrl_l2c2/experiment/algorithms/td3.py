@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import TYPE_CHECKING
 
 from pydantic import Field
@@ -63,7 +64,15 @@ class TD3Config(PerStepConfig):
         bounds = spec.to(torch.get_default_device())
         squash = TanhModule(in_keys=["action"], out_keys=["action"], spec=bounds)
         actor = TensorDictSequential(Actor(network, out_keys=["action"]), squash)
-        half_range = ((spec.space.high - spec.space.low) / 2).max().item()
+        half_ranges = (spec.space.high - spec.space.low) / 2
+        half_range = half_ranges.max().item()
+        if half_ranges.min() < half_range:
+            warnings.warn(
+                "td3's noise is as wide for every action, a share of the largest of half their "
+                f"ranges, got {half_ranges.tolist()}: it fills the narrow ones. Scale the task's "
+                "actions to one range (gymnasium.wrappers.RescaleAction), or use algorithm=sac.",
+                stacklevel=2,
+            )
         loss = TD3Loss(
             actor,
             action_value(env, self.hidden),
