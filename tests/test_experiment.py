@@ -103,7 +103,7 @@ def test_the_same_seed_gives_the_same_numbers_and_another_seed_others():
         {"algorithm": PPORPEConfig(schedule="step", updates=2)},
         {"algorithm": PPORPEConfig(acting_policy="online", baseline="target")},
         {"algorithm": PPORPEConfig(importance="mean")},
-        {"algorithm": PPORPEConfig(reduction="sum")},
+        {"algorithm": PPORPEConfig(reduction="mean")},
         {"algorithm": PPORPEConfig(time_limit="terminated", squash="sigmoid")},
         {"algorithm": PPORPEConfig(squash="none", threshold="ema", critic_weighting="ratio")},
         {"algorithm": PPORPEConfig(reward_scale=1.0, hidden=(8,), num_heads=1, updates=3)},
