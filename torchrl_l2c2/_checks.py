@@ -1,4 +1,4 @@
-"""What a setting may be: a positive integer, a real number in a range, ...; and a difference."""
+"""What a setting may be, such as a real number in a range, and what shape is compared."""
 
 from __future__ import annotations
 

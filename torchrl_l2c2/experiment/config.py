@@ -53,7 +53,7 @@ GROUPS: dict[str, Mapping[str, Any]] = {
     "optimizer": OPTIMIZERS,
     "logger": LOGGERS,
 }
-# Added to a run's seed for its neighbors: no other generator of any run begins there.
+# Added to a run's seed for its neighbors, as others are for tests and noise: far from all of them.
 NEIGHBOR_SEED = 32_452_843
 # What steers where and how often runs happen, and is no setting of a run.
 STEERING = {"outputs", "experiment", "preset", "resume", "allow_other_versions"}
