@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import inspect
 import re
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -91,19 +92,23 @@ class LinksToParts(SphinxPostTransform):
     default_priority = 8  # Before MyST looks for the file among the pages.
 
     def run(self, **kwargs: Any) -> None:
-        parts = {
-            Path(included).stem: (page, ROOT / included)
-            for page in self.env.found_docs
-            if (path := Path(self.env.doc2path(page))).suffix == ".md"
-            for included in re.findall(r"{include} \.\./(results/\S+\.md)", path.read_text())
-        }
         for link in self.document.findall(pending_xref):
             target, _, anchor = link["reftarget"].partition("#")
             name = Path(target).name.removesuffix(".md")
-            if link["reftype"] == "myst" and target not in self.env.found_docs and name in parts:
-                page, path = parts[name]
-                anchor = anchor or link.get("reftargetid") or slug(path.read_text().splitlines()[0])
+            if link["reftype"] == "myst" and target not in self.env.found_docs and name in parts():
+                page, first_heading = parts()[name]
+                anchor = anchor or link.get("reftargetid") or slug(first_heading)
                 link.attributes |= {"refdomain": "doc", "reftarget": page, "reftargetid": anchor}
+
+
+@cache
+def parts() -> dict[str, tuple[str, str]]:
+    """By the name of a file of ``results/``, the page that it is a part of, and its heading."""
+    return {
+        Path(included).stem: (page.stem, (ROOT / included).read_text().splitlines()[0])
+        for page in (ROOT / "docs").glob("*.md")
+        for included in re.findall(r"{include} \.\./(results/\S+\.md)", page.read_text())
+    }
 
 
 def slug(heading: str) -> str:

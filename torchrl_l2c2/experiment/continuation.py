@@ -12,7 +12,6 @@ from typing import Any
 from torchrl_l2c2.experiment.config import (
     FREE_SETTINGS,
     FREE_TASK_SETTINGS,
-    NEUTRAL_SETTINGS,
     ExperimentConfig,
     OtherRunError,
     is_neutral,
@@ -27,6 +26,7 @@ from torchrl_l2c2.experiment.folder import (
 )
 from torchrl_l2c2.experiment.player import SimulatorError
 from torchrl_l2c2.experiment.reports.runs import tested_run
+from torchrl_l2c2.experiment.saved import as_it_was
 from torchrl_l2c2.experiment.tasks import Budget, TaskConfig
 
 MISSING = "none, as it is a setting since"
@@ -42,16 +42,14 @@ def check_same_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> Non
     Raises:
         OtherRunError: names the first setting that differs, with both values.
     """
+    saved = as_it_was(saved)
     for group in sorted((saved.keys() | now.keys()) - FREE_SETTINGS):
-        was, is_now = saved.get(group, _as_before(group)), now.get(group, MISSING)
+        was, is_now = saved.get(group, MISSING), now.get(group, MISSING)
         pairs = {group: (was, is_now)}
         if isinstance(was, Mapping) and isinstance(is_now, Mapping):
             free = FREE_TASK_SETTINGS if group == "task" else set()
             names = sorted((was.keys() | is_now.keys()) - free)
-            pairs = {
-                name: (was.get(key, _as_before(name)), is_now.get(key, MISSING))
-                for key, name in ((key, f"{group}.{key}") for key in names)
-            }
+            pairs = {f"{group}.{n}": (was.get(n, MISSING), is_now.get(n, MISSING)) for n in names}
         for name, (before, after) in pairs.items():
             since = before == MISSING and is_neutral(name, after)
             # As JSON, where a tuple and a list are the same; 10 and 10.0 are, too.
@@ -60,10 +58,6 @@ def check_same_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> Non
                     f"this folder's checkpoint was made with {name}={before}, not {after}: "
                     "choose another folder, or delete this one. Nothing was changed."
                 )
-
-
-def _as_before(name: str) -> Any:
-    return NEUTRAL_SETTINGS.get(name, MISSING)
 
 
 def check_same_versions(saved: Mapping[str, str], now: Mapping[str, str]) -> None:

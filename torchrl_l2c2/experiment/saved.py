@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import io
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -50,9 +51,7 @@ def read_rows(path: str | Path) -> tuple[list[str], list[dict[str, str]]]:
 
 
 def read_config(run: str | Path) -> dict[str, Any]:
-    """Reads a run's ``config.json``, with newer settings as they were before they were settings.
-
-    Their defaults may be others by now.
+    """Reads a run's ``config.json``, :func:`as it was <as_it_was>`.
 
     Raises:
         ValueError: as :func:`read_json`; or it does not say what was run, which no default may.
@@ -63,12 +62,24 @@ def read_config(run: str | Path) -> dict[str, Any]:
         chosen = config.get(group)
         if not isinstance(chosen, dict) or "name" not in chosen:
             raise ValueError(f"{path} does not name its {group}: {REMEDY}")
+    return as_it_was(config)
+
+
+def as_it_was(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Saved settings, with those that are newer as all runs had them when there was no setting.
+
+    Their defaults may be others by now.
+
+    Args:
+        config (Mapping): of ``config.json`` or of a checkpoint, which names its groups' choices.
+    """
+    whole = {k: dict(v) if isinstance(v, Mapping) else v for k, v in config.items()}
     for setting, value in NEUTRAL_SETTINGS.items():
         group, _, name = setting.rpartition(".")
-        values = config[group] if group else config
+        values = whole[group] if group else whole
         if not group or _has(group, values["name"], name):
             values.setdefault(name, value)
-    return config
+    return whole
 
 
 def read_evaluation(run: str | Path) -> dict[str, Any]:
