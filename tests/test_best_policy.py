@@ -113,6 +113,14 @@ def test_evaluate_plays_as_it_is_told(folder):
         assert differs != first["episodes"]["action_variations"]
 
 
+def test_without_a_seed_evaluate_plays_the_runs_own_test(folder):
+    """Its samples, too."""
+    own = Experiment(ExperimentConfig(task=TASK, compile=False), resume=folder)
+    for arguments, sampled in (([], False), (["--sampled"], True)):
+        returns = own.test(3, sampled=sampled).returns
+        assert evaluated(folder, *arguments)["episodes"]["returns"] == returns
+
+
 def test_evaluate_records_its_first_episode(folder, tmp_path):
     """Of 40 steps; of mean actions alone."""
     ffmpeg = pytest.importorskip("imageio_ffmpeg")

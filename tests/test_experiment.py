@@ -501,8 +501,8 @@ def test_a_run_from_the_command_line_leaves_everything_behind(tmp_path):
 
 def test_without_a_terminal_there_are_a_few_plain_lines(tmp_path):
     """At each tenth, each once; train.log has them as well, and nothing of a refused command."""
-    overrides = [o for o in PENDULUM_OVERRIDES if not o.startswith("task.episodes")]
-    overrides += ["task.episodes=40", "algorithm.updates=1", "test_episodes=0"]
+    overrides = [*PENDULUM_OVERRIDES[:2], "task.episodes=40", "task.max_steps=5"]
+    overrides += ["algorithm.updates=1", "test_episodes=0"]
     done = run_train(*overrides, folder=tmp_path)
     shown = [line for line in done.stderr.splitlines() if line.startswith("episode ")]
     assert [line.split(":")[0] for line in shown] == [f"episode {n} of 40" for n in range(4, 41, 4)]

@@ -271,6 +271,16 @@ def test_the_command_prints_the_contract_and_says_what_is_wrong(pendulum, tmp_pa
         main([str(tmp_path)])
 
 
+def test_a_folder_that_cannot_be_written_to_is_refused_before_anything_is_played(
+    pendulum, tmp_path, monkeypatch
+):
+    """A file is no folder; the run's own folder is the default."""
+    monkeypatch.setattr("torchrl_l2c2.experiment.export.play_episodes", None)
+    (tmp_path / "file").touch()
+    with pytest.raises(SystemExit, match=r"error: the folder '.*file' cannot be written to"):
+        main([str(pendulum[1]), "--output", str(tmp_path / "file")])
+
+
 def test_without_the_extra_it_says_how_to_get_it(pendulum, monkeypatch):
     """Before anything is played."""
     monkeypatch.setattr("torchrl_l2c2.experiment.export.find_spec", lambda name: None)

@@ -46,9 +46,19 @@ def contents(folder):
     return {p: p.read_bytes() for p in folder.iterdir() if not p.name.startswith(".lock")}
 
 
+# A tenth of the usual updates: two or so after each episode.
+FEW_UPDATES = PPORPEConfig(replay_ratio=1.0)
+
+
 def small(**settings):
     return ExperimentConfig(
-        **{"task": SWINGUP, "compile": False, "test_episodes": 1, "checkpoint_interval": 0.0}
+        **{
+            "task": SWINGUP,
+            "algorithm": FEW_UPDATES,
+            "compile": False,
+            "test_episodes": 1,
+            "checkpoint_interval": 0.0,
+        }
         | settings
     )
 
@@ -82,7 +92,7 @@ def lines(folder, late_tests=True):
     "settings",
     [
         {"regularizer": L2C2Config()},
-        {"regularizer": CAPSConfig(), "task": HOPPER},
+        {"regularizer": CAPSConfig(), "task": HOPPER, "algorithm": PPORPEConfig()},
         {"replay": UniformReplayConfig(batch_size=32), "optimizer": AdamConfig()},
         {"algorithm": PPORPEConfig(schedule="step"), "task": replace(SWINGUP, max_steps=30)},
         {
@@ -460,31 +470,22 @@ def test_killed_processes_end_with_the_numbers_of_the_one_that_was_not(tmp_path,
 @pytest.mark.parametrize(
     "number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)]
 )
-def test_signals_save_and_the_same_command_continues(tmp_path, number):
-    """The process ends by itself, with a checkpoint and a word on how to go on."""
-    folder = tmp_path / "run"
-    process = start(folder, 2000, "checkpoint_interval=3600")
-    wait_for(lambda: (folder / "metrics.csv").exists() and len(lines(folder)) >= 2, process)
-    process.send_signal(number)
-    assert process.wait(30) == 128 + number
-    errors = messages(folder).read_text()
-    assert f"{number.name} ended the training" in errors and "Traceback" not in errors
-    episodes = len(lines(folder))
-    again = start(folder, episodes + 1)
-    assert again.wait(120) == 0, messages(folder).read_text()
-    assert len(lines(folder)) == episodes + 1
-
-
-def test_a_second_process_is_refused_and_leaves_the_folder_as_it_is(tmp_path):
-    """It names the first one's process; the first goes on to its end."""
+def test_a_second_process_is_refused_and_a_signal_saves_the_first(tmp_path, number):
+    """The folder stays as it is; the same command goes on after the signal."""
     folder = tmp_path / "run"
     first = start(folder, 2000, "checkpoint_interval=3600")
-    wait_for(lambda: (folder / "metrics.csv").exists() and len(lines(folder)) >= 1, first)
+    wait_for(lambda: (folder / "metrics.csv").exists() and len(lines(folder)) >= 2, first)
     config = (folder / "config.json").stat().st_mtime_ns
     second = start(folder, 2000, "checkpoint_interval=3600", log="second")
     assert second.wait(60) == 1
     refusal = messages(tmp_path / "second").read_text()
     assert f"in use by process {first.pid} on" in refusal and "Traceback" not in refusal
     assert (folder / "config.json").stat().st_mtime_ns == config and first.poll() is None
-    first.send_signal(signal.SIGTERM)
-    assert first.wait(30) == 128 + signal.SIGTERM
+    first.send_signal(number)
+    assert first.wait(30) == 128 + number
+    errors = messages(folder).read_text()
+    assert f"{number.name} ended the training" in errors and "Traceback" not in errors
+    episodes = len(lines(folder))
+    again = start(folder, episodes + 1)
+    assert again.wait(120) == 0, messages(folder).read_text()
+    assert len(lines(folder)) == episodes + 1

@@ -24,6 +24,7 @@ from torchrl_l2c2.experiment.collection import EpisodeCollector, check_finite, p
 from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
 from torchrl_l2c2.experiment.folder import make_folder_of, to_json, write_json
 from torchrl_l2c2.experiment.process import ProcessState
+from torchrl_l2c2.experiment.saved import read_config
 from torchrl_l2c2.experiment.tasks import TaskConfig
 from torchrl_l2c2.experiment.trained import load_policy
 from torchrl_l2c2.experiment.video import check_video, record_video
@@ -279,7 +280,9 @@ def main(arguments: Iterable[str] | None = None) -> None:
         policy, env, max_steps = load_policy(
             chosen.folder, seed=chosen.seed, noise_scale=chosen.noise, best=chosen.best
         )
-        with ProcessState(chosen.seed or 0):
+        # Of the samples, too: without --seed they are those of the run's own test.
+        usual = read_config(chosen.folder)["seed"] + TEST_SEED
+        with ProcessState(usual if chosen.seed is None else chosen.seed):
             result = evaluate_policy(
                 policy,
                 env,

@@ -106,7 +106,8 @@ def export_policy(
     Raises:
         ImportError: a package of the ``export`` extra is missing.
         FileNotFoundError: the folder holds no run, or no policy yet.
-        RuntimeError: the exported policy differs from PyTorch's; nothing is written.
+        OSError: the files' folder cannot be written to; no episode is played.
+        RuntimeError: the exported policy differs from PyTorch's; no file is written.
     """
     missing = [name for name in NEEDED if find_spec(name) is None]
     if missing:
@@ -114,6 +115,7 @@ def export_policy(
             f'{", ".join(missing)} is missing: pip install "torchrl-l2c2[export]" brings it.'
         )
     policy, env, max_steps = load_policy(run, best=best)
+    folder = make_folder(output or Path(run) / "export")
     with ProcessState(0):
         played = play_episodes(policy, env, episodes, max_steps=max_steps)
         observations = torch.cat([episode["observation"] for episode in played])
@@ -136,7 +138,6 @@ def export_policy(
         },
     }
     env.close()
-    folder = make_folder(output or Path(run) / "export")
     write_atomically(folder / "policy.onnx", content)
     saved = io.BytesIO()
     torch.export.save(program, saved)

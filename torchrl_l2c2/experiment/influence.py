@@ -20,7 +20,7 @@ def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]
 
     for every term :math:`L_r` that a regularizer has added to a loss :math:`L`, in the parameters
     :math:`\theta` that the term trains. Nothing of the loss changes, and no number is drawn from
-    torch's global generator.
+    torch's global generators.
 
     Args:
         loss (LossModule): as it is trained; one that is not regularized has no shares.
@@ -34,7 +34,8 @@ def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]
     if not added:
         return {}
     # A copy, as some losses keep statistics of what they have seen.
-    with torch.random.fork_rng(devices=[]):
+    devices = {parameter.device for parameter in loss.parameters() if parameter.is_cuda}
+    with torch.random.fork_rng(devices=devices):
         twin = deepcopy(loss)
         terms = twin(batch.copy())
     parameters = list(twin.parameters())
