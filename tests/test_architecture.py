@@ -62,6 +62,7 @@ experiment.reports.score
 experiment.reports.tables
 experiment.reports.comparison experiment.reports.measures
 experiment.reports.front experiment.reports.field experiment.reports.paper_table
+experiment.reports.faster_targets
 experiment.reports.figures
 experiment.reports.choice experiment.reports.pairwise
 experiment.reports.page experiment.reports.readme experiment.reports.results

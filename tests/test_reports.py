@@ -33,13 +33,14 @@ from torchrl_l2c2.experiment.reports.__main__ import main
 from torchrl_l2c2.experiment.reports.choice import choice_table
 from torchrl_l2c2.experiment.reports.comparison import statistics_tables
 from torchrl_l2c2.experiment.reports.differences import differences, fingerprint
+from torchrl_l2c2.experiment.reports.faster_targets import faster_targets_table
 from torchrl_l2c2.experiment.reports.field import BETTER, field_table
 from torchrl_l2c2.experiment.reports.groups import baseline_of, group_records, over_tasks
 from torchrl_l2c2.experiment.reports.measures import measures_table
 from torchrl_l2c2.experiment.reports.pairwise import pairwise_tables
 from torchrl_l2c2.experiment.reports.paper_table import paper_table
-from torchrl_l2c2.experiment.reports.readme import END, START, fill
-from torchrl_l2c2.experiment.reports.records import FIGURES, merge
+from torchrl_l2c2.experiment.reports.readme import END, START, fill, results_text, shown_groups
+from torchrl_l2c2.experiment.reports.records import FIGURES, digest, merge
 from torchrl_l2c2.experiment.reports.runs import FinishedRun, finished_run
 from torchrl_l2c2.experiment.reports.score import readings
 from torchrl_l2c2.experiment.reports.statistics import (
@@ -156,7 +157,7 @@ class TestPaperTable:
         assert row["P(larger return)"].split()[0] == "0.75"
         assert row["P(smoother)"].split()[0] == "0.75"
         assert table.rows[1][3:6] == ["20.00 (7.07)†", "693.8 (123.8)", "50.00 (7.07)"]
-        assert table.rows[0][6] == table.rows[0][-1] == ""
+        assert table.rows[0][6] == table.rows[0][-2] == ""
         assert paper_table([group for group in groups if group.first.algorithm == "sac"]) is None
 
     @pytest.mark.parametrize(("total", "marks"), [(693.0 + 123.0, 0), (693.0 - 126.0, 1)])
@@ -165,6 +166,44 @@ class TestPaperTable:
         make_run(tmp_path / "run", make_config(regularizer="l2c2"), total, 0.08)
         (row,) = paper_table(group_records(run.record for run in read_runs(tmp_path))).rows
         assert "".join(row).count("†") == marks
+
+    def test_the_late_policies_scale_stands_behind_them(self, tmp_path):
+        """L2C2 can satisfy its distance by a wider policy: the mean over seeds, of any figure."""
+        make_run(tmp_path / "run", make_config(regularizer="l2c2"), 700.0, 0.08)
+        record = next(iter(read_runs(tmp_path))).record
+        both = [replace(record, seed=s, policy_scale=v) for s, v in enumerate((0.2, 0.4))]
+        table = paper_table(group_records(both))
+        assert dict(zip(table.columns, table.rows[0]))["policy scale"] == "0.300 (0.141)"
+
+
+class TestFasterTargets:
+    def test_they_are_beside_the_papers_returns(self, tmp_path):
+        """376 and 284 at tau .5, Table III's at .1; other methods and other paces have none."""
+        for tau in (0.1, 0.5, 0.3):
+            for method, total in (("l2c2", 300.0), ("l2c2_policy", 200.0), ("caps", 100.0)):
+                for seed in range(2):
+                    settings = {"algorithm": PPORPEConfig(tau=tau), "seed": seed, "episodes": 350}
+                    config = make_config(regularizer=method, **settings)
+                    folder = tmp_path / f"{tau}" / method / str(seed)
+                    make_run(folder, config, total + 10 * seed - 100 * tau, 0.1)
+        records = [run.record for run in read_runs(tmp_path)]
+        table = faster_targets_table(records)
+        of_rows = {row[1]: (row[3].split()[0], *row[5:]) for row in table.rows}
+        assert of_rows == {
+            "L2C2": ("295.0", "693.8", "1.00 [1.00, 1.00]"),
+            "L2C2, beta=0": ("195.0", "707.4", ""),
+            "L2C2, tau=0.3": ("275.0", "", "1.00 [1.00, 1.00]"),
+            "L2C2, beta=0, tau=0.3": ("175.0", "", ""),
+            "L2C2, tau=0.5": ("255.0", "376.0", "1.00 [1.00, 1.00]"),
+            "L2C2, beta=0, tau=0.5": ("155.0", "284.0", ""),
+        }
+        assert table.markdown() in results_text(records)
+        # And Table III is not of them.
+        beside = paper_table(group_records(records))
+        published = {row[1]: row[4] for row in beside.rows}
+        assert published["L2C2"] == "693.8 (123.8)" and published["L2C2, tau=0.5"] == ""
+        usual = [record for record in records if "tau" not in record.differences]
+        assert faster_targets_table(usual) is None
 
 
 class TestMeasures:
@@ -619,6 +658,15 @@ class TestStatistics:
         expected = np.mean([mannwhitneyu(*pair).statistic / 35 for pair in pairs])
         assert probability_of_improvement(ours, theirs).item() == pytest.approx(expected)
 
+    def test_they_give_what_rliables_own_tests_say(self):
+        """Its metrics' tests (Agarwal et al. 2021): 1.5, 2 and 1/3 of these scores."""
+        ours = np.array([[1.0, 2.0], [2.0, 2.0], [1.0, 1.0], [2.0, 1.0]])
+        theirs = np.array([[1.0, 1.0], [2.0, 2.0], [3.0, 3.0]])
+        assert interquartile_mean(ours).item() == 1.5
+        assert interquartile_mean(theirs).item() == 2.0
+        improvement = probability_of_improvement(ours, theirs).item()
+        assert improvement == pytest.approx(1 / 3)
+
     def test_a_task_counts_with_all_of_its_runs(self):
         """However many others have: 1, 3 over 2 win a half, 1 over 0 wins; 3/4 is their mean."""
         ours, theirs = np.array([[1.0, 1.0], [3.0, math.nan]]), np.array([[2.0, 0.0]])
@@ -1011,7 +1059,8 @@ class TestReadme:
         recorded = read_records(ROOT / "results" / "runs.csv")
         text = (ROOT / "README.md").read_text()
         assert fill(text, recorded) == text
-        assert (ROOT / "docs" / "results.svg").exists() == bool(recorded)
+        shown = [r for group in shown_groups(recorded) for r in group.records]
+        assert f"records {digest(shown)}<" in (ROOT / "docs" / "results.svg").read_text()
 
     def test_the_command_fills_it_in(self, records, tmp_path):
         """Between the marks, whatever stood there; with the picture beside it."""

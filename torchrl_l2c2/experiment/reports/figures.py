@@ -16,7 +16,7 @@ from torchrl_l2c2.experiment.reports.field import MEASURES, published_of
 from torchrl_l2c2.experiment.reports.front import means, pareto_front
 from torchrl_l2c2.experiment.reports.groups import Group, group_records
 from torchrl_l2c2.experiment.reports.paper import METHODS
-from torchrl_l2c2.experiment.reports.records import FIGURES
+from torchrl_l2c2.experiment.reports.records import FIGURES, digest
 from torchrl_l2c2.experiment.reports.runs import FinishedRun
 from torchrl_l2c2.experiment.reports.statistics import Scores, curve_band, mean
 
@@ -90,7 +90,9 @@ def draw_plane(
     for axis in axes[len(panels) :]:
         axis.set_visible(False)
     source = "the paper" if measure == "action_variation" else "published"
-    finish(picture, axes, f"{FIGURES[figure]}; hollow: {source}", path)
+    title = f"{FIGURES[figure]}; hollow: {source}"
+    drawn_of = digest(record for group in groups for record in group.records)
+    finish(picture, axes, title, path, description=f"records {drawn_of}")
 
 
 def draw_front(groups: Sequence[Group], figure: str, path: str | Path) -> None:
@@ -214,7 +216,9 @@ def subplots(across: int, down: int, size: tuple[float, float]) -> tuple[Any, li
     return figure, list(figure.subplots(down, across, squeeze=False).flat)
 
 
-def finish(figure: Any, axes: Sequence[Any], title: str, path: str | Path) -> None:
+def finish(
+    figure: Any, axes: Sequence[Any], title: str, path: str | Path, description: str | None = None
+) -> None:
     """Gives a figure its grid, title and legend, and writes it.
 
     Args:
@@ -222,6 +226,7 @@ def finish(figure: Any, axes: Sequence[Any], title: str, path: str | Path) -> No
         axes: likewise.
         title (str): above all of them.
         path (str or Path): of the file; its ending decides what it is.
+        description (str, optional): of what it is drawn, for the file's own description.
     """
     named: dict[str, Any] = {}
     for axis in axes:
@@ -238,21 +243,22 @@ def finish(figure: Any, axes: Sequence[Any], title: str, path: str | Path) -> No
         figure.set_figheight(figure.get_figheight() + 0.22 * max(0, lines - 2))
         legend = {"loc": "outside lower center", "frameon": False, "ncols": columns}
         figure.legend(named.values(), named.keys(), **legend)
-    save(figure, path)
+    save(figure, path, description)
 
 
-def save(figure: Any, path: str | Path) -> None:
+def save(figure: Any, path: str | Path, description: str | None = None) -> None:
     """Writes a picture whole or not at all; the same picture gives the same bytes."""
-    write_atomically(path, drawn(figure, Path(path).suffix[1:]))
+    write_atomically(path, drawn(figure, Path(path).suffix[1:], description))
 
 
-def drawn(figure: Any, kind: str = "svg") -> bytes:
+def drawn(figure: Any, kind: str = "svg", description: str | None = None) -> bytes:
     """A picture as the content of a file; the same picture gives the same bytes."""
     from matplotlib import rc_context
 
     content = io.BytesIO()
     # Without these an SVG file has the date and random names in it.
     metadata = {"Date": None, "Creator": None} if kind == "svg" else {"Software": None}
+    metadata["Description"] = description
     with rc_context({"svg.hashsalt": "torchrl_l2c2", "svg.fonttype": "none"}):
         figure.savefig(content, dpi=110, format=kind, metadata=metadata)
     return content.getvalue()

@@ -11,6 +11,7 @@ from torchrl_l2c2.experiment.folder import make_folder, write_atomically, write_
 from torchrl_l2c2.experiment.reports.choice import choice_table
 from torchrl_l2c2.experiment.reports.comparison import statistics_tables, summary
 from torchrl_l2c2.experiment.reports.document import picture, whole_page
+from torchrl_l2c2.experiment.reports.faster_targets import faster_targets_table
 from torchrl_l2c2.experiment.reports.field import field_groups, field_table
 from torchrl_l2c2.experiment.reports.figures import draw_front, draw_learning_curves, draw_plane
 from torchrl_l2c2.experiment.reports.front import front_figure, front_table, searched
@@ -34,7 +35,12 @@ def _others(records: Sequence[Record], runs: Sequence[FinishedRun]) -> list[Tabl
     """What stands behind them: every other table that can be made, every run by itself at last."""
     groups = group_records(records)
     scored = readings(groups)
-    more = (field_table(records), choice_table(records), measures_table(runs))
+    more = (
+        faster_targets_table(records),
+        field_table(records),
+        choice_table(records),
+        measures_table(runs),
+    )
     return [
         *statistics_tables(groups),
         *(front_table(found, front_figure(found)) for found in searched(groups)),

@@ -16,7 +16,9 @@ LEGEND = (
     "smoother. The first column of each is of the late policies, training's own episodes of its "
     "last tenth, marked † where it lies further from the paper's than the paper's deviation, and P "
     "of the same: how probable it is that a run is better than one of vanilla "
-    "with the same other settings, ties halved, with the 95% interval of the stratified bootstrap."
+    "with the same other settings, ties halved, with the 95% interval of the stratified bootstrap. "
+    "The policy scale is that of the late policies; the Hellinger distance is relative to it, so "
+    "that a wider policy may change more."
 )
 # Late policies in the first column, as they are steadier than the paper's test of the last one.
 FIRST, SECOND = "late_sampled", "last_sampled"
@@ -35,6 +37,7 @@ def paper_table(groups: Sequence[Group]) -> Table | None:
     columns = ["task", "method", "seeds"]
     for name, better in zip(QUANTITIES.values(), BETTER, strict=True):
         columns += [name, "the paper's", "last policy", better]
+    columns += ["policy scale"]
     rows = [
         _row(group, baseline_of(group, groups))
         for group in groups
@@ -53,7 +56,7 @@ def _row(group: Group, vanilla: Group | None) -> list[str]:
             pooled(group, SECOND, quantity),
             probability(better),
         ]
-    return cells
+    return [*cells, pooled(group, FIRST, "policy_scale")]
 
 
 def _is_off(group: Group, quantity: str) -> bool:

@@ -8,9 +8,10 @@ from pathlib import Path
 
 from torchrl_l2c2.experiment.folder import write_atomically
 from torchrl_l2c2.experiment.reports.differences import BUDGETS
+from torchrl_l2c2.experiment.reports.faster_targets import faster_targets_table
 from torchrl_l2c2.experiment.reports.figures import draw_plane
 from torchrl_l2c2.experiment.reports.groups import Group, group_records
-from torchrl_l2c2.experiment.reports.paper import PAPER, is_of_paper
+from torchrl_l2c2.experiment.reports.paper import PAPER, TAU, is_of_paper
 from torchrl_l2c2.experiment.reports.paper_table import paper_table
 from torchrl_l2c2.experiment.reports.records import Record
 from torchrl_l2c2.experiment.reports.tables import settings_notes
@@ -29,7 +30,7 @@ def results_text(records: Sequence[Record]) -> str:
     Raises:
         ValueError: no record is of the paper's tasks with its algorithm.
     """
-    groups = _groups(records)
+    groups = shown_groups(records)
     table = paper_table(groups)
     if table is None:
         tasks = ", ".join(dict.fromkeys(task for task, _ in PAPER))
@@ -38,7 +39,9 @@ def results_text(records: Sequence[Record]) -> str:
             "README's results are: name a file that has some, by --from or --csv."
         )
     picture = f"![Return against action variation of every method]({PICTURE.as_posix()})"
-    return "\n\n".join([picture, table.markdown(), *settings_notes(groups)])
+    faster = faster_targets_table([r for r in records if _is_as_usual(r, TAU)])
+    tables = [table.markdown(), *settings_notes(groups), faster.markdown() if faster else ""]
+    return "\n\n".join([picture, *filter(None, tables)])
 
 
 def fill(text: str, records: Sequence[Record]) -> str:
@@ -62,17 +65,20 @@ def fill_readme(path: str | Path, records: Sequence[Record]) -> None:
     """
     path = Path(path)
     text = fill(path.read_text(), records)
-    draw_plane(_groups(records), "late_sampled", path.parent / PICTURE)
+    draw_plane(shown_groups(records), "late_sampled", path.parent / PICTURE)
     write_atomically(path, text.encode())
 
 
-def _groups(records: Sequence[Record]) -> list[Group]:
+def shown_groups(records: Sequence[Record]) -> list[Group]:
+    """What the table and the picture are of."""
     records = [r for r in records if is_of_paper(r.task, r.algorithm)]
     as_usual = {r.task for r in records if _is_as_usual(r)}
     return group_records(r for r in records if _is_as_usual(r) or r.task not in as_usual)
 
 
-def _is_as_usual(record: Record) -> bool:
+def _is_as_usual(record: Record, *but: str) -> bool:
+    """Whether it has its task's default length and settings, but for some that are named."""
     task = TASKS.get(record.task)
-    others = {k for k in record.other_settings if not k.startswith("regularizer.")} - {*BUDGETS}
+    others = {k for k in record.other_settings if not k.startswith("regularizer.")}
+    others -= {*BUDGETS, *but}
     return task is not None and record.length == f"{task.episodes} episodes" and not others

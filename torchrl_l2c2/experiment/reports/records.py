@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import math
 from collections.abc import Callable, Iterable
@@ -13,7 +14,7 @@ from typing import Any
 
 from torchrl_l2c2.experiment.folder import make_folder, write_atomically
 from torchrl_l2c2.experiment.reports.differences import BUDGETS, read_differences
-from torchrl_l2c2.experiment.reports.paper import Published, method_order, paper_of
+from torchrl_l2c2.experiment.reports.paper import TAU, Published, method_order, paper_of
 from torchrl_l2c2.experiment.saved import read_rows
 from torchrl_l2c2.experiment.tasks import TASKS
 
@@ -89,8 +90,12 @@ class Record:
         return (task, self.task, *method, *settings, unit, int(amount), self.seed)
 
     def figure(self, figure: str, quantity: str) -> float:
-        """By the names of ``FIGURES`` and ``QUANTITIES``; ``last_mean`` has ``sm_asap`` too."""
-        value: float = getattr(self, f"{figure}_{quantity}")
+        """By the names of ``FIGURES`` and ``QUANTITIES``; ``last_mean`` has ``sm_asap`` too.
+
+        ``policy_scale`` is of the late policies, whatever the figure.
+        """
+        known = quantity if quantity == "policy_scale" else f"{figure}_{quantity}"
+        value: float = getattr(self, known)
         return value
 
     @property
@@ -108,9 +113,10 @@ class Record:
     def paper(self) -> Published | None:
         """The paper's results, where the task, the algorithm and the regularizer are the paper's.
 
-        What else the paper leaves open may differ; tables tell it below.
+        And the targets' pace, which the paper varies. What else it leaves open may differ; tables
+        tell it below.
         """
-        other = ("task.env_id", "task.noise_scale", "regularizer.")
+        other = ("task.env_id", "task.noise_scale", "regularizer.", TAU)
         if any(name.startswith(other) for name in self.other_settings):
             return None
         return paper_of(self.task, self.algorithm, self.method)
@@ -134,12 +140,21 @@ def read_records(path: str | Path) -> list[Record]:
 def write_records(path: str | Path, records: Iterable[Record]) -> None:
     """Writes records as CSV, sorted, whole or not at all; the same records give the same bytes."""
     make_folder(Path(path).parent)
+    write_atomically(path, _written(records))
+
+
+def digest(records: Iterable[Record]) -> str:
+    """What tells these records from all others, as a picture of them says in its description."""
+    return hashlib.sha256(_written(records)).hexdigest()[:12]
+
+
+def _written(records: Iterable[Record]) -> bytes:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(field.name for field in fields(Record))
     for record in sorted(records, key=lambda record: record.place):
         writer.writerow(_cell(getattr(record, field.name)) for field in fields(Record))
-    write_atomically(path, text.getvalue().encode())
+    return text.getvalue().encode()
 
 
 def merge(old: Iterable[Record], new: Iterable[Record]) -> list[Record]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from torchrl_l2c2.experiment.folder import write_json
 from torchrl_l2c2.experiment.reports.choice import choice_table
+from torchrl_l2c2.experiment.reports.faster_targets import faster_targets_table
 from torchrl_l2c2.experiment.reports.field import field_table
 from torchrl_l2c2.experiment.reports.figures import draw_learning_curves
 from torchrl_l2c2.experiment.reports.groups import group_records
@@ -64,7 +65,12 @@ def compare_with_paper(run: FinishedRun) -> str:
 def printed_tables(records: Sequence[Record]) -> list[Table]:
     """What is told of runs without a report: results, and beside them what was published."""
     groups = group_records(records)
-    beside = (paper_table(groups), field_table(records), choice_table(records))
+    beside = (
+        paper_table(groups),
+        faster_targets_table(records),
+        field_table(records),
+        choice_table(records),
+    )
     told = [table for table in beside if table is not None]
     return [*results_tables(groups), *told, *pairwise_tables(records)]
 
