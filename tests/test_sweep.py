@@ -184,17 +184,19 @@ def test_a_launcher_says_what_it_needs(name, monkeypatch):
 
 
 def test_a_sweep_says_how_much_of_it_is_left():
-    """By the mean of what is finished: 15 of 18 runs at 40 minutes, two at once."""
+    """By each task's mean of what is finished, and the tasks' mean for one of which none is."""
     with begin_sweep(["-m", "seed=0,1,2", "~logger"]) as begun:
-        params = {"seed": "range(0,18)", "task": "a,b", "regularizer": "none,caps,l2c2"}
+        params = {"seed": "range(0,18)", "task": "a,b,c", "regularizer": "none,caps"}
         assert begun.standing(1, params) == "run 1 of 18"
-        for number, seconds in enumerate((1800.0, 3000.0, float("nan"))):
+        # Of a 30 minutes and 50, of b 20; then c takes 30, and five of each are 7.5 hours.
+        for number, seconds in enumerate((1800.0, 3000.0, 1200.0, float("nan"))):
             begun.add_finished(number, Path("run"), seconds)
+        assert begun.standing(5, params) == "run 5 of 18, about 7.0 h left"
         # As a job sees it, in whatever process.
-        with begun.job(3, "seed=1"), begun.job(4, "seed=2"):
-            standing = Sweep.of_this_job().standing(4, params)
-            assert standing == "run 4 of 18, about 5.3 h left"
-        assert begun.standing(18, params) == "run 18 of 18, about 40 min left"
+        with begun.job(4, "seed=0"), begun.job(5, "seed=0"):
+            standing = Sweep.of_this_job().standing(7, params)
+            assert standing == "run 7 of 18, about 3.0 h left"
+        assert begun.standing(18, params) == "run 18 of 18, about 30 min left"
 
 
 def test_a_job_that_did_not_end_is_named_and_known_when_it_begins_again(tmp_path):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import _thread
 import atexit
 import contextlib
+import itertools
 import json
 import math
 import os
@@ -21,6 +22,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -139,13 +141,19 @@ class Sweep:
             number (int): of the job, from 1.
             params (Mapping): sweeps of the configuration, by setting.
         """
-        total = count_jobs(self.overrides, params)
-        seconds = [each for _, (_, each) in self._all("finished") if math.isfinite(each)]
-        place = f"run {number} of {total}"
+        tasks = [job.get("task") for job in list_jobs(self.overrides, params)]
+        seconds: dict[str | None, list[float]] = defaultdict(list)
+        for finished, (_, each) in self._all("finished"):
+            if math.isfinite(each):
+                seconds[tasks[finished]].append(each)
+        place = f"run {number} of {len(tasks)}"
         if not seconds:
             return place
-        rounds = math.ceil((total - number + 1) / max(1, len(self._all("running"))))
-        return f"{place}, {_about(rounds * statistics.fmean(seconds))} left"
+        # A task takes many times as long as another; one that is still to come, their mean.
+        of_task = {task: statistics.fmean(each) for task, each in seconds.items()}
+        usual = statistics.fmean(of_task.values())
+        left = sum(of_task.get(task, usual) for task in tasks[number - 1 :])
+        return f"{place}, {_about(left / max(1, len(self._all('running'))))} left"
 
     @contextlib.contextmanager
     def job(self, number: int, job: str) -> Iterator[bool]:
@@ -236,12 +244,13 @@ def start_guard(mark: str) -> None:
     atexit.register(guard.stdin.close)
 
 
-def count_jobs(overrides: Sequence[str], params: Mapping[str, str]) -> int:
-    """How many jobs a sweep has: a product of choices, where the command's go before.
+def list_jobs(overrides: Sequence[str], params: Mapping[str, str]) -> list[dict[str, str]]:
+    """What a sweep chooses for each of its jobs: a product, where the command's go before.
 
     Examples:
-        >>> count_jobs(["-m", "seed=0,1", "task=ant"], {"seed": "range(0,18)", "beta": "1,2,3"})
-        6
+        >>> jobs = list_jobs(["-m", "seed=0,1", "task=ant"], {"seed": "range(0,18)", "beta": "1,2"})
+        >>> [" ".join(f"{name}={value}" for name, value in job.items()) for job in jobs]
+        ['seed=0 beta=1', 'seed=0 beta=2', 'seed=1 beta=1', 'seed=1 beta=2']
     """
     given = {**params}
     for override in overrides:
@@ -251,7 +260,9 @@ def count_jobs(overrides: Sequence[str], params: Mapping[str, str]) -> int:
     parser = OverridesParser.create()
     parsed = parser.parse_overrides([f"{name}={value}" for name, value in given.items()])
     sweeps = [each for each in parsed if each.is_sweep_override()]
-    return math.prod(sum(1 for _ in each.sweep_string_iterator()) for each in sweeps)
+    names = [each.get_key_element() for each in sweeps]
+    choices = itertools.product(*(each.sweep_string_iterator() for each in sweeps))
+    return [dict(zip(names, chosen, strict=True)) for chosen in choices]
 
 
 def _about(seconds: float) -> str:

@@ -257,8 +257,8 @@ def drawn(figure: Any, kind: str = "svg", description: str | None = None) -> byt
 
     content = io.BytesIO()
     # Without these an SVG file has the date and random names in it.
-    metadata = {"Date": None, "Creator": None} if kind == "svg" else {"Software": None}
-    metadata["Description"] = description
+    dated = ("Date", "Creator") if kind == "svg" else ("Software",)
+    metadata = {**dict.fromkeys(dated), "Description": description}
     with rc_context({"svg.hashsalt": "torchrl_l2c2", "svg.fonttype": "none"}):
         figure.savefig(content, dpi=110, format=kind, metadata=metadata)
     return content.getvalue()
