@@ -18,7 +18,7 @@ from torchrl.envs import ExplorationType, GymEnv, set_exploration_type
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from torchrl_l2c2 import L2C2Loss, action_variation, make_actor, make_critic
+from torchrl_l2c2 import L2C2Loss, Neighborhood, action_variation, make_actor, make_critic
 
 FRAMES = 2000  # of all processes
 FRAMES_PER_BATCH = 500  # of each
@@ -37,7 +37,9 @@ def main(frames: int) -> None:
     actor = make_actor(3, env.action_spec, hidden=(64, 64)).to(device)
     critic = make_critic(3, num_heads=1, hidden=(64, 64)).to(device)
     # The advantages are normalized by each process: the mean over processes is not that of all.
-    loss = L2C2Loss(ClipPPOLoss(actor, critic, entropy_coeff=0.0, normalize_advantage=True))
+    base = ClipPPOLoss(actor, critic, entropy_coeff=0.0, normalize_advantage=True)
+    near = Neighborhood(lambda_min=1.0, lambda_max=100.0, shared=True)
+    loss = L2C2Loss(base, near, beta=0.0, policy_distance="mean")
     # A LossModule like any: what it returns is averaged over processes where it is differentiated.
     parallel = DistributedDataParallel(loss)
     advantage = GAE(gamma=0.9, lmbda=0.95, value_network=critic)

@@ -38,10 +38,10 @@ def main(frames: int) -> None:
         MLP(in_features=4, out_features=1, num_cells=[64, 64]), in_keys=["observation", "action"]
     )
 
-    near = Neighborhood(sigma=1.0, lambda_min=0.1, lambda_max=10.0)
+    near = Neighborhood(lambda_min=10.0, lambda_max=1000.0, shared=True)
     base = SACLoss(actor, qvalue, target_entropy=-1.0)
     base.make_value_estimator(gamma=0.95)
-    loss = L2C2Loss(base, near, beta=0.1)
+    loss = L2C2Loss(base, near, beta=0.0, policy_distance="mean")
     replay = TensorDictPrioritizedReplayBuffer(
         alpha=0.6,
         beta=0.5,

@@ -118,22 +118,66 @@ def test_every_comparison_is_made_of_valid_runs(name, regularizer):
         "field_table": ("Pendulum-v1", "ppo", 64),
         "cartpole": ("CartPole-v1", "dqn", 64),
     }[name]
+    if algorithm == "ppo_rpe":
+        assert config.algorithm.tau == (0.5 if name == "table3_tau" else 0.1)
     assert config.algorithm.name == algorithm and config.replay.batch_size == size
     assert config.regularizer.name == regularizer
     assert config.task.env_id == env_id
 
 
-# Frames, batches, learning rate, discount: numbers of rl_zoo3 2.9.2 and, where it
-# is silent, of Stable-Baselines3.
+# What each sweeps over: the seeds, tasks and methods of a published table.
+PAPERS = "none,caps,l2c2,l2c2_policy"
+RIVALS = "none,caps,l2c2_paper,l2c2,l2c2_ramp,cats"
+SWEEPS = {
+    "table3": ("range(0,18)", "swingup,reacher,hopper,ant", PAPERS),
+    "table3_tau": ("range(0,18)", "swingup", "l2c2,l2c2_policy"),
+    "field_table": ("range(0,10)", "pendulum,lunarlander,hopper_v5,walker2d_v5", RIVALS),
+    "field_gains": ("100,101,102", "pendulum,lunarlander", None),
+}
+
+
+@pytest.mark.parametrize("name", SWEEPS)
+def test_a_table_is_of_all_its_runs(name):
+    """Narrowed by the command line alone."""
+    params = OmegaConf.load(CONF / "experiment" / f"{name}.yaml").hydra.sweeper.params
+    assert (params.seed, params.task, params.get("regularizer")) == SWEEPS[name]
+
+
+# Of rl_zoo3 2.9.2 and, where it is silent, of Stable-Baselines3; PPO's n_steps are all
+# environments' together here.
+PPO_ZOO = {"clip_actions": True, "clip_epsilon": 0.2, "entropy_coeff": 0.0, "critic_coeff": 0.5}
+PPO_ZOO |= {"max_grad_norm": 0.5, "log_scale": 0.0, "orthogonal": True, "hidden": (64, 64)}
+PPO_ZOO |= {"activation": "tanh", "normalize_observations": False, "normalize_rewards": False}
+MUJOCO = {"num_envs": 1, "frames": 512, "normalize_observations": True, "normalize_rewards": True}
+SAC_ZOO = {"scale_mapping": "exp", "hidden": (256, 256), "tau": 0.005, "random_frames": 10_000}
+# Frames, batches, learning rate, and what is of the algorithm.
 ZOO = {
-    ("pendulum", "ppo"): (500_000, 64, 1e-3, 0.9),
-    ("lunarlander", "ppo"): (500_000, 64, 3e-4, 0.999),
-    ("hopper_v5", "ppo"): (1_000_000, 32, 9.80828e-5, 0.999),
-    ("walker2d_v5", "ppo"): (1_000_000, 32, 5.05041e-5, 0.99),
-    ("pendulum", "sac"): (100_000, 256, 1e-3, 0.99),
-    ("lunarlander", "sac"): (500_000, 256, 7.3e-4, 0.99),
-    ("hopper_v5", "sac"): (1_000_000, 256, 3e-4, 0.99),
-    ("walker2d_v5", "sac"): (1_000_000, 256, 3e-4, 0.99),
+    ("pendulum", "ppo"): (
+        (500_000, 64, 1e-3),
+        {"num_envs": 4, "frames": 4096, "epochs": 10, "gamma": 0.9, "gae_lambda": 0.95},
+    ),
+    ("lunarlander", "ppo"): (
+        (500_000, 64, 3e-4),
+        {"num_envs": 16, "frames": 16384, "epochs": 4, "gamma": 0.999, "gae_lambda": 0.98}
+        | {"entropy_coeff": 0.01},
+    ),
+    ("hopper_v5", "ppo"): (
+        (1_000_000, 32, 9.80828e-5),
+        MUJOCO
+        | {"epochs": 5, "gamma": 0.999, "gae_lambda": 0.99, "entropy_coeff": 0.00229519}
+        | {"critic_coeff": 0.835671, "max_grad_norm": 0.7, "log_scale": -2.0, "orthogonal": False}
+        | {"hidden": (256, 256), "activation": "relu"},
+    ),
+    ("walker2d_v5", "ppo"): (
+        (1_000_000, 32, 5.05041e-5),
+        MUJOCO
+        | {"epochs": 20, "gamma": 0.99, "gae_lambda": 0.95, "entropy_coeff": 0.000585045}
+        | {"critic_coeff": 0.871923, "max_grad_norm": 1.0, "clip_epsilon": 0.1},
+    ),
+    ("pendulum", "sac"): ((100_000, 256, 1e-3), {"random_frames": 100}),
+    ("lunarlander", "sac"): ((500_000, 256, 7.3e-4), {"hidden": (400, 300), "tau": 0.01}),
+    ("hopper_v5", "sac"): ((1_000_000, 256, 3e-4), {}),
+    ("walker2d_v5", "sac"): ((1_000_000, 256, 3e-4), {}),
 }
 
 
@@ -145,8 +189,13 @@ def test_a_preset_is_of_a_task_and_an_algorithm(task, algorithm):
     values = composed(*chosen)
     config = ExperimentConfig.from_dict(values)
     assert values["preset"] == "rl_zoo"
-    learned = (config.replay.batch_size, config.optimizer.lr, config.algorithm.gamma)
-    assert (config.task.frames, *learned) == ZOO[task, algorithm]
+    sizes, own = ZOO[task, algorithm]
+    assert (config.task.frames, config.replay.batch_size, config.optimizer.lr) == sizes
+    expected = (PPO_ZOO if algorithm == "ppo" else SAC_ZOO | {"gamma": 0.99}) | own
+    assert {name: getattr(config.algorithm, name) for name in expected} == expected
+    # Adam's epsilon is PPO's there alone; one task's learning rate falls.
+    assert config.optimizer.eps == (1e-5 if algorithm == "ppo" else 1e-8)
+    assert config.optimizer.linear == ((task, algorithm) == ("lunarlander", "sac"))
     assert (config.task.env_id, config.test_episodes) == (FIELD_TASKS[task].env_id, 10)
     other = ExperimentConfig.from_dict(composed(*chosen, "algorithm.gamma=0.5"))
     assert other.algorithm.gamma == 0.5
@@ -177,6 +226,13 @@ def test_l2c2_begins_from_what_was_found_for_the_algorithm(name, algorithm, caps
     for config in (paper, ExperimentConfig()):
         tell_tuned(config)
     assert not capsys.readouterr().out
+
+
+@pytest.mark.parametrize("chosen", [("algorithm=dqn",), ("task=pendulum",)], ids=str)
+def test_l2c2_says_where_nothing_was_found_for_it(chosen, capsys):
+    """With another algorithm, or the paper's on another task."""
+    tell_tuned(ExperimentConfig.from_dict(composed(*chosen, "regularizer=l2c2")))
+    assert "others were found for ppo, sac, td3 alone" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("task", PAPER_TASKS)

@@ -415,6 +415,11 @@ class TestLCP:
 
 RIVALS = {
     "cats": (lambda base: CATSLoss(base), "loss_cats", "cats_lambda"),
+    "grad_caps": (
+        lambda base: GradCAPSLoss(base, previous_key="before"),
+        "loss_grad_caps",
+        "grad_caps_lambda",
+    ),
     "sr2l": (lambda base: SR2LLoss(base, steps=2), "loss_sr2l", "sr2l_coeff"),
     "lcp": (lambda base: LCPLoss(base), "loss_lcp", "lcp_coeff"),
 }
@@ -440,8 +445,10 @@ def plain(case, **kwargs):
 
 
 def batch_of(case, *shape):
+    """The state before, which some of them read, is a third one."""
     torch.manual_seed(1)
-    return case.batch(*(shape or (6,)))
+    batch = case.batch(*(shape or (6,)))
+    return batch.set("before", batch[case.observation] + 0.1)
 
 
 def run(loss, batch):

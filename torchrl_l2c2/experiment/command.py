@@ -38,6 +38,7 @@ from torchrl_l2c2.experiment.signals import (
     terminate,
 )
 from torchrl_l2c2.experiment.sweep import Sweep, begin_sweep
+from torchrl_l2c2.experiment.tasks import PAPER_TASKS
 
 if TYPE_CHECKING:
     from torchrl_l2c2.experiment.reports import FinishedRun
@@ -282,15 +283,24 @@ def check_preset(values: dict[str, Any], name: str | None) -> None:
 
 
 def tell_tuned(config: ExperimentConfig) -> None:
-    """Says where L2C2's settings begin with the algorithm, where that is not as in the paper."""
+    """Says where L2C2's settings begin with the algorithm, and where none were found for it."""
     regularizer, algorithm = config.regularizer, config.algorithm.name
-    if regularizer.name in BEGIN_TUNED and algorithm in TUNED:
+    if regularizer.name not in BEGIN_TUNED:
+        return
+    if algorithm in TUNED:
         chosen = ", ".join(f"{name}={getattr(regularizer, name)}" for name in TUNED[algorithm])
         where = (
             f"found for {algorithm} on {TUNED_ON[algorithm]}, or given; larger rewards may want "
             "larger gains; regularizer=l2c2_paper is the paper's"
         )
         print(f"regularizer={regularizer.name}: {chosen} ({where})", flush=True)
+    elif algorithm != ExperimentConfig().algorithm.name or config.task.name not in PAPER_TASKS:
+        found = ", ".join(TUNED)
+        print(
+            f"regularizer={regularizer.name}: the paper's gains, which are for its own tasks and "
+            f"algorithm; others were found for {found} alone",
+            flush=True,
+        )
 
 
 @contextmanager

@@ -58,9 +58,11 @@ export/               the policy as ONNX and torch.export program (experiment.ex
 
 To load the policy, a TorchRL actor, with an environment of its task:
 
+    from torchrl.envs import set_exploration_type
     from torchrl_l2c2.experiment import load_policy
     policy, env, max_steps = load_policy("path of this folder")
-    rollout = env.rollout(max_steps, policy)
+    with set_exploration_type("deterministic"):  # the mean; without it, samples as in training
+        rollout = env.rollout(max_steps, policy)
 
 To play test episodes with it:
 

@@ -47,8 +47,9 @@ TUNED: dict[str, dict[str, Any]] = {
         "lambda_max": 1000.0,
         "beta": 0.0,
     },
+    "td3": {"lambda_min": 0.1, "lambda_max": 10.0},
 }
-TUNED_ON = {"ppo": "Pendulum and LunarLander", "sac": "Pendulum"}
+TUNED_ON = {"ppo": "Pendulum and LunarLander", "sac": "Pendulum", "td3": "Pendulum"}
 
 REGULARIZERS: dict[str, RegularizerConfig] = {
     "none": NoRegularizerConfig(),
