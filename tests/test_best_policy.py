@@ -226,7 +226,7 @@ def test_a_damaged_file_is_named(folder, tmp_path, name, content):
 def test_the_folder_says_how_to_load_its_policy(folder):
     """Its own lines run, and name every file."""
     text = (folder / "README.txt").read_text()
-    lines = [line.strip() for line in text.splitlines() if line.startswith("    ")]
+    lines = [line[4:] for line in text.splitlines() if line.startswith("    ")]
     code = [line for line in lines if not line.startswith("python")]
     names = {"__name__": "readme"}
     exec("\n".join(code).replace("path of this folder", str(folder)), names)

@@ -32,7 +32,10 @@ SWINGUP = GROUPS["task"]["swingup"]
         # The algorithm, the replay buffer and the optimizer have a beta of their own.
         ({"algorithm": PPORPEConfig(beta=0.2)}, "swingup/ppo_rpe/l2c2/algorithm.beta-0.2/seed_0"),
         ({"compile": False, "num_workers": 2}, "swingup/ppo_rpe/l2c2/compile-false_num_workers-2"),
-        ({"algorithm": TD3Config(hidden=(8, 9))}, "swingup/td3/l2c2/hidden-8x9/seed_0"),
+        (
+            {"algorithm": TD3Config(hidden=(8, 9)), "regularizer": NoRegularizerConfig()},
+            "swingup/td3/none/hidden-8x9/seed_0",
+        ),
         ({"replay": UniformReplayConfig()}, "swingup/ppo_rpe/l2c2/replay-uniform/seed_0"),
         ({"task": TaskConfig("A:B/C v1", "A:B/C v1")}, "A-B-C-v1/ppo_rpe/l2c2/seed_0"),
         ({"task": replace(SWINGUP, max_steps=9)}, "swingup/ppo_rpe/l2c2/max_steps-9/seed_0"),
