@@ -38,7 +38,8 @@ from torchrl_l2c2.experiment.reports.field import BETTER, field_table
 from torchrl_l2c2.experiment.reports.groups import baseline_of, group_records, over_tasks
 from torchrl_l2c2.experiment.reports.measures import measures_table
 from torchrl_l2c2.experiment.reports.pairwise import pairwise_tables
-from torchrl_l2c2.experiment.reports.paper_table import paper_table
+from torchrl_l2c2.experiment.reports.paper import TAU
+from torchrl_l2c2.experiment.reports.paper_table import deployed_table, paper_table
 from torchrl_l2c2.experiment.reports.readme import END, START, fill, results_text, shown_groups
 from torchrl_l2c2.experiment.reports.records import FIGURES, digest, merge
 from torchrl_l2c2.experiment.reports.runs import FinishedRun, finished_run
@@ -174,6 +175,29 @@ class TestPaperTable:
         both = [replace(record, seed=s, policy_scale=v) for s, v in enumerate((0.2, 0.4))]
         table = paper_table(group_records(both))
         assert (table.columns[-1], table.rows[0][-1]) == ("policy scale", "0.300 (0.141)")
+
+
+    def test_as_deployed_they_are_compared_by_their_mean_actions(self, tmp_path):
+        """Other numbers than those of sampled actions, and other probabilities."""
+        make_run(tmp_path / "run", make_config(), 10.0, 0.1)
+        (record,) = (run.record for run in read_runs(tmp_path))
+        figures = ("late_mean_return", "late_mean_action_variation")
+        records = [
+            replace(record, method=method, seed=seed, **dict(zip(figures, values, strict=True)))
+            for method, runs in {
+                "none": ((10.0, 0.5), (20.0, 0.5)),
+                "l2c2": ((15.0, 0.4), (25.0, 0.6)),
+            }.items()
+            for seed, values in enumerate(runs)
+        ]
+        groups = group_records(records)
+        plain, smooth = deployed_table(groups).rows
+        assert plain[3:] == ["15.00 (7.07)", plain[4], "", "0.500 (0.000)", plain[7], ""]
+        assert (smooth[3], smooth[6]) == ("20.00 (7.07)", "0.500 (0.141)")
+        assert (smooth[5].split()[0], smooth[8].split()[0]) == ("0.75", "0.50")
+        assert deployed_table(groups).markdown() in results_text(records)
+        untested = [replace(record, **dict.fromkeys(figures, math.nan)) for record in records]
+        assert deployed_table(group_records(untested)) is None
 
 
 class TestFasterTargets:
@@ -1026,6 +1050,8 @@ HEADLINE = {
     "SAC, Pendulum": ("sac_pendulum", "l2c2_mean", "30000 frames", "last_mean"),
     "PPO, LunarLander": ("field", "l2c2", "500000 frames", "last_mean"),
     "PPO, Pendulum": ("field", "l2c2", "500000 frames", "last_mean"),
+    "PPO-RPE, Reacher, as in the paper": ("runs", "l2c2", "4500 episodes", "last_mean"),
+    "PPO-RPE, Swingup, as in the paper": ("runs", "l2c2", "350 episodes", "last_mean"),
     "PPO-RPE, Swingup": ("runs", "l2c2_mean", "300 episodes", "late_sampled"),
 }
 MEASURED = {"sm_asap": "Sm", "action_variation": "action variation"}
@@ -1038,6 +1064,7 @@ class TestReadme:
         name, method, length, figure = HEADLINE[label]
         task = label.split(", ")[1].lower()
         read = read_records(ROOT / "results" / f"{name}.csv")
+        read = [r for r in read if TAU not in r.other_settings]
         plain, regularized = (
             [r for r in read if (r.task, r.method, r.length) == (task, kind, length)]
             for kind in ("none", method)
@@ -1053,8 +1080,8 @@ class TestReadme:
 
         total, kept = means("return")
         rows, start = [], f"{label} | {seeds[0]} |"
-        # Sm is of mean actions.
-        for measure in MEASURED if figure == "last_mean" else ("action_variation",):
+        # The paper measures the action variation alone.
+        for measure in ("action_variation",) if name == "runs" else MEASURED:
             rough, smooth = means(measure)
             told = f"{rough:.3f} | {smooth:.3f} | {smooth / rough - 1:+.0%}"
             rows.append(f"| {start} {MEASURED[measure]} | {told} | {total:.0f} | {kept:.0f} |")
@@ -1085,7 +1112,7 @@ class TestReadme:
         write_records(file, [*records, usual])
         main(["--from", str(file), "--readme", str(readme)])
         told = [line for line in readme.read_text().splitlines() if line.startswith("| swingup")]
-        assert [line.split(" | ")[1:3] for line in told] == [["vanilla", "0"]]
+        assert {tuple(line.split(" | ")[1:3]) for line in told} == {("vanilla", "0")}
         assert "| reacher | L2C2 | 0-4 |" in readme.read_text()
 
     def test_results_are_not_lost_for_those_of_other_tasks(self, records, tmp_path):

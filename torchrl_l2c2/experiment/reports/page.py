@@ -18,7 +18,7 @@ from torchrl_l2c2.experiment.reports.front import front_figure, front_table, sea
 from torchrl_l2c2.experiment.reports.groups import Group, group_records
 from torchrl_l2c2.experiment.reports.measures import measures_table
 from torchrl_l2c2.experiment.reports.pairwise import pairwise_tables
-from torchrl_l2c2.experiment.reports.paper_table import paper_table
+from torchrl_l2c2.experiment.reports.paper_table import deployed_table, paper_table
 from torchrl_l2c2.experiment.reports.records import FIGURES, Record
 from torchrl_l2c2.experiment.reports.runs import FinishedRun
 from torchrl_l2c2.experiment.reports.score import readings
@@ -27,8 +27,8 @@ from torchrl_l2c2.experiment.reports.tables import Table, results_tables, runs_t
 
 def _results(groups: Sequence[Group]) -> list[Table]:
     """What stands before the pictures."""
-    of_paper = paper_table(groups)
-    return [*([of_paper] if of_paper else []), *results_tables(groups)]
+    of_paper = (paper_table(groups), deployed_table(groups))
+    return [*(table for table in of_paper if table is not None), *results_tables(groups)]
 
 
 def _others(records: Sequence[Record], runs: Sequence[FinishedRun]) -> list[Table]:

@@ -20,8 +20,13 @@ LEGEND = (
     "The policy scale is that of the late policies; the Hellinger distance is relative to it, so "
     "that a wider policy may change more."
 )
+DEPLOYED_LEGEND = (
+    "The same runs with mean actions, as a policy is used once it is trained: late policies, a "
+    "test episode of each, and 100 of the last policy. P is of late policies, as above."
+)
 # Late policies in the first column, as they are steadier than the paper's test of the last one.
 FIRST, SECOND = "late_sampled", "last_sampled"
+DEPLOYED = ("late_mean", "last_mean")
 BETTER = ("P(larger return)", "P(smoother)")
 
 
@@ -44,6 +49,37 @@ def paper_table(groups: Sequence[Group]) -> Table | None:
         if is_of_paper(group.first.task, group.first.algorithm)
     ]
     return Table("Beside the paper's table", columns, rows, [LEGEND]) if rows else None
+
+
+def deployed_table(groups: Sequence[Group]) -> Table | None:
+    """The rows of :func:`paper_table` with mean actions, without noise from sampling.
+
+    Args:
+        groups (sequence of Group): of any tasks; others are passed over.
+
+    Returns:
+        Table: ``None`` where no run of such a task has been tested with mean actions.
+    """
+    columns = ["task", "method", "seeds"]
+    for name, better in zip(QUANTITIES.values(), BETTER, strict=True):
+        columns += [name, "last policy", better]
+    rows = [
+        _deployed_row(group, baseline_of(group, groups))
+        for group in groups
+        if is_of_paper(group.first.task, group.first.algorithm)
+        and len(group.scores(DEPLOYED[0], "return"))
+    ]
+    return Table("As deployed", columns, rows, [DEPLOYED_LEGEND]) if rows else None
+
+
+def _deployed_row(group: Group, vanilla: Group | None) -> list[str]:
+    late, last = DEPLOYED
+    cells = [group.first.task, group.name, number_range(group.seeds)]
+    for quantity in QUANTITIES:
+        better = improvement([group], [vanilla], late, quantity) if vanilla else None
+        both = (pooled(group, figure, quantity) for figure in (late, last))
+        cells += [*both, probability(better)]
+    return cells
 
 
 def _row(group: Group, vanilla: Group | None) -> list[str]:

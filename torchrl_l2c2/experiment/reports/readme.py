@@ -12,7 +12,7 @@ from torchrl_l2c2.experiment.reports.faster_targets import faster_targets_table
 from torchrl_l2c2.experiment.reports.figures import draw_plane
 from torchrl_l2c2.experiment.reports.groups import Group, group_records
 from torchrl_l2c2.experiment.reports.paper import PAPER, TAU, is_of_paper
-from torchrl_l2c2.experiment.reports.paper_table import paper_table
+from torchrl_l2c2.experiment.reports.paper_table import deployed_table, paper_table
 from torchrl_l2c2.experiment.reports.records import Record
 from torchrl_l2c2.experiment.reports.tables import settings_notes
 from torchrl_l2c2.experiment.tasks import TASKS
@@ -22,7 +22,7 @@ PICTURE = Path("docs") / "results.svg"
 
 
 def results_text(records: Sequence[Record]) -> str:
-    """What stands between the marks: a picture and the paper's table.
+    """What stands between the marks: a picture, the paper's table, and what it has beside it.
 
     Where a task has runs of its default length and settings, others are not told: they compare
     lengths and readings of the paper. Regularizers' settings may be others.
@@ -40,8 +40,8 @@ def results_text(records: Sequence[Record]) -> str:
         )
     picture = f"![Return against action variation of every method]({PICTURE.as_posix()})"
     faster = faster_targets_table([r for r in records if _is_as_usual(r, TAU)])
-    tables = [table.markdown(), *settings_notes(groups), faster.markdown() if faster else ""]
-    return "\n\n".join([picture, *filter(None, tables)])
+    more = [each.markdown() for each in (deployed_table(groups), faster) if each]
+    return "\n\n".join([picture, table.markdown(), *settings_notes(groups), *more])
 
 
 def fill(text: str, records: Sequence[Record]) -> str:
