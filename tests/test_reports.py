@@ -176,7 +176,6 @@ class TestPaperTable:
         table = paper_table(group_records(both))
         assert (table.columns[-1], table.rows[0][-1]) == ("policy scale", "0.300 (0.141)")
 
-
     def test_as_deployed_they_are_compared_by_their_mean_actions(self, tmp_path):
         """Other numbers than those of sampled actions, and other probabilities."""
         make_run(tmp_path / "run", make_config(), 10.0, 0.1)
