@@ -25,6 +25,7 @@ from torchrl_l2c2.experiment import Experiment, ExperimentConfig
 from torchrl_l2c2.experiment.command import CONF
 from torchrl_l2c2.experiment.regularizers import REGULARIZERS
 from torchrl_l2c2.experiment.reports import Record, read_records
+from torchrl_l2c2.experiment.reports.readme import is_as_usual
 from torchrl_l2c2.experiment.tasks import TASKS
 
 RECORDS = Path(__file__).parents[1] / "results" / "runs.csv"
@@ -62,12 +63,12 @@ def sweep() -> list[tuple[str, str]]:
 
 
 def recorded(records: Sequence[Record], task: str, method: str) -> list[float]:
-    """Seconds of the runs of a task and a method that had the table's length."""
-    length = f"{TASKS[task].episodes} episodes"
+    """Seconds of the runs of a task and a method that had the table's length and settings."""
     return [
         record.seconds
         for record in records
-        if (record.task, record.method, record.length) == (task, method, length)
+        if (record.task, record.method) == (task, method)
+        and is_as_usual(record)
         and math.isfinite(record.seconds)
     ]
 

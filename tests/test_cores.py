@@ -1,8 +1,12 @@
 """How long a sweep takes on so many cores, on paper."""
 
+import math
+from dataclasses import replace
+
 import pytest
 
-from benchmarks.cores import makespan, report, sweep
+from benchmarks.cores import RECORDS, makespan, recorded, report, sweep
+from torchrl_l2c2.experiment.reports import read_records
 
 
 @pytest.mark.parametrize(("cores", "hours"), [(1, 15.0), (2, 10.0), (3, 8.0), (4, 7.0), (9, 6.0)])
@@ -15,6 +19,19 @@ def test_the_table_has_all_of_the_papers_runs():
     """A seed's runs before the next seed's."""
     runs = sweep()
     assert len(runs) == 288 and len(set(runs)) == 16 and runs[:16] == runs[16:32]
+
+
+def test_a_run_takes_what_those_of_the_tables_settings_took():
+    """Neither other lengths, nor other settings of the algorithm, nor what no run says."""
+    run = replace(read_records(RECORDS)[0], task="swingup", algorithm="ppo_rpe", method="l2c2")
+    run = replace(run, length="350 episodes", differences="", seconds=120.0)
+    others = [
+        replace(run, length="300 episodes", seconds=60.0),
+        replace(run, differences="algorithm.tau=0.5", seconds=90.0),
+        replace(run, seconds=math.nan),
+    ]
+    assert recorded([*others, run, replace(run, seconds=130.0)], "swingup", "l2c2") == [120, 130]
+    assert recorded(others, "swingup", "l2c2") == recorded([run], "swingup", "caps") == []
 
 
 def test_the_page_says_where_it_stops_scaling():

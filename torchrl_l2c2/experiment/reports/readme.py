@@ -39,7 +39,7 @@ def results_text(records: Sequence[Record]) -> str:
             "README's results are: name a file that has some, by --from or --csv."
         )
     picture = f"![Return against action variation of every method]({PICTURE.as_posix()})"
-    faster = faster_targets_table([r for r in records if _is_as_usual(r, TAU)])
+    faster = faster_targets_table([r for r in records if is_as_usual(r, TAU)])
     more = [each.markdown() for each in (deployed_table(groups), faster) if each]
     return "\n\n".join([picture, table.markdown(), *settings_notes(groups), *more])
 
@@ -72,11 +72,11 @@ def fill_readme(path: str | Path, records: Sequence[Record]) -> None:
 def shown_groups(records: Sequence[Record]) -> list[Group]:
     """What the table and the picture are of."""
     records = [r for r in records if is_of_paper(r.task, r.algorithm)]
-    as_usual = {r.task for r in records if _is_as_usual(r)}
-    return group_records(r for r in records if _is_as_usual(r) or r.task not in as_usual)
+    as_usual = {r.task for r in records if is_as_usual(r)}
+    return group_records(r for r in records if is_as_usual(r) or r.task not in as_usual)
 
 
-def _is_as_usual(record: Record, *but: str) -> bool:
+def is_as_usual(record: Record, *but: str) -> bool:
     """Whether it has its task's default length and settings, but for some that are named."""
     task = TASKS.get(record.task)
     others = {k for k in record.other_settings if not k.startswith("regularizer.")}
