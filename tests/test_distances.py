@@ -394,6 +394,14 @@ def test_most_specific_registration_wins():
     assert squared_hellinger(p, d.Normal(torch.tensor(0.0), 1.0)).item() == 0.0
 
 
+def test_a_closed_form_has_one_number_for_each_pair():
+    """Not one for each dimension of the action, of which the mean would be taken."""
+    register_hellinger(d.Gumbel)(lambda p, q: (p.loc - q.loc).square().sum(-1).neg())
+    p = d.Gumbel(torch.zeros(4), 1.0)
+    with pytest.raises(ValueError, match=r"shape \(4,\), got \(\): sum over the action's"):
+        squared_hellinger(p, p)
+
+
 def test_only_distributions_can_be_registered():
     """Registering something else says what it takes."""
     with pytest.raises(TypeError, match=r"subclasses of .*Distribution, got 3"):

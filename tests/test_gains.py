@@ -37,6 +37,16 @@ class TestByHand:
         gain = ConstantGain(2.0)
         assert [gain.step(), gain.step(7.0)] == [2.0, 2.0]
 
+    @pytest.mark.parametrize("make", [RampGain, GradientGain, TargetGain])
+    def test_what_was_measured_may_be_a_tensor(self, make):
+        """Of one number; gain and state are plain numbers, as a file has them."""
+        gain, like = (make(2.0) for _ in range(2))
+        assert gain.step(torch.tensor([0.5])) == like.step(0.5)
+        assert all(type(value) in (int, float) for value in gain.state_dict().values())
+        with pytest.raises(TypeError, match=r"measured must be a single number, .*\(2,\)"):
+            gain.step(torch.ones(2))
+        assert gain.state_dict() == like.state_dict()
+
     def test_a_ramp_rises_linearly_and_stays_at_its_end(self):
         """Half of 3 where a quarter of training is over and it is to rise over half."""
         ramp = RampGain(3.0, length=0.5)
@@ -207,6 +217,18 @@ class TestInARun:
         assert shares["loss_l2c2_actor"] == pytest.approx(0.3, rel=1e-4)
         assert shares["loss_l2c2_critic"] == pytest.approx(0.3, rel=1e-4)
         assert rows[-1]["gain_policy"] != pytest.approx(rows[-1]["gain_value"])
+
+    def test_shares_are_measured_where_no_gradients_are_kept(self):
+        """As between updates; terms that are not single numbers are refused."""
+        run = Experiment(small())
+        run.train()
+        batch = run.learner.example()
+        expected = gradient_shares(run.agent.loss, batch)
+        with torch.no_grad():
+            assert gradient_shares(run.agent.loss, batch) == expected
+        run.agent.loss.reduction = "none"
+        with pytest.raises(ValueError, match="make the loss with reduction='mean'"):
+            gradient_shares(run.agent.loss, batch)
 
     def test_several_terms_of_a_network_share_their_gain(self):
         """CAPS has two of the policy: the larger counts, and neither changes beside the other."""

@@ -61,6 +61,24 @@ class TestMeanDistance:
             p, q = (kind(probs=torch.tensor([[x, 1 - x]])) for x in (0.5, 0.9))
             torch.testing.assert_close(mean_distance(p, q), torch.tensor([0.16]))
 
+    def test_several_discrete_actions_are_one_vector(self):
+        """Two choices of two: (.5, .5) and (.9, .1) twice."""
+        p, q = (
+            d.Independent(d.Categorical(probs=torch.tensor([[[x, 1 - x]] * 2])), 1)
+            for x in (0.5, 0.9)
+        )
+        torch.testing.assert_close(mean_distance(p, q), torch.tensor([0.32]))
+
+    def test_torchs_own_squashed_normals_are_compared_before_it(self):
+        """Wrapped as a whole, where torch has no mean: 1/2 (1^2 + 1^2); and 0 of the actions'."""
+        p, q = (
+            d.Independent(d.TransformedDistribution(d.Normal(LOC + x, 1.0), [d.TanhTransform()]), 1)
+            for x in (0.0, 1.0)
+        )
+        torch.testing.assert_close(mean_distance(p, q), torch.tensor([1.0, 1.0]))
+        with pytest.raises(NotImplementedError, match="has no mean: choose another"):
+            policy_mean(p, squashed=True)
+
     def test_the_heads_of_a_composite_policy_are_one_vector(self):
         """Their squared distances add up, also those of heads without a dimension of their own."""
         params = TensorDict(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import gc
+import math
 import pickle
 
 import pytest
@@ -112,6 +113,14 @@ class Declaring(RegularizedLoss):
         self.declare_terms(**kinds)
 
 
+class Doubled(Stillness):
+    """A regularizer with a forward of its own."""
+
+    def forward(self, tensordict):
+        terms = super().forward(tensordict)
+        return terms.set("loss_stillness", 2.0 * terms["loss_stillness"])
+
+
 class TestTheClass:
     def test_it_is_made_once_for_each_pair(self):
         """Two losses of one class have one regularized class, and it can be named."""
@@ -130,6 +139,10 @@ class TestTheClass:
         action = base.actor_network(batch.copy())["action"]
         expected = 0.5 * action.square().sum(-1).mean()
         torch.testing.assert_close(loss(batch.copy())["loss_stillness"], expected)
+        # With a forward of its own, which a regularizer around it does not hide.
+        doubled = L2C2Loss(Doubled(base, coeff=0.5))(batch.copy())
+        torch.testing.assert_close(doubled["loss_stillness"], 2.0 * expected)
+        assert "loss_l2c2_actor" in doubled
         loss.stillness_coeff = 0.0
         assert copy.deepcopy(L2C2Loss(loss))(batch)["loss_stillness"] == 0
 
@@ -259,6 +272,23 @@ class TestAttributes:
         loss = L2C2Loss(ddpg())
         with pytest.raises(TypeError, match="l2c2_coeff must be a real number"):
             loss.l2c2_coeff = value
+
+    def test_a_gain_may_be_a_tensor_of_one_number(self):
+        """Which is checked as a number is; the buffer stays, and inner losses see it."""
+        inner = L2C2Loss(ddpg(), beta=0.0)
+        outer = Stillness(inner)
+        outer.l2c2_coeff = torch.tensor([0.5])
+        assert inner.l2c2_coeff.item() == outer.l2c2_coeff.item() == 0.5
+        assert inner.l2c2_coeff.shape == ()
+        for value in (torch.tensor(-1.0), torch.tensor(math.nan)):
+            with pytest.raises(ValueError, match="l2c2_coeff must be finite and at least 0"):
+                outer.l2c2_coeff = value
+        with pytest.raises(TypeError, match=r"a single number, .* got \(3,\)"):
+            outer.l2c2_coeff = torch.ones(3)
+        with pytest.raises(TypeError, match="detach it"):
+            outer.l2c2_coeff = nn.Parameter(torch.tensor(1.0))
+        with pytest.raises(ValueError, match="has nothing to scale"):
+            inner.l2c2_beta = torch.tensor(0.1)
 
     def test_load_hooks_outlive_the_wrapped_loss(self):
         """Hooks of the plain loss that name their module work when only the new one is left."""

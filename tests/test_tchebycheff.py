@@ -10,7 +10,7 @@ import torch
 from losses import deterministic_actor, gaussian_actor, on_policy, qvalue, transitions
 from torchrl.objectives import ClipPPOLoss, DDPGLoss
 
-from torchrl_l2c2 import CATSLoss, L2C2Loss
+from torchrl_l2c2 import ASAPLoss, CAPSLoss, CATSLoss, L2C2Loss
 from torchrl_l2c2.experiment import (
     AdamConfig,
     Experiment,
@@ -126,6 +126,30 @@ class TestAroundALoss:
         compiled = torch.compile(loss, fullgraph=True, backend="eager")
         torch.testing.assert_close(compiled(batch.copy())["tchebycheff"], expected)
 
+    def test_a_regularizer_around_it_leaves_it_as_it_was(self):
+        """The term of the one outside is added; the shares are those without it."""
+        torch.manual_seed(0)
+        inner = TchebycheffLoss(CAPSLoss(DDPGLoss(deterministic_actor(), qvalue())), 0.2)
+        outer, batch = CATSLoss(inner, 3.0), transitions(8)
+        seeds = (torch.manual_seed(1) and loss(batch.copy()) for loss in (inner, outer))
+        plain, found = seeds
+        assert set(outer.out_keys) <= set(found.keys())
+        for key in plain.keys():
+            torch.testing.assert_close(found[key], plain[key])
+        assert found["loss_cats"] > 0 and found["tchebycheff_share"] > 0
+
+    def test_a_network_of_the_regularizers_own_is_not_the_policys(self):
+        """The predictor of ASAP is trained as it was, whatever the policy's share."""
+        torch.manual_seed(0)
+        base = ASAPLoss(DDPGLoss(deterministic_actor(), qvalue()), previous_key="before")
+        batch = transitions(8)
+        batch["before"] = torch.randn_like(batch["observation"])
+        terms, found = base(batch.copy()), TchebycheffLoss(base, 0.2)(batch.copy())
+        assert found["loss_asap_temporal"].equal(terms["loss_asap_temporal"])
+        of_policy = terms["loss_asap_spatial"] + terms["loss_grad_caps"]
+        share = torch.softmax(torch.stack([terms["loss_actor"], of_policy]) / 0.2, 0)[1]
+        torch.testing.assert_close(found["tchebycheff_share"], share.detach())
+
     @pytest.mark.parametrize(
         ("make", "error", "message"),
         [
@@ -135,8 +159,10 @@ class TestAroundALoss:
                 "DDPGLoss has none: put L2C2Loss",
             ),
             (lambda: TchebycheffLoss(cats(), 0.0), ValueError, "mu must be finite and greater"),
+            (lambda: TchebycheffLoss(cats(), ideal=0.0), TypeError, "ideal must be two numbers"),
+            (lambda: TchebycheffLoss(cats(), ideal=(0.0,)), TypeError, "ideal must be two numbers"),
             (
-                lambda: TchebycheffLoss(cats(), objectives=["loss_pi"]),
+                lambda: TchebycheffLoss(cats(), objectives="loss_pi"),
                 ValueError,
                 r"objectives must name .*'loss_actor'.* got \['loss_pi'\]",
             ),

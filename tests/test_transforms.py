@@ -50,6 +50,23 @@ def transitions(*batch: int, **entries: tuple[int, ...]) -> TensorDict:
 # NeighborTransform
 
 
+@pytest.mark.parametrize("order", [("wide", "thin"), ("thin", "wide")])
+def test_one_number_for_all_entries_leaves_each_its_dtype(order):
+    """Whichever is the first, from which it is drawn; the part of the way is the same."""
+    data = transitions(6, wide=(3,), thin=(2,))
+    for key in ("wide", ("next", "wide")):
+        data[key] = data[key].double()
+    near = Neighborhood(shared=True)
+    NeighborTransform(near, in_keys=list(order), generator=generator())(data)
+    found = {key: data["neighbor", key] for key in order}
+    assert {key: each.dtype for key, each in found.items()} == {
+        "wide": torch.float64,
+        "thin": torch.float32,
+    }
+    parts = {key: found[key][:, 0] - data[key] for key in order}  # every step is 1
+    torch.testing.assert_close(parts["wide"][:, :2].float(), parts["thin"], atol=1e-6, rtol=0)
+
+
 @pytest.mark.parametrize("batch", [(), (6,), (6, 4)])
 def test_neighbors_are_those_of_the_neighborhood(batch):
     """The entry holds what the neighborhood samples, in the batch size of the batch."""

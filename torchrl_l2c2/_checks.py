@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from numbers import Real
 from typing import Any
 
+from torch import Tensor
+
 
 def check_positive_int(name: str, value: Any) -> None:
     """Refuses all but integers of at least 1; ``True`` is not one.
@@ -19,6 +21,20 @@ def check_positive_int(name: str, value: Any) -> None:
         raise TypeError(f"{name} must be an integer, got {value!r} ({type(value).__name__}).")
     if value < 1:
         raise ValueError(f"{name} must be at least 1, got {value!r}.")
+
+
+def as_number(name: str, value: Any) -> Any:
+    """A tensor of one number as that number, which is checked as others are; all else as it is.
+
+    Raises:
+        TypeError: the tensor has several numbers, or a gradient, which would be lost.
+    """
+    if not isinstance(value, Tensor):
+        return value
+    if value.numel() != 1 or value.requires_grad:
+        what = "one with a gradient: detach it" if value.numel() == 1 else tuple(value.shape)
+        raise TypeError(f"{name} must be a single number, or a tensor of one, got {what}.")
+    return value.item()
 
 
 def check_real(

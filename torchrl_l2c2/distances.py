@@ -76,7 +76,7 @@ def squared_hellinger(
         TypeError: if a policy is deterministic or can neither be sampled nor scored, or
             ``num_samples`` is no integer.
         ValueError: if the event shapes differ, ``num_samples`` is below 1, or the arguments
-            contradict each other.
+            contradict each other, or a registered closed form has another shape.
 
     Examples:
         >>> import torch
@@ -102,6 +102,13 @@ def squared_hellinger(
     exact = log_affinity(p, q)
     if exact is NotImplemented:
         return _monte_carlo(p, q, MONTE_CARLO_SAMPLES)
+    pairs = torch.broadcast_shapes(p.batch_shape, q.batch_shape)
+    if exact.shape != pairs:
+        raise ValueError(
+            f"the closed form of {type(p).__name__} and {type(q).__name__} must return one number "
+            f"for each pair of policies, shape {tuple(pairs)}, got {tuple(exact.shape)}: sum over "
+            "the action's dimensions in what register_hellinger has."
+        )
     return -torch.expm1(exact)
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 
-from torchrl_l2c2._checks import check_real
+from torchrl_l2c2._checks import as_number, check_real
 
 
 class ConstantGain:
@@ -78,6 +78,7 @@ class RampGain(ConstantGain):
 
     def step(self, measured: float = math.nan) -> float:
         """The value where a share of training, ``measured``, is over, in [0, 1]."""
+        measured = as_number("measured", measured)
         check_real("measured", measured, at_least=0)
         self.value = self.end * min(1.0, measured / self.length)
         return self.value
@@ -140,6 +141,7 @@ class GradientGain(_BoundedGain):
 
     def step(self, measured: float = math.nan) -> float:
         """The next value after a share :math:`\\rho`; 0 and what is not finite change nothing."""
+        measured = as_number("measured", measured)
         if 0.0 < measured < math.inf:
             wanted = self.share / measured
             self._measurements += 1
@@ -198,6 +200,7 @@ class TargetGain(_BoundedGain):
 
     def step(self, measured: float = math.nan) -> float:
         """The next value after a measure :math:`m`; one that is not finite changes nothing."""
+        measured = as_number("measured", measured)
         if math.isfinite(measured):
             excess = min(max(measured / self.target - 1.0, -1.0), 1.0)
             self._multiply(math.exp(self.rate * excess))

@@ -50,7 +50,8 @@ class Neighborhood:
             through :math:`s` and :math:`s'`, as in implementations for robots; their distances are
             uniform then, and the gain that of one dimension. Defaults to ``False``, one for each:
             the paper.
-        max_step: the largest :math:`\lVert s' - s \rVert_2`, greater than 0, in the state's units.
+        max_step: the largest :math:`\lVert s' - s \rVert_2`, greater than 0, in the state's units;
+            where a state is several entries, of each by itself, and one that is longer is enough.
             A transition with a longer one is a reset or a teleport, and counts nothing: its
             neighbors are the state itself, at an infinite distance with a gain of 0. Defaults to
             ``None``, no bound.
@@ -238,7 +239,8 @@ class Neighborhood:
                 f"{tuple(state.shape)} with {batch_dims} batch dimensions, got "
                 f"{tuple(uniform.shape)}."
             )
-        u = (2.0 * uniform - 1.0) * self.radius
+        # Shared numbers may be those of an entry of another dtype.
+        u = ((2.0 * uniform - 1.0) * self.radius).to(state.dtype)
         displacement = (next_state - state).to(state.dtype)
         displacement = torch.nan_to_num(displacement, nan=0.0, posinf=0.0, neginf=0.0)
         # An explicit size: -1 is ambiguous for empty batches.

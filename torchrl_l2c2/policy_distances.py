@@ -155,7 +155,19 @@ def policy_mean(policy: Distribution | Tensor, *, squashed: bool = False) -> Ten
         if isinstance(policy, TruncatedNormal):
             return policy.loc
     mean = getattr(policy, "deterministic_sample", None)
-    return policy.mean if mean is None else mean
+    if mean is not None:
+        return mean
+    if isinstance(policy, Independent):
+        # Torch's mean of actions that are labels is NaN, and that of squashed ones not there.
+        base = policy_mean(policy.base_dist, squashed=squashed)
+        return base.reshape(*policy.batch_shape, -1)
+    try:
+        return policy.mean
+    except NotImplementedError as error:
+        raise NotImplementedError(
+            f"{type(policy).__name__} has no mean: choose another policy_distance or "
+            "regularizer, or give the class a deterministic_sample."
+        ) from error
 
 
 def mean_distance(p: Distribution, q: Distribution) -> Tensor:

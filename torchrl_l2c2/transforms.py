@@ -89,7 +89,7 @@ def _transitions(tensordict: TensorDictBase, in_keys: Sequence[NestedKey]) -> Tr
             if entry is None:
                 raise KeyError(
                     f"a neighborhood needs {name!r}, which the tensordict lacks; it has "
-                    f"{_listed(tensordict)}. Store it, or name the state's entries in in_keys."
+                    f"{_listed(tensordict)}. Store it, or choose other in_keys (or moved_keys)."
                 )
     return transitions
 
@@ -251,7 +251,7 @@ class ObservationNoise(_RandomTransform):
 
     The noise is drawn once per observation, at every step and reset, so the successor of a state
     and the state that follows it are the same noisy observation, as with a real sensor.
-    Environments of a batch that are not reset keep theirs.
+    Environments that are not reset keep theirs. In a replay buffer it would be drawn anew.
 
     The paper states a "scale" of its white noise (Kobayashi, L2C2, 2022, "Setup"), read here as the
     standard deviation of a Gaussian [inferred]. The noise leaves the bounds of the observations, so

@@ -100,8 +100,9 @@ class GainControl:
     def _terms(self) -> dict[str, list[str]]:
         """The regularizer's terms, by what they train."""
         loss = self._learner.agent.loss
-        added, of_policy = loss.added_terms, loss.policy_terms
-        terms = {"policy": sorted(added & of_policy), "value": sorted(added - of_policy)}
+        of_policy = loss.policy_terms
+        of_value = loss.added_terms - of_policy - loss.auxiliary_terms
+        terms = {"policy": sorted(of_policy), "value": sorted(of_value)}
         return {name: keys for name, keys in terms.items() if keys}
 
     def _measure(self, row: Mapping[str, float]) -> dict[str, float]:

@@ -12,6 +12,7 @@ from torchrl.objectives import LossModule
 from torchrl_l2c2.experiment.update import is_loss
 
 
+@torch.enable_grad()
 def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]:
     r"""The gradients' norms of a regularizer's terms, relative to those of the loss's own terms.
 
@@ -29,6 +30,9 @@ def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]
     Returns:
         dict: at least 0 for every added ``loss_*`` key; infinite where the loss's own gradient is
         zero.
+
+    Raises:
+        ValueError: a term is not a single number.
     """
     added = [key for key in loss.out_keys if key in getattr(loss, "added_terms", ())]
     if not added:
@@ -38,6 +42,11 @@ def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]
     with torch.random.fork_rng(devices=devices):
         twin = deepcopy(loss)
         terms = twin(batch.copy())
+    if any(terms[key].ndim for key in terms.keys() if is_loss(key)):
+        raise ValueError(
+            "gradient_shares needs terms that are single numbers, one for the whole batch: make "
+            "the loss with reduction='mean'."
+        )
     parameters = list(twin.parameters())
 
     def gradients(value: Tensor) -> tuple[Tensor | None, ...]:

@@ -101,7 +101,7 @@ class ASAPLoss(GradCAPSLoss):
         self.register_coefficient("asap_lambda_spatial", lambda_spatial)
         self.register_coefficient("asap_lambda_temporal", lambda_temporal)
         self.asap_predictor = _copy_of_policy(self)
-        self.declare_terms(policy=["loss_asap_spatial", "loss_asap_temporal"])
+        self.declare_terms(policy=["loss_asap_spatial"], auxiliary=["loss_asap_temporal"])
 
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
         terms = super().policy_regularizer(tensordict)

@@ -6,9 +6,8 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor
 
-from torchrl_l2c2._checks import check_real
+from torchrl_l2c2._checks import as_number, check_real
 
 if TYPE_CHECKING:
     from torchrl.objectives import LossModule as Base
@@ -22,18 +21,21 @@ class DeclaredTerms(Base):
     Attributes:
         policy_terms (frozenset of str): the ``loss_*`` keys of all regularizers applied that train
             the policy.
+        auxiliary_terms (frozenset of str): those that train networks of the regularizers' own.
         added_terms (frozenset of str): all ``loss_*`` keys of all regularizers applied.
     """
 
     policy_terms: frozenset[str] = frozenset()
+    auxiliary_terms: frozenset[str] = frozenset()
     added_terms: frozenset[str] = frozenset()
     _coefficients: frozenset[str] = frozenset()
     out_keys: list[str]
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if name not in self._coefficients or isinstance(value, Tensor):
+        if name not in self._coefficients:
             super().__setattr__(name, value)
             return
+        value = as_number(name, value)
         check_real(name, value, at_least=0)
         if name not in self._buffers:
             raise ValueError(
@@ -47,6 +49,7 @@ class DeclaredTerms(Base):
         *,
         policy: Iterable[str] = (),
         value: Iterable[str] = (),
+        auxiliary: Iterable[str] = (),
         diagnostics: Iterable[str] = (),
     ) -> None:
         """Declares what the two methods return; adds it to ``out_keys``, in the order given.
@@ -54,20 +57,24 @@ class DeclaredTerms(Base):
         Keyword Args:
             policy: ``loss_*`` keys of terms that train the policy, for ``policy_terms``.
             value: ``loss_*`` keys of terms that train value functions alone.
+            auxiliary: ``loss_*`` keys of terms that train networks of the regularizer's own, for
+                ``auxiliary_terms``.
             diagnostics: other keys, of entries that train nothing.
 
         Raises:
             ValueError: a key has the beginning of another kind.
         """
-        policy, value, diagnostics = list(policy), list(value), list(diagnostics)
-        for keys, trains in ((policy, True), (value, True), (diagnostics, False)):
+        policy, auxiliary, diagnostics = list(policy), list(auxiliary), list(diagnostics)
+        others = [*value, *auxiliary]
+        for keys, trains in ((policy, True), (others, True), (diagnostics, False)):
             for key in keys:
                 if key.startswith("loss_") != trains:
                     kind = "a term must start" if trains else "a diagnostic must not start"
                     raise ValueError(f"{kind} with 'loss_', got {key!r}: rename it.")
-        self.out_keys = [*self.out_keys, *policy, *value, *diagnostics]
+        self.out_keys = [*self.out_keys, *policy, *others, *diagnostics]
         self.policy_terms = self.policy_terms.union(policy)
-        self.added_terms = self.added_terms.union(policy, value)
+        self.auxiliary_terms = self.auxiliary_terms.union(auxiliary)
+        self.added_terms = self.added_terms.union(policy, others)
 
     def register_coefficient(self, name: str, value: float, used: bool = True) -> None:
         """Makes a gain, a buffer of shape ``[]`` that can be assigned to later on.

@@ -85,8 +85,13 @@ def read_neighbors(
         neighborhood that they were drawn in, ``[n, *B]``, if the entry has them.
 
     Raises:
-        KeyError: it has no distances.
+        KeyError: it has no distances, or is a tensor.
     """
+    if not isinstance(neighbor, TensorDictBase):
+        raise KeyError(
+            f"{key!r} is a tensor of the batch's own, and no neighbors of NeighborTransform: name "
+            "another neighbor_key."
+        )
     entries = {
         key: value.movedim(neighbor.batch_dims, 0)
         for key, value in neighbor.items(include_nested=True, leaves_only=True)

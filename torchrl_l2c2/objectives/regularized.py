@@ -57,6 +57,7 @@ class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
     Attributes:
         policy_terms (frozenset of str): the ``loss_*`` keys of all regularizers applied that train
             the policy.
+        auxiliary_terms (frozenset of str): those that train networks of the regularizers' own.
         added_terms (frozenset of str): all ``loss_*`` keys of all regularizers applied.
 
     Raises:

@@ -16,7 +16,16 @@ from torchrl.objectives import LossModule
 _REGISTRIES = frozenset(vars(nn.Module()))
 
 
-class SpecializedLoss(LossModule):
+class _WithoutCopies(type(LossModule)):  # type: ignore[misc]
+    """TorchRL's metaclass gives every class a forward of its own, which would hide the loss's."""
+
+    def __init__(cls, name: str, bases: tuple[type, ...], namespace: dict[str, Any]) -> None:
+        super().__init__(name, bases, namespace)
+        if "forward" not in namespace:
+            del cls.forward
+
+
+class SpecializedLoss(LossModule, metaclass=_WithoutCopies):
     """A loss made of another loss, as an object of a subclass of its class.
 
     ``Extension(loss, ...)``, with ``Extension`` a subclass of this one, returns an instance of
@@ -86,10 +95,6 @@ class SpecializedLoss(LossModule):
         # A class made here has no name that can be imported; the classes that it is made of have.
         parts = vars(type(self)).get("_parts", (type(self),))
         return (_make_empty, parts, *super().__reduce_ex__(protocol)[2:])
-
-
-# TorchRL's metaclass gives every class a forward of its own; here it would hide the loss's.
-del SpecializedLoss.forward
 
 
 @functools.cache

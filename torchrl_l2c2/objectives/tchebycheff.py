@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import torch
 from tensordict import TensorDictBase
@@ -34,8 +34,9 @@ class TchebycheffLoss(SpecializedLoss):
     all terms has the gradient of :math:`g`; terms of values stay as they are. ``tchebycheff`` is
     :math:`g` and ``tchebycheff_share`` is :math:`p_2`, for the log.
 
-    It goes around the last regularizer. Loops that call ``policy_regularizer`` themselves, without
-    ``forward``, take the shares from :func:`tchebycheff_shares`.
+    It goes around the last regularizer: the terms of one around it are added as they are. Loops
+    that call ``policy_regularizer`` themselves, without ``forward``, take the shares from
+    :func:`tchebycheff_shares`.
 
     .. note:: The loss of an actor has no natural zero: that of SAC or TD3 is minus a value, so that
         :math:`z_1` has to be about minus the largest value that can be hoped for, and that of PPO
@@ -52,8 +53,8 @@ class TchebycheffLoss(SpecializedLoss):
             :math:`z_1` train the regularizers more. Defaults to ``(0.0, 0.0)``.
 
     Keyword Args:
-        objectives (iterable of str): names of the terms that are :math:`f_1`; those that the loss
-            does not have are passed over. Defaults to ``OBJECTIVES``.
+        objectives (str or iterable of str): names of the terms that are :math:`f_1`; those that
+            the loss does not have are passed over. Defaults to ``OBJECTIVES``.
 
     Raises:
         TypeError: the loss has no regularizer with a term of the policy, or an argument has the
@@ -81,9 +82,13 @@ class TchebycheffLoss(SpecializedLoss):
         mu: float = 1.0,
         ideal: tuple[float, float] = (0.0, 0.0),
         *,
-        objectives: Iterable[str] = OBJECTIVES,
+        objectives: str | Iterable[str] = OBJECTIVES,
     ) -> None:
         check_real("mu", mu, above=0)
+        if not isinstance(ideal, Sequence) or len(ideal) != 2:
+            raise TypeError(
+                f"ideal must be two numbers, of the loss and of the regularizers, got {ideal!r}."
+            )
         for place, value in enumerate(ideal):
             check_real(f"ideal[{place}]", value)
         none: frozenset[str] = frozenset()
@@ -93,7 +98,7 @@ class TchebycheffLoss(SpecializedLoss):
                 f"TchebycheffLoss weighs a regularizer of the policy against the loss, and "
                 f"{type(base_loss).__name__} has none: put L2C2Loss or another around it first."
             )
-        names = list(objectives)
+        names = [objectives] if isinstance(objectives, str) else list(objectives)
         own = [key for key in self.out_keys if key in names]
         if not own:
             raise ValueError(
