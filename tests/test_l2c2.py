@@ -443,7 +443,7 @@ class TestNeighbors:
         loss = linear_loss(neighbor_key="near")
         batch = linear_batch().rename_key_("neighbor", "near")
         assert loss.policy_regularizer(batch)["l2c2_distance"].item() == pytest.approx(1.0)
-        with pytest.raises(KeyError, match="'near' is a tensor .* another neighbor_key"):
+        with pytest.raises(KeyError, match=r"'near' is a tensor .* another neighbor_key"):
             loss.policy_regularizer(linear_batch().set("near", torch.zeros(2, 3)))
 
 
