@@ -20,7 +20,7 @@ distances transforms modules updaters optim.adaterm metrics.actions
 policy_distances
 optim.__init__ metrics.policy metrics.spectrum
 metrics.__init__
-objectives.precision
+objectives.precision objectives.mixin
 objectives.specialization objectives.wiring objectives.shared_evaluation
 objectives.declarations objectives.evaluation
 objectives.transitions objectives.relative_pearson

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
 from torchrl_l2c2._checks import as_number, check_real
-
-if TYPE_CHECKING:
-    from torchrl.objectives import LossModule as Base
-else:  # Every class of a LossModule gets a forward of its own, which would hide the loss's.
-    from torch.nn import Module as Base
+from torchrl_l2c2.objectives.mixin import LossMixin
 
 
-class DeclaredTerms(Base):
+class DeclaredTerms(LossMixin):
     """Knows which of a loss's terms were added to it, and the gains that scale these.
 
     Attributes:

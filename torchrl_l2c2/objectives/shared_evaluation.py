@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from tensordict import TensorDictBase
-from torchrl.objectives import LossModule
+
+from torchrl_l2c2.objectives.mixin import LossMixin
 
 
-class SharedEvaluation(LossModule):
+class SharedEvaluation(LossMixin):
     """A loss that evaluates its networks at the batch's states through one method.
 
     A loss that inherits from this class, and evaluates its networks with
@@ -45,7 +46,3 @@ class SharedEvaluation(LossModule):
             ``get_dist_params`` returns.
         """
         raise NotImplementedError
-
-
-# TorchRL's metaclass gives every class a forward of its own; here it would hide the loss's.
-del SharedEvaluation.forward

@@ -12,20 +12,13 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.objectives import LossModule
 
+from torchrl_l2c2.objectives.mixin import LossMixin
+
 # What nn.Module itself keeps: dictionaries that two losses must not share.
 _REGISTRIES = frozenset(vars(nn.Module()))
 
 
-class _WithoutCopies(type(LossModule)):  # type: ignore[misc]
-    """TorchRL's metaclass gives every class a forward of its own, which would hide the loss's."""
-
-    def __init__(cls, name: str, bases: tuple[type, ...], namespace: dict[str, Any]) -> None:
-        super().__init__(name, bases, namespace)
-        if "forward" not in namespace:
-            del cls.forward
-
-
-class SpecializedLoss(LossModule, metaclass=_WithoutCopies):
+class SpecializedLoss(LossMixin):
     """A loss made of another loss, as an object of a subclass of its class.
 
     ``Extension(loss, ...)``, with ``Extension`` a subclass of this one, returns an instance of
