@@ -43,7 +43,6 @@ def settings_of():
         ("seed=1.5", "seed must be a valid integer, got 1.5."),
         ("threads=0", "threads must be greater than or equal to 1, got 0."),
         ("num_workers=0", "num_workers must be greater than or equal to 1, got 0."),
-        ("num_workers=4", "task.episodes must be a multiple of num_workers=4"),
         ("num_workers=2 algorithm.schedule=step", "num_workers must be 1 with algorithm.schedule"),
         ("compile=maybe", "compile must be a valid boolean, got 'maybe'."),
         ("on_nonfinite=continue", "on_nonfinite must be 'stop' or 'skip', got 'continue'."),

@@ -101,8 +101,9 @@ class ExperimentConfig:
     num_workers: int = Field(
         default=1,
         ge=1,
-        description="processes that play episodes, one each in a round with one policy; more than "
-        "1 needs algorithm.schedule other than step",
+        description="processes that play episodes, one each in a round with one policy, the last "
+        "round whole: 4 play 352 episodes where 350 are asked for; more than 1 needs "
+        "algorithm.schedule other than step",
     )
     workers: Literal["processes", "ray"] = Field(
         default="processes",
@@ -244,7 +245,7 @@ class ExperimentConfig:
 
     def _check_rounds(self) -> None:
         """Several workers play whole episodes, and all of them as many."""
-        workers, episodes = self.num_workers, self.task.episodes
+        workers = self.num_workers
         if workers == 1 and self.workers != "processes":
             raise SettingError(
                 "num_workers",
@@ -261,12 +262,6 @@ class ExperimentConfig:
                 "num_workers",
                 f"must be 1 with algorithm.schedule=step, which updates after every frame, got "
                 f"{workers}: use algorithm.schedule=episode, or one worker.",
-            )
-        if episodes % workers and self.task.frames is None:
-            raise SettingError(
-                "task.episodes",
-                f"must be a multiple of num_workers={workers}, which play one each in a round, got "
-                f"{episodes}: use {episodes - episodes % workers or workers}, for example.",
             )
 
 
