@@ -35,7 +35,12 @@ from torchrl_l2c2.experiment.reports.comparison import statistics_tables
 from torchrl_l2c2.experiment.reports.differences import differences, fingerprint
 from torchrl_l2c2.experiment.reports.faster_targets import faster_targets_table
 from torchrl_l2c2.experiment.reports.field import BETTER, field_table
-from torchrl_l2c2.experiment.reports.groups import baseline_of, group_records, over_tasks
+from torchrl_l2c2.experiment.reports.groups import (
+    baseline_of,
+    comparable,
+    group_records,
+    over_tasks,
+)
 from torchrl_l2c2.experiment.reports.measures import measures_table
 from torchrl_l2c2.experiment.reports.pairwise import pairwise_tables
 from torchrl_l2c2.experiment.reports.paper import TAU
@@ -197,6 +202,23 @@ class TestPaperTable:
         assert deployed_table(groups).markdown() in results_text(records)
         untested = [replace(record, **dict.fromkeys(figures, math.nan)) for record in records]
         assert deployed_table(group_records(untested)) is None
+
+    def test_the_last_rows_are_the_means_over_tasks(self, records):
+        """Of 1 on Swingup, and of a half on Reacher, where returns are vanilla's own."""
+        vanilla = {(r.task, r.seed): r.late_sampled_return for r in records if r.method == "none"}
+        equal = [
+            replace(r, late_sampled_return=vanilla[r.task, r.seed])
+            if (r.task, r.method) == ("reacher", "l2c2")
+            else r
+            for r in records
+        ]
+        table = paper_table(group_records(equal))
+        better, smoother = map(table.columns.index, ("P(larger return)", "P(smoother)"))
+        (row,) = (row for row in table.rows if row[:2] == ["2 tasks", "L2C2"])
+        assert (row[better].split()[0], row[smoother].split()[0]) == ("0.75", "1.00")
+        assert not any(cell for i, cell in enumerate(row[2:], 2) if i not in (better, smoother))
+        of_mean = [row for row in deployed_table(group_records(equal)).rows if row[1] == "L2C2"]
+        assert (of_mean[-1][0], of_mean[-1][5].split()[0]) == ("2 tasks", "1.00")
 
 
 class TestFasterTargets:
@@ -372,6 +394,28 @@ class TestGroups:
             "13.00 (0.79)",
             "1.00 (0.79)",
         ]
+
+    def test_what_differs_in_the_regularizer_alone_is_together(self, records):
+        """Other settings set groups apart; the names leave out what all have in common."""
+        swingup = [r for r in records if r.task == "swingup"]
+        mean = [
+            replace(
+                r,
+                settings=f"m{r.settings}",
+                differences=f"algorithm.reduction=mean {r.differences}",
+            )
+            for r in swingup
+        ]
+        groups, names = group_records([*records, *mean]), list(METHODS)
+        assert [(told, [g.name for g in found]) for told, found in comparable(groups)] == [
+            ("", names),
+            ("reduction=mean", names),
+            ("", names),
+        ]
+        # Nothing would be left to compare the settings of one method with.
+        sweep = group_records(r for r in (*swingup, *mean) if r.method == "none")
+        assert [(told, len(found)) for told, found in comparable(sweep)] == [("", 2)]
+        assert [group.name for group in sweep] == ["vanilla", "vanilla, reduction=mean"]
 
     def test_one_run_in_one_line(self, records):
         """Everything that is kept of it."""
@@ -941,7 +985,7 @@ class TestReport:
         file = str(tmp_path / "runs.csv")
         main([str(forty), "--csv", file])
         tables, _, _ = capsys.readouterr().out.partition("\n\nrecords: ")
-        assert tables.count("\n| ") == 30
+        assert tables.count("\n| ") == 33
         main(["--from", file])
         assert capsys.readouterr().out.strip() == tables
         main(["--from", file, "--score"])

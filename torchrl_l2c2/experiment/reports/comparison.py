@@ -71,6 +71,35 @@ def improvement(
     return Estimate.of(probability_of_improvement, *matrices)
 
 
+def improvements_over_tasks(
+    groups: Sequence[Group], figure: str
+) -> list[tuple[str, str, list[Group], list[str]]]:
+    """Of methods that several tasks have: probabilities, unlike means, need no common scale.
+
+    Args:
+        groups (sequence of Group): of several tasks.
+        figure (str): one of ``FIGURES``.
+
+    Returns:
+        list: the algorithm, the method, its group of each task, and of each of ``QUANTITIES`` how
+        probable it is that a run is better than one of vanilla, the mean over these tasks, with
+        its interval.
+    """
+    vanilla = {
+        group: baseline
+        for group in groups
+        if (baseline := baseline_of(group, groups)) is not None
+        and all(len(side.scores(figure, "return")) for side in (group, baseline))
+    }
+    found = []
+    for algorithm, name, ours in over_tasks(vanilla):
+        if len(ours) > 1:
+            theirs = [vanilla[group] for group in ours]
+            better = [probability(improvement(ours, theirs, figure, q)) for q in QUANTITIES]
+            found.append((algorithm, name, ours, better))
+    return found
+
+
 def statistics_tables(groups: Sequence[Group]) -> list[Table]:
     """Interquartile means and probabilities of improvement, a table for each figure there is."""
     known = [f for f in FIGURES if any(len(group.scores(f, "return")) for group in groups)]
@@ -106,19 +135,8 @@ def _statistics_row(figure: str, group: Group, baseline: Group | None) -> list[s
 
 
 def _across_tasks(figure: str, groups: Sequence[Group]) -> list[list[str]]:
-    """Rows over all tasks, of methods that several have: probabilities need no common scale."""
-    vanilla = {
-        group: baseline
-        for group in groups
-        if (baseline := baseline_of(group, groups)) is not None
-        and all(len(side.scores(figure, "return")) for side in (group, baseline))
-    }
     rows = []
-    for algorithm, name, ours in over_tasks(vanilla):
-        if len(ours) < 2:
-            continue
-        theirs = [vanilla[group] for group in ours]
-        better = [probability(improvement(ours, theirs, figure, q)) for q in QUANTITIES]
+    for algorithm, name, ours, better in improvements_over_tasks(groups, figure):
         runs = number_range(sorted({len(group.scores(figure, "return")) for group in ours}))
         rows.append([f"{len(ours)} tasks", algorithm, name, runs, "", better[0], "", better[1]])
     return rows

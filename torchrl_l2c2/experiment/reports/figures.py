@@ -14,7 +14,7 @@ from torchrl_l2c2.experiment.folder import write_atomically
 from torchrl_l2c2.experiment.reports.comparison import Estimate
 from torchrl_l2c2.experiment.reports.field import MEASURES, published_of
 from torchrl_l2c2.experiment.reports.front import means, pareto_front
-from torchrl_l2c2.experiment.reports.groups import Group, group_records
+from torchrl_l2c2.experiment.reports.groups import Group, comparable, group_records
 from torchrl_l2c2.experiment.reports.paper import METHODS
 from torchrl_l2c2.experiment.reports.records import FIGURES, digest
 from torchrl_l2c2.experiment.reports.runs import FinishedRun
@@ -69,22 +69,30 @@ def draw_plane(
     for what was published: of the paper with its standard deviation, dotted.
 
     Args:
-        groups (sequence of Group): a panel is drawn for each task and algorithm.
+        groups (sequence of Group): a panel is drawn for each task and algorithm, and for groups of
+            one that differ in more than the regularizer, as :func:`~.groups.comparable` has it.
         figure (str): one of ``FIGURES``, such as ``"late_mean"``.
         path (str or Path): of the file; its ending, ``.png`` or ``.svg``, decides what it is.
         measure (str): ``"action_variation"``, as the paper has it, or ``"sm_asap"``, as the
             published table of the field's tasks does.
     """
-    panels = list(dict.fromkeys((group.first.task, group.first.algorithm) for group in groups))
+    panels = comparable(groups)
     across = min(4, len(panels))
     down = -(-len(panels) // across)
     picture, axes = subplots(across, down, (max(3.4 * across, 5.4), 3.2 * down + 0.6))
-    for axis, (task, algorithm) in zip(axes, panels, strict=False):
-        together = [g for g in groups if (g.first.task, g.first.algorithm) == (task, algorithm)]
+    first_of: dict[tuple[str, str], Any] = {}
+    for axis, (settings, together) in zip(axes, panels, strict=False):
+        of = together[0].first
+        # What is told apart by settings is on one scale, of all that is drawn on it.
+        first = first_of.setdefault((of.task, of.algorithm), axis)
+        if axis is not first:
+            axis.sharex(first)
+            axis.sharey(first)
         looks = styles(together)
         for group in together:
             _draw_point(axis, group, figure, measure, looks[group.name])
-        axis.set_title(f"{task}, {algorithm}", fontsize=10)
+        title = f"{of.task}, {of.algorithm}"
+        axis.set_title(f"{title}\n{settings}" if settings else title, fontsize=10)
         axis.set_xlabel(MEASURES[measure])
         axis.set_ylabel("return")
     for axis in axes[len(panels) :]:

@@ -123,15 +123,44 @@ def _one_of_each(groups: Sequence[Group]) -> dict[Settings, list[Group]]:
 
 
 def _row_name(method: str, settings: Settings) -> str:
+    return ", ".join([method_name(method), *_told_settings(settings)])
+
+
+def _told_settings(settings: Settings) -> list[str]:
     keys = {key for key, _ in settings}
-    return ", ".join(
-        [method_name(method)]
-        + [
-            value if key in (LENGTH, CODE) else f"{_shortest(key, keys)}={value}"
-            for key, value in settings
-            if value is not None
-        ]
-    )
+    return [
+        value if key in (LENGTH, CODE) else f"{_shortest(key, keys)}={value}"
+        for key, value in settings
+        if value is not None
+    ]
+
+
+def comparable(groups: Iterable[Group]) -> list[tuple[str, list[Group]]]:
+    """Groups that differ in the regularizer alone, together, and what sets them apart from others.
+
+    All of a task and an algorithm are together where no two of them are so: a sweep over other
+    settings is compared for these.
+
+    Returns:
+        list: what sets them apart, such as ``"reduction=mean, 300 episodes"``, empty where there
+        are no others; and the groups, whose names no longer say it.
+    """
+    tasks: dict[tuple[str, str], dict[tuple[Any, ...], list[Group]]] = {}
+    for group in groups:
+        readings = tasks.setdefault((group.first.task, group.first.algorithm), {})
+        readings.setdefault(group.reading, []).append(group)
+    found = []
+    for together in map(list, (readings.values() for readings in tasks.values())):
+        if len(together) == 1 or max(map(len, together)) == 1:
+            found.append(("", [group for members in together for group in members]))
+            continue
+        others = [_others(members[0]) for members in together]
+        keys = sorted({key for one in others for key in one})
+        apart = [key for key in keys if len({one.get(key) for one in others}) > 1]
+        for own, members in zip(others, together, strict=True):
+            told = _told_settings(tuple((key, own.get(key)) for key in apart))
+            found.append((", ".join(told), _named(members)))
+    return found
 
 
 def differing_lengths(groups: Sequence[Group]) -> list[str]:

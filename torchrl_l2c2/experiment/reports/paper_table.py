@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from torchrl_l2c2.experiment.reports.comparison import improvement, probability
+from torchrl_l2c2.experiment.reports.comparison import (
+    improvement,
+    improvements_over_tasks,
+    probability,
+)
 from torchrl_l2c2.experiment.reports.groups import Group, baseline_of
 from torchrl_l2c2.experiment.reports.paper import Published, is_of_paper
 from torchrl_l2c2.experiment.reports.records import QUANTITIES
@@ -16,13 +20,14 @@ LEGEND = (
     "smoother. The first column of each is of the late policies, training's own episodes of its "
     "last tenth, marked † where it lies further from the paper's than the paper's deviation, and P "
     "of the same: how probable it is that a run is better than one of vanilla "
-    "with the same other settings, ties halved, with the 95% interval of the stratified bootstrap. "
+    "with the same other settings, ties halved, with the 95% interval of the stratified bootstrap; "
+    "of several tasks it is the mean of theirs. "
     "The policy scale is that of the late policies; the Hellinger distance is relative to it, so "
     "that a wider policy may change more."
 )
 DEPLOYED_LEGEND = (
     "The same runs with mean actions, as a policy is used once it is trained: late policies, a "
-    "test episode of each, and 100 of the last policy. P is of late policies, as above."
+    "test episode of each, and 100 of the last policy. P is of late policies."
 )
 # Late policies in the first column, as they are steadier than the paper's test of the last one.
 FIRST, SECOND = "late_sampled", "last_sampled"
@@ -43,11 +48,10 @@ def paper_table(groups: Sequence[Group]) -> Table | None:
     for name, better in zip(QUANTITIES.values(), BETTER, strict=True):
         columns += [name, "the paper's", "last policy", better]
     columns += ["policy scale"]
-    rows = [
-        _row(group, baseline_of(group, groups))
-        for group in groups
-        if is_of_paper(group.first.task, group.first.algorithm)
-    ]
+    groups = _of_paper(groups)
+    rows = [_row(group, baseline_of(group, groups)) for group in groups]
+    for tasks, name, (returns, smoother) in _over_tasks(groups, FIRST):
+        rows.append([tasks, name, "", *("", "", "", returns), *("", "", "", smoother), ""])
     return Table("Beside the paper's table", columns, rows, [LEGEND]) if rows else None
 
 
@@ -63,13 +67,22 @@ def deployed_table(groups: Sequence[Group]) -> Table | None:
     columns = ["task", "method", "seeds"]
     for name, better in zip(QUANTITIES.values(), BETTER, strict=True):
         columns += [name, "last policy", better]
-    rows = [
-        _deployed_row(group, baseline_of(group, groups))
-        for group in groups
-        if is_of_paper(group.first.task, group.first.algorithm)
-        and len(group.scores(DEPLOYED[0], "return"))
-    ]
+    groups = [g for g in _of_paper(groups) if len(g.scores(DEPLOYED[0], "return"))]
+    rows = [_deployed_row(group, baseline_of(group, groups)) for group in groups]
+    for tasks, name, (returns, smoother) in _over_tasks(groups, DEPLOYED[0]):
+        rows.append([tasks, name, "", *("", "", returns), *("", "", smoother)])
     return Table("As deployed", columns, rows, [DEPLOYED_LEGEND]) if rows else None
+
+
+def _of_paper(groups: Sequence[Group]) -> list[Group]:
+    return [g for g in groups if is_of_paper(g.first.task, g.first.algorithm)]
+
+
+def _over_tasks(groups: Sequence[Group], figure: str) -> list[tuple[str, str, list[str]]]:
+    return [
+        (f"{len(ours)} tasks", name, better)
+        for _, name, ours, better in improvements_over_tasks(groups, figure)
+    ]
 
 
 def _deployed_row(group: Group, vanilla: Group | None) -> list[str]:
