@@ -15,10 +15,10 @@ MODULES = {
 # From the bottom up: a module imports from lines above its own alone.
 LAYERS = """
 _version _checks
-neighborhood affinities gains
-distances transforms modules updaters optim.adaterm metrics.actions
+neighborhood affinities gains transforms.random
+distances transforms.neighbors transforms.noise modules updaters optim.adaterm metrics.actions
 policy_distances
-optim.__init__ metrics.policy metrics.spectrum
+transforms.__init__ optim.__init__ metrics.policy metrics.spectrum
 metrics.__init__
 objectives.precision objectives.mixin
 objectives.specialization objectives.wiring objectives.shared_evaluation

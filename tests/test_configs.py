@@ -25,7 +25,9 @@ from torchrl.trainers.algorithms import SACTrainer
 
 from torchrl_l2c2 import (
     AdaTerm,
+    ASAPLoss,
     CAPSLoss,
+    GradCAPSLoss,
     L2C2Loss,
     Neighborhood,
     NeighborTransform,
@@ -41,6 +43,8 @@ OURS = {
     ("loss", "l2c2"): trainers.L2C2LossConfig,
     ("loss", "caps"): trainers.CAPSLossConfig,
     ("loss", "cats"): trainers.CATSLossConfig,
+    ("loss", "grad_caps"): trainers.GradCAPSLossConfig,
+    ("loss", "asap"): trainers.ASAPLossConfig,
     ("loss", "sr2l"): trainers.SR2LLossConfig,
     ("loss", "lcp"): trainers.LCPLossConfig,
     ("loss", "ppo_rpe"): trainers.PPORPELossConfig,
@@ -184,6 +188,15 @@ def test_caps_over_sac_composes():
     loss = instantiate(cfg.loss)
     assert isinstance(loss, CAPSLoss) and isinstance(loss, SACLoss)
     assert (loss.caps_sigma, loss.caps_mean) == (0.3, "action")
+
+
+@pytest.mark.parametrize(("name", "loss_class"), [("grad_caps", GradCAPSLoss), ("asap", ASAPLoss)])
+def test_what_reads_frames_reads_nested_keys(name, loss_class):
+    """With the settings given, over SAC."""
+    settings = ["loss.frames_key=[stack,frames]", "loss.epsilon=0.3"]
+    loss = instantiate(with_networks(composed(f"+loss={name}", *SAC, *settings)).loss)
+    assert isinstance(loss, loss_class) and isinstance(loss, SACLoss)
+    assert ("stack", "frames") in loss.in_keys and loss.grad_caps_epsilon == 0.3
 
 
 def test_ppo_rpe_instantiates():

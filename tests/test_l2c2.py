@@ -694,6 +694,12 @@ class TestPolicyDistances:
         with pytest.raises(TypeError, match=r"a deterministic policy.*its default"):
             L2C2Loss(base, policy_distance=distance)
 
+    def test_of_deterministic_policies_nothing_is_drawn(self):
+        """Samples would change nothing, and are refused."""
+        base = DDPGLoss(deterministic_actor(), qvalue())
+        with pytest.raises(TypeError, match=r"nothing is drawn, got hellinger_samples=8"):
+            L2C2Loss(base, hellinger_samples=8)
+
     @pytest.mark.parametrize("distance", ["mean", "kl"])
     def test_they_compile_into_one_graph(self, distance):
         """With the eager numbers, squashed policies included."""

@@ -160,6 +160,19 @@ def test_masked_transitions_have_no_part_in_anything(importance, threshold):
         torch.testing.assert_close(found[1][key], expected, msg=key)
 
 
+@pytest.mark.parametrize("importance", ["max", "mean"])
+def test_a_batch_that_is_masked_as_a_whole_trains_nothing(importance):
+    """Its weights have no largest: the gradient was NaN behind a loss of 0."""
+    loss = make_loss(importance=importance)
+    batch = make_batch(loss, [1.5, 0.7], [0.3, -2.0])
+    batch["priority_weight"] = torch.tensor([2.0, 1.0])
+    batch["collector", "mask"] = torch.zeros(2, dtype=torch.bool)
+    terms = loss(batch)
+    sum(terms[key] for key in ("loss_actor", "loss_critic")).backward()
+    gradients = [p.grad for p in loss.parameters() if p.grad is not None]
+    assert gradients and all(not gradient.any() for gradient in gradients)
+
+
 def test_a_likelihood_of_each_action_is_no_likelihood():
     """Of one action it is the same in another shape; of several it is refused, with what to do."""
     base, found = make_loss(), []

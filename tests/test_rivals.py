@@ -11,8 +11,10 @@ import torch
 from losses import (
     CASES,
     action_values,
+    agents_batch,
     deterministic_actor,
     gaussian_actor,
+    make_mappo,
     on_policy,
     qvalue,
     transitions,
@@ -104,7 +106,7 @@ class TestCATS:
         loss = CATSLoss(linear_base(), 0.3)
         found = loss.policy_regularizer(batch)["loss_cats"]
         assert found.item() == pytest.approx(0.3 * (1.0 + (1.5**2 + 2.0**2)) / 2)
-        loss.cats_lambda = 0.6
+        loss.cats_lambda_temporal = 0.6
         assert loss.policy_regularizer(batch)["loss_cats"].item() == pytest.approx(2 * found.item())
 
     def test_it_is_twice_the_temporal_term_of_caps(self):
@@ -407,6 +409,31 @@ class TestLCP:
                 parameter[0, 0] -= shift
         assert found[0, 0].item() == pytest.approx((values[0] - values[1]) / 2e-5, rel=1e-6)
 
+    def test_agents_are_as_the_rows_of_a_batch(self):
+        """The same networks at the same states: a team's term is the mean over its agents."""
+        torch.manual_seed(0)
+        team, batch = make_mappo(), agents_batch(4)
+        single = PPOLoss(gaussian_actor(), None)
+        single.actor_network_params.update_(team.actor_network_params)
+        rows = batch["agents"].flatten(0, 1)
+        expected = LCPLoss(single, 1.0).policy_regularizer(rows)["loss_lcp"]
+        found = LCPLoss(team, 1.0).policy_regularizer(batch)["loss_lcp"]
+        torch.testing.assert_close(found, expected)
+
+    @pytest.mark.parametrize(
+        ("regularizer", "passes"),
+        [(LCPLoss, 1), (lambda base: SR2LLoss(base, steps=3), 1 + 3 + 1)],
+    )
+    def test_the_policy_is_evaluated_where_it_is_needed(self, regularizer, passes):
+        """Of LCP at the states; of SR2L there once, at each step of the search, and at its end."""
+        rows = []
+        base = PPOLoss(gaussian_actor(), None)
+        loss, batch = regularizer(base), transitions(8)
+        net = loss.actor_network.module[0].module
+        net.register_forward_hook(lambda *of: rows.append(of[1][0].shape[:-1].numel()))
+        loss.policy_regularizer(batch)
+        assert rows == [8] * passes
+
     def test_a_deterministic_policy_is_refused(self):
         """With the regularizers that take it."""
         with pytest.raises(TypeError, match=r"DDPGLoss has no likelihood. CAPSLoss, CATSLoss"):
@@ -414,11 +441,11 @@ class TestLCP:
 
 
 RIVALS = {
-    "cats": (lambda base: CATSLoss(base), "loss_cats", "cats_lambda"),
+    "cats": (lambda base: CATSLoss(base), "loss_cats", "cats_lambda_temporal"),
     "grad_caps": (
         lambda base: GradCAPSLoss(base, previous_key="before"),
         "loss_grad_caps",
-        "grad_caps_lambda",
+        "grad_caps_lambda_temporal",
     ),
     "sr2l": (lambda base: SR2LLoss(base, steps=2), "loss_sr2l", "sr2l_coeff"),
     "lcp": (lambda base: LCPLoss(base), "loss_lcp", "lcp_coeff"),
@@ -563,7 +590,7 @@ def test_cats_compiles_into_one_graph():
     loss, batch = CATSLoss(DDPGLoss(deterministic_actor(), qvalue())), transitions(4)
     compiled = torch.compile(loss.policy_regularizer, fullgraph=True, backend="eager")
     for gain in (0.1, 0.2):
-        loss.cats_lambda = gain
+        loss.cats_lambda_temporal = gain
         expected = loss.policy_regularizer(batch)["loss_cats"]
         torch.testing.assert_close(compiled(batch)["loss_cats"], expected)
 
@@ -592,7 +619,7 @@ def test_they_run(regularizer):
     assert math.isfinite(second[term])
     if regularizer.name == "cats":
         assert (first["gain"], second["gain"]) == (0.0, 0.5)
-        assert run.agent.loss.cats_lambda.item() == pytest.approx(0.1)
+        assert run.agent.loss.cats_lambda_temporal.item() == pytest.approx(0.1)
 
 
 def test_the_predictor_of_asap_is_trained_and_continued(tmp_path):

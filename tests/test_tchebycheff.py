@@ -97,7 +97,7 @@ class TestAroundALoss:
         loss, batch = TchebycheffLoss(cats(), 0.5), transitions(8)
         shares = []
         for gain in (0.0, 1.0, 10.0, 1e4):
-            loss.cats_lambda = gain
+            loss.cats_lambda_temporal = gain
             shares.append(loss(batch.copy())["tchebycheff_share"].item())
         assert shares == sorted(shares) and shares[-1] == 1.0
         assert loss(batch.copy())["loss_actor"].item() == 0.0
@@ -139,6 +139,15 @@ class TestAroundALoss:
         for key in plain.keys():
             torch.testing.assert_close(found[key], plain[key])
         assert found["loss_cats"] > 0 and found["tchebycheff_share"] > 0
+
+    def test_keys_that_are_set_on_it_are_its_own(self):
+        """The loss that it was put around goes on reading what it did."""
+        inner, batch = L2C2Loss(DDPGLoss(deterministic_actor(), qvalue())), transitions(4)
+        torch.manual_seed(1)
+        expected = inner.value_regularizer(batch.copy())["loss_l2c2_value"]
+        TchebycheffLoss(inner, 0.2).set_keys(state_action_value="another")
+        torch.manual_seed(1)
+        assert inner.value_regularizer(batch.copy())["loss_l2c2_value"] == expected
 
     def test_a_network_of_the_regularizers_own_is_not_the_policys(self):
         """The predictor of ASAP is trained as it was, whatever the policy's share."""

@@ -104,6 +104,18 @@ def test_several_keys_are_one_state():
     assert stats.spearmanr(*(part.flatten() for part in parts)).pvalue > 1e-3
 
 
+def test_a_step_that_is_too_long_leaves_the_whole_state_where_it_is():
+    """Of several keys, whichever jumped; the diagnostics would have the others' moves."""
+    near = Neighborhood(max_step=1.0)
+    far, short = torch.tensor([[10.0], [0.5]]), torch.tensor([[[0.5]], [[0.5]]])
+    batch = TensorDict({"a": torch.zeros(2, 1), "b": torch.zeros(2, 1, 1)}, [2])
+    batch["next"] = TensorDict({"a": far, "b": short}, [2])
+    found = NeighborTransform(near, in_keys=["a", "b"], num_samples=3)(batch)["neighbor"]
+    assert found["distance"].isinf().all(-1).tolist() == [True, False]
+    assert found["b"].shape == (2, 3, 1, 1)
+    assert not found["a"][0].any() and not found["b"][0].any() and found["b"][1].any()
+
+
 def test_neighbors_of_episode_ends_are_finite():
     """A successor of NaN, as at some episode ends, has the state itself as neighbor."""
     data = transitions(4)

@@ -63,8 +63,8 @@ class SigmoidNormal(TanhNormal):
         \sigma(x) = \tfrac{1}{2} \big(1 + \tanh \tfrac{x}{2}\big)
 
     Takes what :class:`~torchrl.modules.TanhNormal` takes; its base distribution has half the
-    location and half the scale that were given. So distances of means, which are taken of that,
-    are half as large as those of the key ``loc``, which CAPS compares.
+    location and half the scale that were given. Distances of means are taken of that, and so are a
+    quarter of those of the key ``loc``.
 
     Examples:
         >>> import torch

@@ -53,8 +53,8 @@ class Neighborhood:
         max_step: the largest :math:`\lVert s' - s \rVert_2`, greater than 0, in the state's units;
             where a state is several entries, of each by itself, and one that is longer is enough.
             A transition with a longer one is a reset or a teleport, and counts nothing: its
-            neighbors are the state itself, at an infinite distance with a gain of 0. Defaults to
-            ``None``, no bound.
+            neighbors are the state itself, in all entries, at an infinite distance with a gain of
+            0. Defaults to ``None``, no bound.
 
     Raises:
         TypeError: if a value is not a real number, or ``shared`` is not a boolean.

@@ -96,15 +96,19 @@ def compare_policies(
     return squared_error(p, q)
 
 
-def distance_name(chosen: str | PolicyDistance, stochastic: bool) -> str:
+def distance_name(
+    chosen: str | PolicyDistance, stochastic: bool, hellinger_samples: int | None = None
+) -> str:
     """How the distance of :func:`choose_policy_distance` is called where it is logged.
 
     Args:
         chosen: as there.
         stochastic: whether the policies are distributions; otherwise their actions are compared.
+        hellinger_samples: as there.
 
     Raises:
-        TypeError: deterministic policies, and a distance that has no counterpart for actions.
+        TypeError: deterministic policies, and a distance that has no counterpart for actions, or
+            samples.
     """
     if stochastic:
         return _NAMES[chosen] if isinstance(chosen, str) else "policy_distance"
@@ -113,6 +117,11 @@ def distance_name(chosen: str | PolicyDistance, stochastic: bool) -> str:
             "the loss has a deterministic policy, which is no distribution to compare by "
             f"policy_distance={chosen!r}: leave it at its default, which then is half the squared "
             "distance of the actions."
+        )
+    if hellinger_samples is not None:
+        raise TypeError(
+            "the loss has a deterministic policy, of which nothing is drawn, got hellinger_samples="
+            f"{hellinger_samples!r}: leave it at None."
         )
     return "action_distance"
 

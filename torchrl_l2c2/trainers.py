@@ -25,8 +25,10 @@ from torchrl.trainers.algorithms.configs.transforms import TransformConfig
 
 from torchrl_l2c2.neighborhood import Neighborhood
 from torchrl_l2c2.objectives import (
+    ASAPLoss,
     CAPSLoss,
     CATSLoss,
+    GradCAPSLoss,
     L2C2Loss,
     LCPLoss,
     PPORPELoss,
@@ -46,6 +48,26 @@ def _make_l2c2_loss(
         moved_keys=_normalize_hydra_keys(moved_keys),
         **settings,
     )
+
+
+def _make_grad_caps_loss(
+    base_loss: LossModule, frames_key: Any, previous_key: Any, **settings: Any
+) -> GradCAPSLoss:
+    return _make_of_frames(GradCAPSLoss, base_loss, frames_key, previous_key, **settings)
+
+
+def _make_asap_loss(
+    base_loss: LossModule, frames_key: Any, previous_key: Any, **settings: Any
+) -> GradCAPSLoss:
+    return _make_of_frames(ASAPLoss, base_loss, frames_key, previous_key, **settings)
+
+
+def _make_of_frames(
+    kind: type[GradCAPSLoss], base_loss: LossModule, frames: Any, previous: Any, **settings: Any
+) -> GradCAPSLoss:
+    keys = {"frames_key": frames, "previous_key": previous}
+    named = {name: _normalize_hydra_key(key) for name, key in keys.items()}
+    return kind(base_loss, **named, **settings)
 
 
 def _make_neighbor_transform(
@@ -147,6 +169,8 @@ NeighborhoodConfig = _node(Neighborhood, ConfigBase)
 L2C2LossConfig = _node(L2C2Loss, LossConfig, builder=_make_l2c2_loss)
 CAPSLossConfig = _node(CAPSLoss, LossConfig)
 CATSLossConfig = _node(CATSLoss, LossConfig)
+GradCAPSLossConfig = _node(GradCAPSLoss, LossConfig, builder=_make_grad_caps_loss)
+ASAPLossConfig = _node(ASAPLoss, LossConfig, builder=_make_asap_loss)
 SR2LLossConfig = _node(SR2LLoss, LossConfig)
 LCPLossConfig = _node(LCPLoss, LossConfig)
 PPORPELossConfig = _node(PPORPELoss, LossConfig)
@@ -172,7 +196,8 @@ def register() -> None:
     group                  names
     ====================== ===================================
     ``loss``               ``l2c2``, ``caps``, ``cats``,
-                           ``sr2l``, ``lcp``, ``ppo_rpe``
+                           ``grad_caps``, ``asap``, ``sr2l``,
+                           ``lcp``, ``ppo_rpe``
     ``transform``          ``neighbor``, ``observation_noise``
     ``optimizer``          ``adaterm``
     ``target_net_updater`` ``tsoft``
@@ -204,6 +229,8 @@ def register() -> None:
     store.store(group="loss", name="l2c2", node=L2C2LossConfig)
     store.store(group="loss", name="caps", node=CAPSLossConfig)
     store.store(group="loss", name="cats", node=CATSLossConfig)
+    store.store(group="loss", name="grad_caps", node=GradCAPSLossConfig)
+    store.store(group="loss", name="asap", node=ASAPLossConfig)
     store.store(group="loss", name="sr2l", node=SR2LLossConfig)
     store.store(group="loss", name="lcp", node=LCPLossConfig)
     store.store(group="loss", name="ppo_rpe", node=PPORPELossConfig)

@@ -50,8 +50,8 @@ class ASAPLoss(GradCAPSLoss):
             follow the policy sooner, with optimizers that are not free of scale. Scheduled as
             ``asap_lambda_temporal``. Defaults to ``2.0``.
         lambda_grad (float): gain of Grad-CAPS's term, at least 0. Scheduled as
-            ``grad_caps_lambda``. Defaults to ``0.05``; the authors' for LunarLander and Pendulum
-            is ``0.005``.
+            ``grad_caps_lambda_temporal``. Defaults to ``0.05``; the authors' for LunarLander and
+            Pendulum is ``0.005``.
         epsilon (float): as for :class:`GradCAPSLoss`.
 
     Keyword Args:

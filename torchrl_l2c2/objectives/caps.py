@@ -88,13 +88,11 @@ class CAPSLoss(RegularizedLoss):
     ) -> None:
         check_choice("mean", mean, ("loc", "action"))
         check_real("sigma", sigma, above=0)
-        if not self.policy_networks():
-            raise TypeError(f"CAPSLoss needs a policy: {type(base_loss).__name__} has none.")
         self.caps_sigma = float(sigma)
         self.caps_mean = mean
         self.register_coefficient("caps_lambda_temporal", lambda_temporal)
         self.register_coefficient("caps_lambda_spatial", lambda_spatial)
-        self.declare_networks(self.policy_networks())
+        self.declare_policy()
         self.declare_terms(policy=["loss_caps_temporal", "loss_caps_spatial"])
 
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:

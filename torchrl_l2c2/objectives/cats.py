@@ -24,9 +24,10 @@ class CATSLoss(RegularizedLoss):
         \frac kK\, \lambda\, \mathbb E\left[\lVert \mu(s) - \mu(s') \rVert_2^2\right]
 
     as ``loss_cats``, in update :math:`k` of :math:`K`. The ramp is the caller's: assign
-    ``loss.cats_lambda = RampGain(0.1).step(progress)`` (:class:`torchrl_l2c2.gains.RampGain`), as
-    ``regularizer=cats`` does in a run. There is no spatial term: its authors bound it by twice the
-    temporal one. Gradients flow into the policy alone, through both states.
+    ``loss.cats_lambda_temporal = RampGain(0.1).step(progress)``
+    (:class:`torchrl_l2c2.gains.RampGain`), as ``regularizer=cats`` does in a run. There is no
+    spatial term: its authors bound it by twice the temporal one. Gradients flow into the policy
+    alone, through both states.
 
     [inferred] Which side of a squashing is compared and the value of :math:`\lambda` could not be
     read. Coordinates of the next observation that are not finite count as not having moved.
@@ -34,7 +35,7 @@ class CATSLoss(RegularizedLoss):
     Args:
         base_loss (LossModule): the loss; see :class:`RegularizedLoss` for how it is wrapped.
         lambda_temporal (float): :math:`\lambda k / K`, at least 0. Larger values slow the actions
-            down. Scheduled as ``cats_lambda``. Defaults to ``0.1``.
+            down. Scheduled as ``cats_lambda_temporal``. Defaults to ``0.1``.
 
     Keyword Args:
         mean (str): ``"loc"`` compares means before the squashing, ``"action"`` deterministic
@@ -67,11 +68,9 @@ class CATSLoss(RegularizedLoss):
         mean: Literal["loc", "action"] = "loc",
     ) -> None:
         check_choice("mean", mean, ("loc", "action"))
-        if not self.policy_networks():
-            raise TypeError(f"CATSLoss needs a policy: {type(base_loss).__name__} has none.")
         self.cats_mean = mean
-        self.register_coefficient("cats_lambda", lambda_temporal)
-        self.declare_networks(self.policy_networks())
+        self.register_coefficient("cats_lambda_temporal", lambda_temporal)
+        self.declare_policy()
         self.declare_terms(policy=["loss_cats"])
 
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -82,7 +81,7 @@ class CATSLoss(RegularizedLoss):
         squashed = self.cats_mean == "action"
         means = (policy_mean(p, squashed=squashed) for p in self.policies_at(tensordict, states))
         term = self.reduce_term(cats_term(*means).squeeze(0), tensordict)
-        return terms.set("loss_cats", self.cats_lambda * term)
+        return terms.set("loss_cats", self.cats_lambda_temporal * term)
 
 
 def cats_term(

@@ -76,9 +76,16 @@ class Evaluation:
         keys = actor.dist_params_keys if wiring.stochastic else [wiring.output]
         here, there = self._outputs_at(loss, POLICY_NETWORK, tensordict, states, keys, rows)
         here = here.expand(states.batch_size)
-        if wiring.stochastic:
-            return actor.build_dist_from_params(here), actor.build_dist_from_params(there)
-        return here.get(wiring.output), there.get(wiring.output)
+        return self._policy(loss, here), self._policy(loss, there)
+
+    def policy_at(
+        self, loss: LossModule, tensordict: TensorDictBase, states: TensorDictBase
+    ) -> Policy:
+        """The policy at other states alone, ``[K, *B]``, by a pass that nothing else shares."""
+        rows = self._rows(POLICY_NETWORK, tensordict, states, with_batch=False)
+        out = self._evaluate(loss, POLICY_NETWORK, rows)
+        (there,) = _split(out, 0, [len(states)], tensordict)
+        return self._policy(loss, there)
 
     def values_at(
         self,
@@ -128,6 +135,13 @@ class Evaluation:
             self.forward_pass.at_others[network] = states, there
         self.forward_pass.at_batch[network] = here
         return here
+
+    def _policy(self, loss: LossModule, outputs: TensorDictBase) -> Policy:
+        wiring = self.wiring[POLICY_NETWORK]
+        if not wiring.stochastic:
+            return outputs.get(wiring.output)
+        policy: Distribution = getattr(loss, POLICY_NETWORK).build_dist_from_params(outputs)
+        return policy
 
     def _fits_one_pass(self, network: str, tensordict: TensorDictBase) -> bool:
         wiring = self.wiring.get(network)

@@ -42,7 +42,7 @@ class GradCAPSLoss(RegularizedLoss):
         base_loss (LossModule): the loss; see :class:`RegularizedLoss` for how it is wrapped. Its
             policy reads one observation, a vector.
         lambda_temporal (float): :math:`\lambda`, at least 0. Larger values straighten the actions.
-            Scheduled as ``grad_caps_lambda``. Defaults to ``0.01``.
+            Scheduled as ``grad_caps_lambda_temporal``. Defaults to ``0.01``.
         epsilon (float): :math:`\epsilon`, greater than 0. Smaller values punish zigzags around one
             place more. Defaults to ``0.1``.
 
@@ -87,14 +87,10 @@ class GradCAPSLoss(RegularizedLoss):
     ) -> None:
         check_choice("mean", mean, ("loc", "action"))
         check_real("epsilon", epsilon, above=0)
-        if not self.policy_networks():
-            raise TypeError(
-                f"{self._parts[0].__name__} needs a policy: {type(base_loss).__name__} has none."
-            )
         self.grad_caps_epsilon, self.grad_caps_mean = float(epsilon), mean
         self.grad_caps_frames_key, self.grad_caps_previous_key = frames_key, previous_key
-        self.register_coefficient("grad_caps_lambda", lambda_temporal)
-        self.declare_networks(self.policy_networks())
+        self.register_coefficient("grad_caps_lambda_temporal", lambda_temporal)
+        self.declare_policy()
         self.declare_terms(policy=["loss_grad_caps"])
         self.declare_inputs([frames_key if previous_key is None else previous_key])
 
@@ -102,7 +98,7 @@ class GradCAPSLoss(RegularizedLoss):
         terms = super().policy_regularizer(tensordict)
         means = self.successive_means(tensordict)
         term = self.reduce_term(grad_caps_term(*means, self.grad_caps_epsilon), tensordict)
-        return terms.set("loss_grad_caps", self.grad_caps_lambda * term)
+        return terms.set("loss_grad_caps", self.grad_caps_lambda_temporal * term)
 
     def successive_means(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
         """The policy's means ``[*B, A]`` at the states before, the states and the next ones.

@@ -187,15 +187,15 @@ class L2C2Loss(RegularizedLoss):
         self.l2c2_hellinger_samples = hellinger_samples
         self.l2c2_neighbor_key = neighbor_key
         self._l2c2_compared = False
-        self._l2c2_policies = self.policy_networks()
-        self._l2c2_values = self.value_networks() if beta else []
+        policies, values = self.policy_networks(), self.value_networks() if beta else []
+        self._l2c2_policies, self._l2c2_values = policies, values
         self.register_coefficient("l2c2_coeff", coeff)
-        self.register_coefficient("l2c2_beta", beta, used=bool(self._l2c2_values))
-        _check_terms(type(base_loss).__name__, self._l2c2_policies, self._l2c2_values, beta)
-        self.declare_networks([*self._l2c2_policies, *self._l2c2_values])
-        policies, values = self._l2c2_policies, self._l2c2_values
-        for _ in policies:
-            name = distance_name(policy_distance, self.has_stochastic_policy())
+        self.register_coefficient("l2c2_beta", beta, used=bool(values))
+        _check_terms(type(base_loss).__name__, policies, values, beta)
+        self.declare_networks([*policies, *values])
+        if policies:
+            stochastic = self.has_stochastic_policy()
+            name = distance_name(policy_distance, stochastic, hellinger_samples)
             self._l2c2_policy_diagnostic = f"l2c2_{name}"
         self.declare_terms(
             policy=["loss_l2c2_actor" for _ in policies],

@@ -52,10 +52,8 @@ class LCPLoss(RegularizedLoss):
     """
 
     def __init__(self, base_loss: LossModule, coeff: float = 0.002) -> None:
-        if not self.policy_networks():
-            raise TypeError(f"LCPLoss needs a policy: {type(base_loss).__name__} has none.")
         self.register_coefficient("lcp_coeff", coeff)
-        self.declare_networks(self.policy_networks())
+        self.declare_policy()
         if not self.has_stochastic_policy():
             raise TypeError(
                 f"LCPLoss needs a stochastic policy: that of {type(base_loss).__name__} has no "
@@ -69,7 +67,7 @@ class LCPLoss(RegularizedLoss):
         with torch.enable_grad():
             states = {key: state.unsqueeze(0).requires_grad_() for key, state in read.items()}
             others = TensorDict(states, batch_size=[1, *tensordict.batch_size])
-            _, policy = self.policies_at(tensordict, others)
+            policy = self.policy_at(tensordict, others)
             assert isinstance(policy, Distribution)
             actions = tensordict.unsqueeze(0)
             if not isinstance(policy, CompositeDistribution):
@@ -84,7 +82,7 @@ def lcp_term(
     log_prob: Tensor,  # shape: [*B, ...]
     states: list[Tensor],  # shape: [*B, *F] each
     batch_dims: int,
-) -> Tensor:  # shape: [*B]
+) -> Tensor:  # shape: [*B] or, of agents with a state each, [*B, agents]
     r"""The gradient penalty of LCP, before its gain and its reduction.
 
     .. math::
@@ -108,5 +106,8 @@ def lcp_term(
     gradients = torch.autograd.grad(
         log_prob.sum(), states, create_graph=True, materialize_grads=True
     )
+    # Agents that have a state each are as the rows of a batch, and are not summed over either.
+    if all(state.shape[: log_prob.ndim] == log_prob.shape for state in states):
+        batch_dims = log_prob.ndim
     squares = [gradient.square().flatten(batch_dims).sum(-1) for gradient in gradients]
     return torch.stack(squares).sum(0)

@@ -32,7 +32,8 @@ class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
     ``Regularizer(loss, ...)`` returns an instance of ``Regularizer[type(loss)]``, a subclass of
     both classes that is made once for each pair. It is a full member of the loss's class: updaters,
     ``set_keys``, ``select_out_keys``, scheduled coefficients, ``deepcopy`` and checkpoints work as
-    before, and its ``state_dict`` has the keys of the plain loss's. It holds the networks,
+    before, and its ``state_dict`` has the keys of the plain loss's (but for networks of a
+    regularizer's own: :class:`ASAPLoss`). It holds the networks,
     parameters and buffers of ``loss`` themselves, not copies, and ``loss`` stays the plain loss.
     From then on, move or cast the regularized one.
 
@@ -153,6 +154,18 @@ class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
         """
         self._wire([*self._evaluation.wiring, *networks])
 
+    def declare_policy(self) -> None:
+        """Declares that the policy is evaluated.
+
+        Raises:
+            TypeError: the loss has none, or as :meth:`declare_networks`.
+        """
+        networks = self.policy_networks()
+        if not networks:
+            regularizer, *_, loss = (part.__name__ for part in self._parts)
+            raise TypeError(f"{regularizer} needs a policy: {loss} has none.")
+        self.declare_networks(networks)
+
     def declare_inputs(self, keys: Iterable[NestedKey]) -> None:
         """Declares entries of the batch that are read beside states and their successors."""
         self._inputs = (*self._inputs, *keys)
@@ -233,6 +246,21 @@ class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
             deterministic, actions ``[K, *B, A]``.
         """
         return self._evaluation.policies_at(self, tensordict, states, rows)
+
+    def policy_at(self, tensordict: TensorDictBase, states: TensorDictBase) -> Policy:
+        """The policy at other states alone.
+
+        Its gradients are free of every other evaluation's, so that they may be taken at once, as by
+        a search for states.
+
+        Args:
+            tensordict: the batch, ``[*B]``.
+            states: as for :meth:`policies_at`; the batch's own where these are given.
+
+        Returns:
+            A distribution ``[K, *B]`` or, where it is deterministic, actions ``[K, *B, A]``.
+        """
+        return self._evaluation.policy_at(self, tensordict, states)
 
     def values_at(
         self,

@@ -170,7 +170,9 @@ def importance_weight(
     if mask is None:
         return weight / (weight.max() if reading == "max" else weight.mean())
     kept = torch.where(mask, weight, 0.0)
-    return kept / (kept.max() if reading == "max" else kept.sum() / mask.sum().clamp_min(1))
+    divisor = kept.max() if reading == "max" else kept.sum() / mask.sum().clamp_min(1)
+    # Where nothing counts, 0 / 0 would be a gradient of NaN behind a loss of 0.
+    return kept / divisor.clamp_min(torch.finfo(kept.dtype).tiny)
 
 
 def of_each_transition(

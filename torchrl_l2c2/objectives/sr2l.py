@@ -12,6 +12,7 @@ from torch.distributions import Distribution
 from torchrl.objectives import LossModule
 
 from torchrl_l2c2._checks import check_positive_int, check_real
+from torchrl_l2c2.objectives.evaluation import Policy
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
 from torchrl_l2c2.policy_distances import (
     PolicyDistance,
@@ -39,8 +40,8 @@ class SR2LLoss(RegularizedLoss):
     through both states and not through the search.
 
     .. note:: ``torch.compile`` does not take it, as the search takes gradients of its own (the
-        experiment's updates are compiled otherwise, and are). It costs a forward and a backward
-        pass of the policy for each of its ``steps``.
+        experiment's updates are compiled otherwise, and are). It evaluates the policy at the
+        states, at each of its ``steps`` and at their end, and differentiates all of it.
 
     Args:
         base_loss (LossModule): the loss; see :class:`RegularizedLoss` for how it is wrapped.
@@ -89,11 +90,9 @@ class SR2LLoss(RegularizedLoss):
     ) -> None:
         check_real("epsilon", epsilon, above=0)
         check_positive_int("steps", steps)
-        if not self.policy_networks():
-            raise TypeError(f"SR2LLoss needs a policy: {type(base_loss).__name__} has none.")
         self.sr2l_epsilon, self.sr2l_steps = float(epsilon), steps
         self.register_coefficient("sr2l_coeff", coeff)
-        self.declare_networks(self.policy_networks())
+        self.declare_policy()
         if policy_distance == "jeffreys":
             self._sr2l_distance: PolicyDistance = jeffreys_divergence
         else:
@@ -105,11 +104,15 @@ class SR2LLoss(RegularizedLoss):
         terms = super().policy_regularizer(tensordict)
         states = self.policy_states(tensordict)
 
-        def distance(moved: States) -> Tensor:
-            batch = {key: state.unsqueeze(0) for key, state in moved.items()}
+        def policy_at(places: States) -> Policy:
+            batch = {key: place.unsqueeze(0) for key, place in places.items()}
             others = TensorDict(batch, batch_size=[1, *tensordict.batch_size])
-            policies = self.policies_at(tensordict, others)
-            return compare_policies(self._sr2l_distance, *policies).squeeze(0)
+            return self.policy_at(tensordict, others)
+
+        here = policy_at(states)
+
+        def distance(moved: States) -> Tensor:
+            return compare_policies(self._sr2l_distance, here, policy_at(moved)).squeeze(0)
 
         farthest = ascend(distance, states, self.sr2l_epsilon, self.sr2l_steps)
         term = self.reduce_term(distance(farthest), tensordict)

@@ -11,13 +11,13 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_l2c2._checks import check_real
-from torchrl_l2c2.objectives.specialization import SpecializedLoss
+from torchrl_l2c2.objectives.regularized import RegularizedLoss
 
 OBJECTIVES = ("loss_actor", "loss_objective", "loss_entropy")
 """The names under which TorchRL's losses return what trains their policy."""
 
 
-class TchebycheffLoss(SpecializedLoss):
+class TchebycheffLoss(RegularizedLoss):
     r"""A regularized loss whose policy is trained by a smooth maximum instead of a sum.
 
     With :math:`f_1` the sum of the loss's own terms that train the policy and :math:`f_2` that of
@@ -91,8 +91,7 @@ class TchebycheffLoss(SpecializedLoss):
             )
         for place, value in enumerate(ideal):
             check_real(f"ideal[{place}]", value)
-        none: frozenset[str] = frozenset()
-        added = getattr(self, "added_terms", none) & getattr(self, "policy_terms", none)
+        added = self.added_terms & self.policy_terms
         if not added:
             raise TypeError(
                 f"TchebycheffLoss weighs a regularizer of the policy against the loss, and "

@@ -228,7 +228,7 @@ class CATSPPO(RegularizedPPO):
         ValueError: likewise.
     """
 
-    coefficient = "cats_lambda"
+    coefficient = "cats_lambda_temporal"
 
     def regularize(self, networks: ActorCriticLoss, **options: Any) -> tuple[RegularizedLoss, None]:
         return CATSLoss(networks, **options), None

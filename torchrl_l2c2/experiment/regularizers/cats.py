@@ -34,4 +34,4 @@ class CATSConfig(GainConfig):
         return CATSLoss(loss, self.lambda_temporal, mean=self.mean)
 
     def set_gains(self, loss: LossModule, policy: float, value: float) -> None:
-        loss.cats_lambda = policy * self.lambda_temporal
+        loss.cats_lambda_temporal = policy * self.lambda_temporal

@@ -42,4 +42,4 @@ class GradCAPSConfig(GainConfig):
         )
 
     def set_gains(self, loss: LossModule, policy: float, value: float) -> None:
-        loss.grad_caps_lambda = policy * self.lambda_temporal
+        loss.grad_caps_lambda_temporal = policy * self.lambda_temporal

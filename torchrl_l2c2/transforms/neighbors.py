@@ -1,4 +1,4 @@
-"""TorchRL transforms: neighbors for replayed batches, noise for observations."""
+"""The neighbors of replayed states, drawn where the batch is drawn."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ from typing import Any
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import Tensor
-from torchrl.data import Composite, Unbounded
-from torchrl.envs import Transform
 
-from torchrl_l2c2._checks import check_positive_int, check_real
+from torchrl_l2c2._checks import check_positive_int
 from torchrl_l2c2.neighborhood import Neighborhood
+from torchrl_l2c2.transforms.random import RandomTransform, listed
 
 Transitions = dict[NestedKey, tuple[Tensor, Tensor]]  # states and successors, by the states' keys
 
@@ -76,6 +75,13 @@ def _place(
         neighbors.set(key, neighbor)
         distances.append(distance)
     distance = torch.stack(distances).amax(0)
+    if len(transitions) > 1 and neighborhood.max_step is not None:
+        # One step that is too long leaves the whole transition out.
+        far = distance.isinf()
+        for key, (state, _) in transitions.items():
+            near, ndim = neighbors.get(key), tensordict.batch_dims
+            left_out = far.reshape(*far.shape, *(1,) * (near.ndim - far.ndim))
+            neighbors.set(key, torch.where(left_out, state.unsqueeze(ndim), near))
     numbers = distance.new_tensor(neighborhood.numbers).expand(*tensordict.batch_size, -1)
     return neighbors.set("neighborhood", numbers).set("distance", distance)
 
@@ -89,44 +95,12 @@ def _transitions(tensordict: TensorDictBase, in_keys: Sequence[NestedKey]) -> Tr
             if entry is None:
                 raise KeyError(
                     f"a neighborhood needs {name!r}, which the tensordict lacks; it has "
-                    f"{_listed(tensordict)}. Store it, or choose other in_keys (or moved_keys)."
+                    f"{listed(tensordict)}. Store it, or choose other in_keys (or moved_keys)."
                 )
     return transitions
 
 
-def _listed(entries: TensorDictBase | Composite) -> str:
-    return ", ".join(sorted(map(str, entries.keys(True, True)))) or "no entries"
-
-
-class _RandomTransform(Transform):
-    """A transform whose own generator, if it has one, is part of its ``state_dict``."""
-
-    def __init__(self, in_keys: Any, out_keys: Any, generator: torch.Generator | None) -> None:
-        if generator is not None and not isinstance(generator, torch.Generator):
-            raise TypeError(
-                f"generator must be a torch.Generator or None, got {generator!r}: pass "
-                "torch.Generator().manual_seed(seed)."
-            )
-        super().__init__(in_keys=in_keys, out_keys=out_keys)
-        self.generator = generator
-
-    def get_extra_state(self) -> Tensor:
-        # Not None: some ways of saving take tensors only.
-        return torch.empty(0) if self.generator is None else self.generator.get_state()
-
-    def set_extra_state(self, state: Tensor) -> None:
-        saved, present = state.numel() > 0, self.generator is not None
-        if saved != present:
-            with_or_without = {True: "with", False: "without"}
-            raise ValueError(
-                f"{type(self).__name__} was saved {with_or_without[saved]} a generator and built "
-                f"{with_or_without[present]} one: build it as it was built then."
-            )
-        if self.generator is not None:
-            self.generator.set_state(state.cpu())  # Wherever a checkpoint was loaded to.
-
-
-class NeighborTransform(_RandomTransform):
+class NeighborTransform(RandomTransform):
     r"""Draws neighbors of each sampled state, where the batch is drawn.
 
     Appended to a replay buffer, it adds to every batch the states
@@ -244,107 +218,3 @@ class NeighborTransform(_RandomTransform):
             f"{type(self).__name__}({self.neighborhood}, keys={self.in_keys}, "
             f"out_key={self.out_key!r}, num_samples={self.num_samples})"
         )
-
-
-class ObservationNoise(_RandomTransform):
-    """Adds white Gaussian noise to the observations of an environment.
-
-    The noise is drawn once per observation, at every step and reset, so the successor of a state
-    and the state that follows it are the same noisy observation, as with a real sensor.
-    Environments that are not reset keep theirs. In a replay buffer it would be drawn anew.
-
-    The paper states a "scale" of its white noise (Kobayashi, L2C2, 2022, "Setup"), read here as the
-    standard deviation of a Gaussian [inferred]. The noise leaves the bounds of the observations, so
-    their spec becomes unbounded.
-
-    Args:
-        scale: standard deviation of the noise, in units of the observation, finite and at least 0;
-            a number, or a tensor that broadcasts to the observation. Larger values make the task
-            harder; the paper uses 0.01 and 0.001.
-        in_keys: the observations to perturb. Defaults to ``["observation"]``; others, also
-            floating-point ones such as the episode's reward sum, stay exact unless named.
-        generator: source of the randomness, on the device of the observations, saved and restored
-            with the ``state_dict`` of the environment. Defaults to PyTorch's global generator.
-            TorchRL gives the seed of ``env.set_seed`` to the simulator and not to transforms: seed
-            a generator, or call :func:`torch.manual_seed`. In the workers of a
-            :class:`~torchrl.envs.ParallelEnv` ``set_seed`` seeds each worker's global generator
-            differently, while one made in the environment's constructor would be the same in all.
-
-    Raises:
-        TypeError: if ``scale`` or ``generator`` is of another type, or, when an environment takes
-            the transform, if an observation is not floating point.
-        ValueError: if ``scale`` is negative or not finite, or, likewise, does not broadcast to an
-            observation.
-        KeyError: likewise, if the environment has no such observation.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl.envs import GymEnv, TransformedEnv
-        >>> from torchrl_l2c2 import ObservationNoise
-        >>> noise = ObservationNoise(scale=0.01, generator=torch.Generator().manual_seed(0))
-        >>> env = TransformedEnv(GymEnv("Pendulum-v1"), noise)
-        >>> rollout = env.rollout(10)
-        >>> torch.equal(rollout["next", "observation"][:-1], rollout["observation"][1:])
-        True
-    """
-
-    def __init__(
-        self,
-        scale: float | Tensor,
-        in_keys: Sequence[NestedKey] | None = None,
-        generator: torch.Generator | None = None,
-    ) -> None:
-        in_keys = ["observation"] if in_keys is None else in_keys
-        super().__init__(in_keys=in_keys, out_keys=in_keys, generator=generator)
-        several = hasattr(scale, "__len__") and not isinstance(scale, str)
-        for entry in torch.as_tensor(scale).flatten().tolist() if several else [scale]:
-            check_real("scale", entry, at_least=0)
-        scale = torch.as_tensor(scale, dtype=torch.get_default_dtype())
-        # A setting, not a state: a checkpoint must not overrule it.
-        self.register_buffer("scale", scale, persistent=False)
-
-    def _apply_transform(self, obs: Tensor) -> Tensor:
-        noise = torch.randn(obs.shape, generator=self.generator, dtype=obs.dtype, device=obs.device)
-        # In place, so that the observation keeps its dtype.
-        return noise.mul_(self.scale).add_(obs)
-
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        return self._call(tensordict_reset)
-
-    def set_container(self, container: Any) -> None:
-        super().set_container(container)
-        # TorchRL works specs out when they are first asked for, which may be after a step.
-        if self.parent is not None:
-            self.transform_observation_spec(self.parent.observation_spec.clone())
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        for key in self.in_keys:
-            if key not in observation_spec.keys(True, True):
-                raise KeyError(
-                    f"ObservationNoise finds no observation {key!r}; the environment has "
-                    f"{_listed(observation_spec)}. Name those to perturb in in_keys."
-                )
-            spec = observation_spec[key]
-            self._check_leaf(key, spec.dtype, spec.shape)
-            observation_spec[key] = Unbounded(spec.shape, device=spec.device, dtype=spec.dtype)
-        return observation_spec
-
-    def _check_leaf(self, key: NestedKey, dtype: torch.dtype, shape: torch.Size) -> None:
-        if not dtype.is_floating_point:
-            raise TypeError(
-                f"ObservationNoise needs floating-point observations, {key!r} has dtype {dtype}: "
-                "convert it with a transform before this one, or leave it out of in_keys."
-            )
-        trailing = shape[len(shape) - self.scale.ndim :]
-        if self.scale.ndim > len(shape) or any(
-            size not in (1, full) for size, full in zip(self.scale.shape, trailing, strict=True)
-        ):
-            raise ValueError(
-                f"scale of shape {tuple(self.scale.shape)} does not broadcast to the observation "
-                f"{key!r} of shape {tuple(shape)}."
-            )
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}(scale={self.scale.tolist()}, keys={self.in_keys})"

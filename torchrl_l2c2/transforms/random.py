@@ -1,0 +1,44 @@
+"""What transforms that draw have in common."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite
+from torchrl.envs import Transform
+
+
+class RandomTransform(Transform):
+    """A transform whose own generator, if it has one, is part of its ``state_dict``."""
+
+    def __init__(self, in_keys: Any, out_keys: Any, generator: torch.Generator | None) -> None:
+        if generator is not None and not isinstance(generator, torch.Generator):
+            raise TypeError(
+                f"generator must be a torch.Generator or None, got {generator!r}: pass "
+                "torch.Generator().manual_seed(seed)."
+            )
+        super().__init__(in_keys=in_keys, out_keys=out_keys)
+        self.generator = generator
+
+    def get_extra_state(self) -> Tensor:
+        # Not None: some ways of saving take tensors only.
+        return torch.empty(0) if self.generator is None else self.generator.get_state()
+
+    def set_extra_state(self, state: Tensor) -> None:
+        saved, present = state.numel() > 0, self.generator is not None
+        if saved != present:
+            with_or_without = {True: "with", False: "without"}
+            raise ValueError(
+                f"{type(self).__name__} was saved {with_or_without[saved]} a generator and built "
+                f"{with_or_without[present]} one: build it as it was built then."
+            )
+        if self.generator is not None:
+            self.generator.set_state(state.cpu())  # Wherever a checkpoint was loaded to.
+
+
+def listed(entries: TensorDictBase | Composite) -> str:
+    """The entries' names, for errors."""
+    return ", ".join(sorted(map(str, entries.keys(True, True)))) or "no entries"
