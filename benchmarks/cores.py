@@ -22,7 +22,7 @@ from omegaconf import OmegaConf
 
 from benchmarks.timing import machine
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig
-from torchrl_l2c2.experiment.command import CONF
+from torchrl_l2c2.experiment.composition import CONF
 from torchrl_l2c2.experiment.regularizers import REGULARIZERS
 from torchrl_l2c2.experiment.reports import Record, read_records
 from torchrl_l2c2.experiment.reports.readme import is_as_usual

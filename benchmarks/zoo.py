@@ -21,7 +21,7 @@ from omegaconf import OmegaConf
 from benchmarks.timing import machine
 from torchrl_l2c2 import action_variation
 from torchrl_l2c2.experiment import ExperimentConfig
-from torchrl_l2c2.experiment.command import CONF, register
+from torchrl_l2c2.experiment.composition import CONF, register
 from torchrl_l2c2.experiment.environments import TEST_SEED
 from torchrl_l2c2.experiment.tasks import FIELD_TASKS
 from torchrl_l2c2.metrics import spectral_smoothness

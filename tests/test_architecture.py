@@ -83,6 +83,7 @@ experiment.learner
 experiment.gain
 experiment.continuation experiment.schedules
 experiment.training
+experiment.composition
 experiment.command
 experiment.search_space
 experiment.search

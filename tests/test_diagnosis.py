@@ -488,6 +488,7 @@ class TestCommand:
         told, picture = capsys.readouterr().out, path.read_text()
         for name in names:
             assert f"{name}: return " in told and f">{name}: return " in picture
+        assert "the second is of another task than the first (Blank-v0, Pendulum-v1)." in told
         rows = picture.split('<g id="axes_')[1:]
         ticks = [sorted(re.findall(r">([^<>a-z]*\d)</text>", row)) for row in rows]
         assert len(rows) == 2 and ticks[0] == ticks[1] != []
@@ -497,6 +498,13 @@ class TestCommand:
         with pytest.raises(SystemExit):
             main([str(run), str(tmp_path), "--names", "one"])
         assert "--names: one for each of the 2 runs" in capsys.readouterr().err
+        for wrong, message in (
+            (["--names", "a", "a"], "--names: each run needs one of its own"),
+            (["--actions", "a.png"], "--actions must be an SVG file"),
+        ):
+            with pytest.raises(SystemExit):
+                main([str(run), str(tmp_path), *wrong])
+            assert message in capsys.readouterr().err
         with pytest.raises(SystemExit, match=r"^error: '.*' is not the folder of a run"):
             main([str(tmp_path)])
         with pytest.raises(SystemExit, match=r"^error: a run is named twice"):

@@ -36,8 +36,8 @@ from torchrl_l2c2.experiment import (
     make_env,
 )
 from torchrl_l2c2.experiment.collection import check_finite
+from torchrl_l2c2.experiment.environments import SimulatorError
 from torchrl_l2c2.experiment.evaluate import LateTests, evaluate_policy
-from torchrl_l2c2.experiment.player import SimulatorError
 from torchrl_l2c2.experiment.regularizers import LCPConfig
 from torchrl_l2c2.experiment.reports import read_runs
 
@@ -291,7 +291,7 @@ def broken_after(experiment, frames, outcome):
         left[0] -= 1
         if left[0] > 0:
             return original(action)
-        if isinstance(outcome, Exception):
+        if isinstance(outcome, BaseException):
             raise outcome
         observation, _, *ends = original(action)
         return observation, outcome, *ends
@@ -303,7 +303,12 @@ def broken_after(experiment, frames, outcome):
     ("outcome", "error", "message"),
     [
         (float("nan"), FloatingPointError, r"'reward'\) is not finite at frame 59: \[nan\]"),
-        (RuntimeError("physics gone"), SimulatorError, "failed after frame 40: .* physics gone"),
+        (
+            RuntimeError("physics gone"),
+            SimulatorError,
+            "failed beyond frame 40: .* physics gone",
+        ),
+        (SystemExit(4), SimulatorError, r"failed beyond frame 40: SystemExit: 4\."),
     ],
 )
 def test_a_broken_simulator_stops_the_run_and_leaves_a_checkpoint(
@@ -354,7 +359,7 @@ def test_workers_play_rounds_that_are_learned_from_as_episodes(tmp_path):
         assert len({row["return"] for row in rows}) == 4
         experiment.player.collector.procs[0].kill()
         experiment.player.collector.procs[0].join()
-        message = r"Pendulum-v1 failed after frame 160.*Last good checkpoint: .*_0+4.pt"
+        message = r"Pendulum-v1 failed beyond frame 160.*Last good checkpoint: .*_0+4.pt"
         with pytest.raises(SimulatorError, match=message):
             experiment.train(6)
         assert len(experiment.metrics) == 4
@@ -547,7 +552,7 @@ def test_an_error_of_the_users_own_task_is_shown_with_its_lines(tmp_path, monkey
     assert done.returncode == 1
     assert 'broken_task.py", line 9, in step' in done.stderr and "lower_the_boom" in done.stderr
     assert "KeyError: 'boom'" in done.stderr
-    assert done.stderr.splitlines()[-1].startswith("error: broken_task:Broken-v0 failed after")
+    assert done.stderr.splitlines()[-1].startswith("error: broken_task:Broken-v0 failed beyond")
 
 
 def test_a_sweep_gives_one_table(tmp_path):

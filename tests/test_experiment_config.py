@@ -22,7 +22,7 @@ from torchrl_l2c2.experiment import (
     SACConfig,
     TaskConfig,
 )
-from torchrl_l2c2.experiment.command import CONF, check_preset, register, tell_tuned
+from torchrl_l2c2.experiment.composition import CONF, check_preset, register, tell_tuned
 from torchrl_l2c2.experiment.config import GROUPS
 from torchrl_l2c2.experiment.manual import manual, page
 from torchrl_l2c2.experiment.regularizers import BEGIN_TUNED, REGULARIZERS, TUNED, TUNED_ON

@@ -301,6 +301,9 @@ class TestFieldTable:
         assert cells(table, "hopper_v5", "ppo", "LipsNet++") == [*[""] * 6, "1878", "0.543"]
         assert len(table.rows) == 8  # CAPS and vanilla once, as they were run
         assert {row[0] for row in table.rows} == {"hopper_v5"}
+        # With noise, or shorter episodes, it is another task.
+        other = [replace(r, differences="task.max_steps=60") for r in records]
+        assert all(row[-2:] == ["", ""] for row in field_table(other).rows if row[3])
         assert "2440" in sweep_summary([tmp_path])
         write_report(tmp_path / "report", records)
         picture = (tmp_path / "report" / "plane_field.svg").read_text()

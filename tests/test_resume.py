@@ -23,6 +23,7 @@ from torchrl_l2c2.experiment import (
     Experiment,
     ExperimentConfig,
     L2C2Config,
+    NoRegularizerConfig,
     PPOConfig,
     PPORPEConfig,
     TaskConfig,
@@ -240,7 +241,7 @@ def test_changed_settings_are_refused_and_nothing_is_overwritten(tmp_path):
     """The error names the setting with both values."""
     Experiment(small(), tmp_path).train()
     before = contents(tmp_path)
-    with pytest.raises(ValueError, match=r"regularizer.sigma=1.0, not 2.0: choose another folder"):
+    with pytest.raises(ValueError, match=r"regularizer.sigma=1.0, not 2.0: give the same"):
         Experiment(small(regularizer=L2C2Config(sigma=2.0)), tmp_path)
     assert contents(tmp_path) == before
 
@@ -372,6 +373,13 @@ def test_a_setting_that_changes_nothing_may_be_new():
     with pytest.raises(OtherRunError, match=r"regularizer.policy_distance=hellinger, not mean"):
         now = small(regularizer=L2C2Config(policy_distance="mean"))
         check_same_settings(saved, now.to_dict())
+
+
+def test_another_choice_is_named_and_not_what_it_brings():
+    """Its settings are others, too, and come first in the alphabet."""
+    saved = small(regularizer=NoRegularizerConfig()).to_dict()
+    with pytest.raises(OtherRunError, match=r"made with regularizer=none, not l2c2: give the same"):
+        check_same_settings(saved, small().to_dict())
 
 
 @pytest.mark.parametrize("file", ["checkpoint_00000002.pt", "metrics.csv"])

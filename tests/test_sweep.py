@@ -12,6 +12,7 @@ import pytest
 
 from torchrl_l2c2.experiment.command import check_launcher
 from torchrl_l2c2.experiment.folder import list_checkpoints, load_checkpoint
+from torchrl_l2c2.experiment.settings import SettingError
 from torchrl_l2c2.experiment.sweep import Sweep, begin_sweep
 
 ROOT = Path(__file__).parent.parent
@@ -214,6 +215,16 @@ def test_a_job_that_did_not_end_is_named_and_known_when_it_begins_again(tmp_path
         with begun.job(0, "seed=0") as before:
             assert before
         assert begun.failures == [("seed=1", "no room")]
+
+
+def test_two_jobs_do_not_share_a_folder(tmp_path):
+    """The second would take the place of the first's results; the same job again may go on."""
+    with begin_sweep() as sweep:
+        sweep.claim(0, tmp_path / "seed_0")
+        sweep.claim(1, tmp_path / "seed_1")
+        sweep.claim(0, tmp_path / "seed_0")
+        with pytest.raises(SettingError, match=r"another for job 2 than for job 0 .*seed_0: how"):
+            sweep.claim(2, tmp_path / "seed_0")
 
 
 def test_a_job_of_a_sweep_that_ended_does_not_begin(tmp_path):

@@ -23,7 +23,7 @@ from torchrl_l2c2.experiment import (
     TaskConfig,
     make_env,
 )
-from torchrl_l2c2.experiment.player import SimulatorError
+from torchrl_l2c2.experiment.environments import SimulatorError
 
 INF = float("inf")
 VECTOR = spaces.Box(-INF, INF, (2,), np.float32)
@@ -230,6 +230,42 @@ def test_a_reward_may_be_an_array_of_one_number(monkeypatch, name, settings):
             continue
         with pytest.raises(SimulatorError, match=r"Still-v0 failed .* must be one number, got arr"):
             run.train()
+
+
+@pytest.mark.parametrize(
+    ("method", "raises", "message"),
+    [
+        ("__init__", KeyError("licence"), "Still-v0 could not be made: KeyError: 'licence'"),
+        ("reset", TypeError("no seed"), "Still-v0 could not be reset: TypeError: no seed"),
+        ("reset", SystemExit(3), "Still-v0 could not be reset: SystemExit: 3"),
+    ],
+)
+def test_what_a_task_raises_before_it_plays_names_it(monkeypatch, method, raises, message):
+    """With the error behind it, whose lines are shown."""
+    still(monkeypatch)
+
+    def fail(*_, **__):
+        raise raises
+
+    monkeypatch.setattr(Still, method, fail)
+    with pytest.raises(SimulatorError, match=message) as raised:
+        make_env(task(), 0)
+    assert raised.value.__cause__ is raises
+
+
+def test_returns_that_are_no_number_are_not_averaged(monkeypatch):
+    """Each of the rewards is finite, and their sum is not."""
+    still(monkeypatch)
+    step = Still.step
+
+    def paid(self, action):
+        seen, _, *rest = step(self, action)
+        return seen, 3e38, *rest
+
+    run = experiment("sac", task(episodes=1))
+    monkeypatch.setattr(Still, "step", paid)
+    with pytest.raises(FloatingPointError, match=r"of a test episode is inf, a sum of \d+ fin"):
+        run.test(1)
 
 
 def test_ppo_rpe_acts_without_bounds_where_it_does_not_squash(monkeypatch):

@@ -14,7 +14,7 @@ from pydantic import TypeAdapter
 from small import own_nodes
 
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig
-from torchrl_l2c2.experiment.command import CONF, register
+from torchrl_l2c2.experiment.composition import CONF, folder_named, register
 from torchrl_l2c2.experiment.config import GROUPS
 from torchrl_l2c2.experiment.settings import SettingError, describe
 
@@ -66,6 +66,7 @@ def settings_of():
         ("algorithm.hidden=100", "algorithm.hidden must be a list, got 100."),
         ("algorithm.hidden=[0]", "algorithm.hidden must be greater than or equal to 1, got 0."),
         ("algorithm.replay_ratio=1 algorithm.updates=1", "replay_ratio and updates both say"),
+        ("optimizer=adam optimizer.betas=[0.9,1]", "betas must each be in [0, 1), got [0.9, 1.0]."),
         ("replay.batch_size=0", "replay.batch_size must be greater than or equal to 1, got 0."),
         ("replay.capacity=8", "replay.capacity must be at least the batch_size (32), got 8."),
         ("optimizer.lr=-1", "optimizer.lr must be greater than or equal to 0, got -1."),
@@ -92,6 +93,17 @@ def test_a_wrong_name_is_hydras_to_refuse(settings_of, line, message):
     """And its line says which."""
     with pytest.raises(HydraException, match=message):
         settings_of(line)
+
+
+@pytest.mark.parametrize(
+    ("setting", "given"),
+    [("outputs", None), ("outputs", ""), ("resume", ""), ("resume", [1]), ("outputs", False)],
+)
+def test_what_is_no_folder_is_refused(setting, given):
+    """A number may name one, and nothing need be resumed."""
+    with pytest.raises(SettingError, match=rf"{setting} must be a folder, got "):
+        folder_named(setting, given)
+    assert folder_named("outputs", 2026) == "2026" and folder_named("resume", None) is None
 
 
 def kinds_of_settings():

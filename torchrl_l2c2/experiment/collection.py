@@ -278,12 +278,15 @@ def play_episodes(
         collector.shutdown(close_env=False)
 
 
-def check_finite(batch: TensorDictBase, first_frame: int) -> None:
+def check_finite(batch: TensorDictBase, first_frame: int, *, test: bool = False) -> None:
     """Stops at the first NaN or infinity that the environment or the policy gave.
 
     Args:
         batch (TensorDictBase): frames, ``[T]``.
         first_frame (int): frames before them, for the error.
+
+    Keyword Args:
+        test (bool): whether they are of a test, which has frames of its own. Default ``False``.
 
     Raises:
         FloatingPointError: names the key and the frame.
@@ -297,10 +300,11 @@ def check_finite(batch: TensorDictBase, first_frame: int) -> None:
     if found:
         step, key = min(found, key=lambda each: each[0])
         giver = "policy" if key == "action" else "environment"
+        frame = f"frame {first_frame + step}{' of a test' if test else ''}"
+        left = "" if test else "; nothing is learned from this episode"
         raise FloatingPointError(
-            f"{key} is not finite at frame {first_frame + step}: "
-            f"{batch[key][step].flatten().tolist()}. "
-            f"The {giver} gave it; nothing is learned from this episode."
+            f"{key} is not finite at {frame}: {batch[key][step].flatten().tolist()}. "
+            f"The {giver} gave it{left}."
         )
 
 

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import os
 import signal
@@ -15,22 +14,18 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from importlib.util import find_spec
-from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import hydra
-from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_l2c2.experiment.config import GROUPS, ExperimentConfig, OtherRunError
-from torchrl_l2c2.experiment.manual import manual
-from torchrl_l2c2.experiment.naming import run_name
+from torchrl_l2c2.experiment.composition import CONF, read, register, tell_sweep, tell_tuned
+from torchrl_l2c2.experiment.config import ExperimentConfig, OtherRunError
 from torchrl_l2c2.experiment.progress import log
-from torchrl_l2c2.experiment.regularizers import BEGIN_TUNED, TUNED, TUNED_ON
-from torchrl_l2c2.experiment.settings import SettingError, describe
+from torchrl_l2c2.experiment.settings import SettingError
 from torchrl_l2c2.experiment.signals import (
     Interrupted,
     Terminated,
@@ -38,14 +33,10 @@ from torchrl_l2c2.experiment.signals import (
     terminate,
 )
 from torchrl_l2c2.experiment.sweep import Sweep, begin_sweep
-from torchrl_l2c2.experiment.tasks import PAPER_TASKS
 
 if TYPE_CHECKING:
     from torchrl_l2c2.experiment.reports import FinishedRun
 
-PACKAGE = Path(__file__).parents[1]
-# Beside the package in a clone, within it when installed.
-CONF = next(folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if folder.is_dir())
 # What tells by itself what was wrong; anything else is a fault of the program.
 EXPECTED = (ValueError, OSError, RuntimeError, FloatingPointError, ImportError)
 # How long a file server may hold the lock of a machine that was lost.
@@ -59,38 +50,6 @@ HINTS: dict[type[Exception], str] = {
     SettingError: "--help lists every setting.",
     OtherRunError: "In a shell: outputs=FOLDER, allow_other_versions=true, task.episodes=N.",
 }
-
-
-def register() -> None:
-    """Gives Hydra every choice of every group, from the settings' own defaults.
-
-    ``conf/`` holds what combines them.
-    """
-    store = ConfigStore.instance()
-    for group, choices in GROUPS.items():
-        for name, chosen in choices.items():
-            store.store(group=group, name=name, node=_node(chosen))
-    for name, (algorithm, tuned) in product(BEGIN_TUNED, TUNED.items()):
-        store.store(group="tuned", name=f"{name}_{algorithm}", node={"regularizer": tuned})
-    unknown = dict.fromkeys(("env_id", "noise_scale", "max_steps", "solved_at"))
-    any_task = {"name": "${task.env_id}", **unknown}
-    store.store(
-        group="task", name="gymnasium", node={**_node(GROUPS["task"]["swingup"]), **any_task}
-    )
-    config = dataclasses.asdict(ExperimentConfig())
-    store.store(name="settings", node={name: config[name] for name in describe(ExperimentConfig)})
-    store.store(group="hydra/help", name="settings", node={"template": manual()})
-
-
-def _node(chosen: Any) -> dict[str, Any]:
-    values = {k: list(v) if isinstance(v, tuple) else v for k, v in vars(chosen).items()}
-    if not hasattr(chosen, "usual_replay"):
-        return values
-    usual = [
-        {"override /replay@_global_.replay": chosen.usual_replay},
-        {"override /optimizer@_global_.optimizer": chosen.usual_optimizer},
-    ]
-    return {"defaults": [*usual, "_self_"], **values}
 
 
 def check_launcher(arguments: Sequence[str]) -> None:
@@ -142,7 +101,8 @@ def _main(values: DictConfig) -> None:
         _run_job(plain, Sweep.of_this_job())
         return
     try:
-        run(plain)
+        tell_sweep()
+        run(*read(plain), plain)
     except Interrupted as interruption:
         print(interruption, file=sys.stderr)
         sys.exit(128 + interruption.signal_number)
@@ -162,7 +122,10 @@ def _run_job(values: dict[str, Any], sweep: Sweep) -> None:
     try:
         with sweep.job(number, job) as begun_before:
             patience = LOST_SECONDS if begun_before else 0.0
-            if (finished := run(values, _standing(sweep), patience)) is not None:
+            config, folder = read(values)
+            sweep.claim(number, folder)
+            finished = run(config, folder, values, _standing(sweep), patience)
+            if finished is not None:
                 sweep.add_finished(number, finished.folder, finished.record.seconds)
     except (Interrupted, KeyboardInterrupt) as interruption:
         stopped_by = getattr(interruption, "signal_number", signal.SIGTERM)
@@ -192,26 +155,22 @@ def _tell(error: Exception) -> str:
     return told
 
 
-def run_folder(config: ExperimentConfig, outputs: str) -> Path:
-    """The folder that Hydra was told, or one below ``outputs`` that is named by the settings."""
-    chosen = HydraConfig.get()
-    multirun = chosen.mode == RunMode.MULTIRUN
-    folder = chosen.sweep.subdir if multirun else chosen.run.dir
-    if folder == ".":
-        return Path(outputs) / run_name(config)
-    return Path(chosen.runtime.output_dir)
-
-
-def run(values: dict[str, Any], standing: str = "", patience: float = 0.0) -> FinishedRun | None:
+def run(
+    config: ExperimentConfig,
+    folder: Path,
+    values: dict[str, Any],
+    standing: str = "",
+    patience: float = 0.0,
+) -> FinishedRun | None:
     """One run in its folder, its progress and its result, if it tests its policy.
 
     Args:
-        values (dict): the configuration.
+        config (ExperimentConfig): its settings.
+        folder (Path): of the run.
+        values (dict): the configuration, which says what the run goes on from.
         standing (str): of the sweep that it belongs to; shown before its name and its progress.
         patience (float): seconds to wait for a process that has its folder.
     """
-    check_preset(values, HydraConfig.get().runtime.choices.get("preset"))
-    config = ExperimentConfig.from_dict(values)
     # Here, as settings are checked before anything waits for torch.
     from torchrl_l2c2.experiment.continuation import tell_past
     from torchrl_l2c2.experiment.folder import save_policy
@@ -232,7 +191,6 @@ def run(values: dict[str, Any], standing: str = "", patience: float = 0.0) -> Fi
     keep_freed_memory()
     warnings.simplefilter("ignore", FutureWarning)
     warnings.filterwarnings("ignore", "No target network updater")
-    folder = run_folder(config, values["outputs"])
     chosen = (config.task, config.algorithm, config.regularizer)
     named = f"{', '.join(group.name for group in chosen)}, seed {config.seed}: {folder}"
     print(f"{standing}: {named}" if standing else named, flush=True)
@@ -263,44 +221,6 @@ def run(values: dict[str, Any], standing: str = "", patience: float = 0.0) -> Fi
     if video.exists():
         print(f"video: {video}", flush=True)
     return finished
-
-
-def check_preset(values: dict[str, Any], name: str | None) -> None:
-    """Refuses a task and an algorithm that a preset has no settings of.
-
-    Raises:
-        SettingError: with those that it has.
-    """
-    if values.get("preset") != "???":  # What they replace.
-        return
-    known = ", ".join(sorted(path.stem for path in (CONF / "preset" / str(name)).glob("*.yaml")))
-    task, algorithm = values["task"]["name"], values["algorithm"]["name"]
-    raise SettingError(
-        "preset",
-        f"must have settings of task={task} with algorithm={algorithm}, and {name} has those of "
-        f"{known}: choose one of these, or preset=none.",
-    )
-
-
-def tell_tuned(config: ExperimentConfig) -> None:
-    """Says where L2C2's settings begin with the algorithm, and where none were found for it."""
-    regularizer, algorithm = config.regularizer, config.algorithm.name
-    if regularizer.name not in BEGIN_TUNED:
-        return
-    if algorithm in TUNED:
-        chosen = ", ".join(f"{name}={getattr(regularizer, name)}" for name in TUNED[algorithm])
-        where = (
-            f"found for {algorithm} on {TUNED_ON[algorithm]}, or given; larger rewards may want "
-            "larger gains; regularizer=l2c2_paper is the paper's"
-        )
-        print(f"regularizer={regularizer.name}: {chosen} ({where})", flush=True)
-    elif algorithm != ExperimentConfig().algorithm.name or config.task.name not in PAPER_TASKS:
-        found = ", ".join(TUNED)
-        print(
-            f"regularizer={regularizer.name}: the paper's gains, which are for its own tasks and "
-            f"algorithm; others were found for {found} alone",
-            flush=True,
-        )
 
 
 @contextmanager

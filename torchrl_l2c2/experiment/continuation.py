@@ -16,6 +16,7 @@ from torchrl_l2c2.experiment.config import (
     OtherRunError,
     is_neutral,
 )
+from torchrl_l2c2.experiment.environments import SimulatorError
 from torchrl_l2c2.experiment.folder import (
     CheckpointError,
     list_checkpoints,
@@ -24,7 +25,6 @@ from torchrl_l2c2.experiment.folder import (
     write_atomically,
     write_settings,
 )
-from torchrl_l2c2.experiment.player import SimulatorError
 from torchrl_l2c2.experiment.reports.runs import tested_run
 from torchrl_l2c2.experiment.saved import as_it_was
 from torchrl_l2c2.experiment.tasks import Budget, TaskConfig
@@ -42,22 +42,30 @@ def check_same_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> Non
     Raises:
         OtherRunError: names the first setting that differs, with both values.
     """
-    saved = as_it_was(saved)
-    for group in sorted((saved.keys() | now.keys()) - FREE_SETTINGS):
-        was, is_now = saved.get(group, MISSING), now.get(group, MISSING)
-        pairs = {group: (was, is_now)}
-        if isinstance(was, Mapping) and isinstance(is_now, Mapping):
+    before, after = _by_name(as_it_was(saved)), _by_name(now)
+    # What was chosen by name first: the settings of another choice are others anyway.
+    for name in sorted(before.keys() | after.keys(), key=lambda n: (not n.endswith(".name"), n)):
+        was, is_now = before.get(name, MISSING), after.get(name, MISSING)
+        since = was == MISSING and is_neutral(name, is_now)
+        # As JSON, where a tuple and a list are the same; 10 and 10.0 are, too.
+        if not since and json.loads(json.dumps(was)) != json.loads(json.dumps(is_now)):
+            raise OtherRunError(
+                f"the checkpoint was made with {name.removesuffix('.name')}={was}, not {is_now}: "
+                "give the same settings, or begin in another folder. Nothing was changed."
+            )
+
+
+def _by_name(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings that change a run's numbers, those of groups as ``group.name``."""
+    named: dict[str, Any] = {}
+    for group in settings.keys() - FREE_SETTINGS:
+        values = settings[group]
+        if isinstance(values, Mapping):
             free = FREE_TASK_SETTINGS if group == "task" else set()
-            names = sorted((was.keys() | is_now.keys()) - free)
-            pairs = {f"{group}.{n}": (was.get(n, MISSING), is_now.get(n, MISSING)) for n in names}
-        for name, (before, after) in pairs.items():
-            since = before == MISSING and is_neutral(name, after)
-            # As JSON, where a tuple and a list are the same; 10 and 10.0 are, too.
-            if not since and json.loads(json.dumps(before)) != json.loads(json.dumps(after)):
-                raise OtherRunError(
-                    f"this folder's checkpoint was made with {name}={before}, not {after}: "
-                    "choose another folder, or delete this one. Nothing was changed."
-                )
+            named |= {f"{group}.{name}": values[name] for name in values.keys() - free}
+        else:
+            named[group] = values
+    return named
 
 
 def check_same_versions(saved: Mapping[str, str], now: Mapping[str, str]) -> None:
@@ -72,7 +80,7 @@ def check_same_versions(saved: Mapping[str, str], now: Mapping[str, str]) -> Non
     differing = [f"{n} {saved[n]}, now {now[n]}" for n in now if saved.get(n, now[n]) != now[n]]
     if differing:
         raise OtherRunError(
-            f"this folder's checkpoint was made with {'; '.join(differing)}: the numbers may "
+            f"the checkpoint was made with {'; '.join(differing)}: the numbers may "
             "differ from those of a run in one go. allow_other_versions=True continues all the "
             "same. Nothing was changed."
         )
@@ -129,7 +137,8 @@ def find_checkpoint(
     if found is None and elsewhere is not None:
         found = load_newest(elsewhere)
         if found is None:
-            raise CheckpointError(f"resume={str(elsewhere)!r} holds no checkpoint_*.pt.")
+            hint = " Name its folder." if Path(elsewhere).is_file() else ""
+            raise CheckpointError(f"resume={str(elsewhere)!r} holds no checkpoint_*.pt.{hint}")
     if found is None:
         return None
     path, state, damaged = found
@@ -214,7 +223,9 @@ def checkpoint_named(folder: Path | None) -> Iterator[None]:
     except FloatingPointError as error:
         raise FloatingPointError(f"{error} {_last_checkpoint(folder)}") from None
     except SimulatorError as error:
-        raise SimulatorError(f"{error} {_last_checkpoint(folder)}") from error.__cause__
+        raise SimulatorError(
+            f"{str(error).rstrip('.')}. {_last_checkpoint(folder)}"
+        ) from error.__cause__
     except OSError as error:
         raise OSError(f"{error}. {_last_checkpoint(folder)}") from error
 

@@ -28,6 +28,10 @@ def main(arguments: Iterable[str] | None = None) -> None:
         parser.error(f"--episodes must be at least 1, got {chosen.episodes}")
     if chosen.names and len(chosen.names) != len(chosen.folders):
         parser.error(f"--names: one for each of the {len(chosen.folders)} runs, got {chosen.names}")
+    if len(set(chosen.names or ())) < len(chosen.names or ()):
+        parser.error(f"--names: each run needs one of its own, got {chosen.names}")
+    if chosen.actions and not chosen.actions.endswith(".svg"):
+        parser.error(f"--actions must be an SVG file, named FILE.svg, got {chosen.actions}")
     try:
         # Before anything is played that could be lost.
         for given in filter(None, (chosen.output, chosen.actions)):

@@ -30,6 +30,10 @@ if TYPE_CHECKING:
 TEST_SEED = 1_000_003
 
 
+class SimulatorError(RuntimeError):
+    """The environment or the policy in it raised an error; the cause is chained."""
+
+
 def make_env(task: TaskConfig, seed: int, *, render: bool = False) -> EnvBase:
     """Makes a task's environment, noisy and seeded.
 
@@ -49,6 +53,7 @@ def make_env(task: TaskConfig, seed: int, *, render: bool = False) -> EnvBase:
         ValueError: an id that Gymnasium does not know, a task without a time limit, or one whose
             observations or actions are not vectors of numbers, nor images where they are to be;
             or one that draws no pictures, with ``render``.
+        SimulatorError: the environment itself raises an error when it is made or reset.
     """
     simulator = taking_vector(_make(task, render))
     if task.images:
@@ -57,7 +62,7 @@ def make_env(task: TaskConfig, seed: int, *, render: bool = False) -> EnvBase:
         simulator = observing_vector(simulator, flatten=task.flatten)
     if render:
         simulator = RenderCollection(simulator)
-    with quiet_output():
+    with _own_errors(task, "reset"), quiet_output():
         env = GymWrapper(simulator)
         env.reset()
     env.set_seed(seed)
@@ -114,7 +119,7 @@ def control_rate(env: EnvBase) -> float | None:
 
 def _make(task: TaskConfig, render: bool) -> Env:
     limit = time_limit(task)
-    with _explained(task), quiet_output():
+    with _explained(task), _own_errors(task, "made"), quiet_output():
         if not render:
             return gymnasium.make(task.env_id, max_episode_steps=limit)
         try:
@@ -135,6 +140,18 @@ def _explained(task: TaskConfig) -> Iterator[None]:
             f"task.env_id={task.env_id!r} is not a task that Gymnasium can make here ({error}). "
             "Use task=swingup|reacher|hopper|ant, or task=gymnasium with a registered id; "
             "`module:id` imports the module that registers it."
+        ) from error
+
+
+@contextlib.contextmanager
+def _own_errors(task: TaskConfig, what: str) -> Iterator[None]:
+    try:
+        yield
+    except (gymnasium.error.Error, ImportError):
+        raise
+    except (Exception, SystemExit) as error:
+        raise SimulatorError(
+            f"{task.env_id} could not be {what}: {type(error).__name__}: {error}"
         ) from error
 
 

@@ -146,9 +146,9 @@ def evaluate_policy(
         leave=False,
     )
     for episode in bar:
-        check_finite(episode, sum(lengths))
+        check_finite(episode, sum(lengths), test=True)
         actions = mean_actions(policy, episode) if sampled else episode["action"]
-        returns.append(episode["next", "reward"].sum().item())
+        returns.append(_return(episode))
         variations.append(_variation(actions))
         taken = getattr(policy, "taken", lambda samples: samples)(episode["action"])
         played = {"": actions, "sampled_": taken} if sampled else {"": actions}
@@ -160,6 +160,16 @@ def evaluate_policy(
         lengths.append(len(episode))
         bar.set_postfix_str(f"return {statistics.fmean(returns):.1f}")
     return Evaluation(returns, variations, lengths, measures)
+
+
+def _return(episode: TensorDictBase) -> float:
+    total: float = episode["next", "reward"].sum().item()
+    if not math.isfinite(total):
+        raise FloatingPointError(
+            f"the return of a test episode is {total}, a sum of {len(episode)} finite rewards: "
+            "have the task give smaller ones."
+        )
+    return total
 
 
 def measure(actions: torch.Tensor, spec: TensorSpec) -> dict[str, float]:
@@ -225,9 +235,9 @@ class LateTests:
                 self._collector = self._make_collector()
             self._collector.set_seed(self._seed + number)
             episode = self._collector.rollout()
-        check_finite(episode, 0)
-        total = episode["next", "reward"].sum().item()
-        return dict(zip(TESTED, (total, _variation(episode["action"])), strict=True))
+        check_finite(episode, 0, test=True)
+        figures = _return(episode), _variation(episode["action"])
+        return dict(zip(TESTED, figures, strict=True))
 
     def none(self) -> dict[str, float]:
         """The same entries where no episode is played."""

@@ -195,7 +195,7 @@ def _visited_scale(runs: Iterable[FinishedRun], episodes: int) -> Tensor:
         policy, env, max_steps = load_policy(run.folder, noise_scale=0.0)
         with ProcessState(run.seed):
             for episode in play_episodes(policy, env, episodes, max_steps=max_steps):
-                check_finite(episode, 0)
+                check_finite(episode, 0, test=True)
                 states.append(episode["observation"])
         env.close()
     visited = torch.cat(states)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from torchrl_l2c2.experiment.settings import settings
+from torchrl_l2c2.experiment.settings import SettingError, settings
 
 if TYPE_CHECKING:
     from torch.nn import Parameter
@@ -48,6 +48,10 @@ class AdamConfig:
         description="the learning rate falls to 0 in a line over the training that is asked for: a "
         "run that is later continued for longer had a steeper line",
     )
+
+    def __post_init__(self) -> None:
+        if not all(0 <= beta < 1 for beta in self.betas):
+            raise SettingError("betas", f"must each be in [0, 1), got {list(self.betas)}.")
 
     def make(self, parameters: Iterable[Parameter]) -> Optimizer:
         """The optimizer of these parameters."""

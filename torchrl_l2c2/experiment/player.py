@@ -13,6 +13,7 @@ from torchrl.modules import EGreedyModule
 
 from torchrl_l2c2.experiment.algorithms.agent import Agent
 from torchrl_l2c2.experiment.collection import EpisodeCollector, check_finite
+from torchrl_l2c2.experiment.environments import SimulatorError
 from torchrl_l2c2.experiment.frames import Frame, stack_frames
 from torchrl_l2c2.experiment.rollouts import RolloutCollector
 from torchrl_l2c2.experiment.workers import MultiEpisodeCollector, RayEpisodeCollector
@@ -22,10 +23,6 @@ Played = TypeVar("Played")
 
 # Of every episode, by their names in metrics.csv.
 MEASURES = ("return", "action_variation", "policy_scale", "length")
-
-
-class SimulatorError(RuntimeError):
-    """The environment or the policy in it raised an error; the cause is chained."""
 
 
 @dataclass
@@ -128,9 +125,9 @@ class Player:
     def _simulate(self, play: Callable[[], Played]) -> Played:
         try:
             return play()
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise SimulatorError(
-                f"{self._env_id} failed after frame {self.frames}: {type(error).__name__}: {error}"
+                f"{self._env_id} failed beyond frame {self.frames}: {type(error).__name__}: {error}"
             ) from error
 
     def _count(self, frames: int) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 from torchrl_l2c2.experiment.config import GROUPS, NEUTRAL_SETTINGS
 
 REMEDY = "it was changed or cut since it was written; restore it."
+ANEW = " Or delete it: the command that made the run tests its policy again."
 
 
 def read_json(path: str | Path) -> dict[str, Any]:
@@ -24,7 +25,8 @@ def read_json(path: str | Path) -> dict[str, Any]:
     try:
         value = json.loads(_read_text(path))
     except json.JSONDecodeError as error:
-        raise ValueError(f"{path} is no JSON ({error}): {REMEDY}") from None
+        again = ANEW if Path(path).name == "evaluation.json" else ""
+        raise ValueError(f"{path} is no JSON ({error}): {REMEDY}{again}") from None
     if not isinstance(value, dict):
         raise ValueError(f"{path} must hold an object, {{...}}, got {value!r:.40}: {REMEDY}")
     return value
@@ -111,5 +113,9 @@ def _has(group: str, chosen: Any, setting: str) -> bool:
 def _read_text(path: str | Path) -> str:
     try:
         return Path(path).read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise FileNotFoundError(
+            f"{path} is not there, which a run's folder has: restore it."
+        ) from None
     except UnicodeDecodeError as error:
         raise ValueError(f"{path} is no text in UTF-8 ({error.reason}): {REMEDY}") from None

@@ -12,7 +12,7 @@ from hydra.core.override_parser.types import ChoiceSweep, Glob, IntervalSweep, O
 from hydra.errors import HydraException, OverrideParseException
 from omegaconf import OmegaConf
 
-from torchrl_l2c2.experiment.command import CONF, register
+from torchrl_l2c2.experiment.composition import CONF, register
 from torchrl_l2c2.experiment.config import ExperimentConfig
 
 if TYPE_CHECKING:

@@ -31,6 +31,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
+from torchrl_l2c2.experiment.settings import SettingError
 from torchrl_l2c2.experiment.signals import FINISHING, SAME_SIGNAL_SECONDS, terminate
 
 VARIABLE = "TORCHRL_L2C2_SWEEP"  # of the environment, which a launcher's processes inherit
@@ -124,6 +125,22 @@ class Sweep:
             lost = f"{LOST}; the same command continues it"
             failed |= {number: (job, lost) for number, job in self._all("running")}
         return [failed[number] for number in sorted(failed)]
+
+    def claim(self, number: int, folder: Path) -> None:
+        """Keeps a run's folder for one job of the sweep.
+
+        Raises:
+            SettingError: another job has it, whose results it would take the place of.
+        """
+        self._put(f"folder_{number:06d}", json.dumps(str(folder)))
+        for other, claimed in self._all("folder"):
+            if other != number and claimed == str(folder):
+                raise SettingError(
+                    "outputs",
+                    f"must be another for job {number} than for job {other} of the sweep, which "
+                    f"both have {folder}: how long is trained and tested names no folder. Sweep "
+                    "over outputs, too, or give two commands.",
+                )
 
     def add_finished(self, number: int, folder: Path, seconds: float) -> None:
         """Keeps where a finished run lies, and how long it took, until the sweep's end."""

@@ -97,7 +97,7 @@ class Experiment:
         self.config = config = config or ExperimentConfig()
         self.folder = None if folder is None else Path(folder)
         check_installed(config.logger.name)
-        self._log = MetricsLog(None)  # till the folder is there
+        self._log, self._unlock = MetricsLog(None), lambda: None  # till the folder is there
         self._compile = config.compile and compiler_available()
         self._process = ProcessState(config.seed, config.threads)
         with self._process:
@@ -114,12 +114,12 @@ class Experiment:
             self.player = Player(collector, self.agent, config.task.env_id)
         self.metrics: list[dict[str, float]] = []
         self._late_tests = LateTests(config.task, config.seed, self.agent.policy, self._compile)
-        self._best_policy = BestPolicy(config, self.agent.policy, self.folder)
-        self._gain = GainControl(config, self.learner)
-        # Only now, as what was refused above leaves no folder.
-        if self.folder is not None:
-            self._unlock = lock_folder(make_folder(self.folder), self)
         try:
+            self._best_policy = BestPolicy(config, self.agent.policy, self.folder)
+            self._gain = GainControl(config, self.learner)
+            # Only now, as what was refused above leaves no folder.
+            if self.folder is not None:
+                self._unlock = lock_folder(make_folder(self.folder), self)
             self._begin(resume, allow_other_versions)
         except BaseException:
             self.close()
@@ -292,8 +292,7 @@ class Experiment:
         self.player.collector.shutdown()
         self._late_tests.close()
         self._log.close()
-        if self.folder is not None:
-            self._unlock()
+        self._unlock()
 
     def _begin(self, resume: str | Path | None, allow_other_versions: bool) -> None:
         self._log = MetricsLog(self.folder, logger=self.config.logger.name)

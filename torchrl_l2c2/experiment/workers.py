@@ -161,6 +161,9 @@ class MultiEpisodeCollector(_Rounds, MultiSyncCollector):
         """Ends the processes; nothing can be collected any more."""
         atexit.unregister(self._at_exit)
         super().shutdown(*args, **kwargs)
+        # Left to their __del__ they would start a thread where Python ends, and wait for it.
+        for scheme in (getattr(self, "_weight_sync_schemes", None) or {}).values():
+            scheme.shutdown()
 
     def rollout(self) -> list[TensorDictBase]:
         """One episode of every process, as :meth:`EpisodeCollector.rollout` gives them."""

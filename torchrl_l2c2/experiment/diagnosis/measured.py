@@ -74,6 +74,7 @@ class Diagnosis:
         shares: of the loss's terms.
         entries: what the coordinates of an observation are called.
         pictures: of every state of the first episode, ``[H, W, 3]``; may be empty.
+        task: a run's, by its id; empty where it is not known.
     """
 
     name: str
@@ -96,6 +97,7 @@ class Diagnosis:
     shares: Mapping[str, TermShare] = field(default_factory=dict)
     entries: Sequence[str] = ()
     pictures: Sequence[Any] = ()
+    task: str = ""
 
     @property
     def range(self) -> Tensor:

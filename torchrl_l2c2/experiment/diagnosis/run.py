@@ -87,7 +87,8 @@ def diagnose_run(
     entries = entry_names(seen, found.observations.shape[1])
     env.close()
     pictures = _pictures(folder, seed, noise_scale, best) if with_pictures else []
-    return replace(found, shares=shares, entries=entries, pictures=pictures)
+    task = config.task.env_id
+    return replace(found, task=task, shares=shares, entries=entries, pictures=pictures)
 
 
 def value_function(loss: LossModule, normalization: Normalization | None = None) -> Value | None:

@@ -110,10 +110,15 @@ def comparison(diagnoses: Sequence[Diagnosis]) -> list[str]:
     """What is different about each policy, in a sentence, beside the first of them.
 
     Args:
-        diagnoses (sequence of Diagnosis): of one task, at least one.
+        diagnoses (sequence of Diagnosis): at least one; those of another task are not compared.
     """
     first, *others = diagnoses
-    return [_beside(first, other) for other in others]
+    return [
+        _beside(first, other)
+        if other.task == first.task
+        else f"{other.name} is of another task than {first.name} ({other.task}, {first.task})."
+        for other in others
+    ]
 
 
 def _beside(first: Diagnosis, other: Diagnosis) -> str:

@@ -90,8 +90,13 @@ def field_table(records: Sequence[Record]) -> Table | None:
 
 
 def published_of(group: Group) -> PublishedCell | None:
-    """What was published of its method, with its authors' gains; ``None`` where nothing was."""
+    """What was published of its method, with its authors' gains; ``None`` where nothing was.
+
+    Or not of this task: with more noise, or shorter episodes.
+    """
     first = group.first
+    if not first.is_of_own_task:
+        return None
     return PUBLISHED.get((first.task, first.algorithm, first.method))
 
 

@@ -110,14 +110,21 @@ class Record:
         return read_differences(self.differences)
 
     @property
+    def is_of_own_task(self) -> bool:
+        """Whether the simulator, its noise and its longest episode are those of the task's name."""
+        of_task = {"task.env_id", "task.noise_scale", "task.max_steps"}
+        return not of_task & self.other_settings.keys()
+
+    @property
     def paper(self) -> Published | None:
         """The paper's results, where the task, the algorithm and the regularizer are the paper's.
 
         And the targets' pace, which the paper varies. What else it leaves open may differ; tables
         tell it below.
         """
-        other = ("task.env_id", "task.noise_scale", "regularizer.", TAU)
-        if any(name.startswith(other) for name in self.other_settings):
+        if not self.is_of_own_task or any(
+            name.startswith(("regularizer.", TAU)) for name in self.other_settings
+        ):
             return None
         return paper_of(self.task, self.algorithm, self.method)
 

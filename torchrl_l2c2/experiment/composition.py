@@ -1,0 +1,134 @@
+"""What Hydra composes of ``conf/`` and the settings' own defaults, and what a run reads of it."""
+
+from __future__ import annotations
+
+import dataclasses
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from hydra.core.config_store import ConfigStore
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+
+from torchrl_l2c2.experiment.config import GROUPS, ExperimentConfig
+from torchrl_l2c2.experiment.manual import manual
+from torchrl_l2c2.experiment.naming import run_name
+from torchrl_l2c2.experiment.regularizers import BEGIN_TUNED, TUNED, TUNED_ON
+from torchrl_l2c2.experiment.settings import SettingError, describe
+from torchrl_l2c2.experiment.tasks import PAPER_TASKS
+
+PACKAGE = Path(__file__).parents[1]
+# Beside the package in a clone, within it when installed.
+CONF = next(folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if folder.is_dir())
+
+
+def register() -> None:
+    """Gives Hydra every choice of every group, from the settings' own defaults.
+
+    ``conf/`` holds what combines them.
+    """
+    store = ConfigStore.instance()
+    for group, choices in GROUPS.items():
+        for name, chosen in choices.items():
+            store.store(group=group, name=name, node=_node(chosen))
+    for name, (algorithm, tuned) in product(BEGIN_TUNED, TUNED.items()):
+        store.store(group="tuned", name=f"{name}_{algorithm}", node={"regularizer": tuned})
+    unknown = dict.fromkeys(("env_id", "noise_scale", "max_steps", "solved_at"))
+    any_task = {"name": "${task.env_id}", **unknown}
+    store.store(
+        group="task", name="gymnasium", node={**_node(GROUPS["task"]["swingup"]), **any_task}
+    )
+    config = dataclasses.asdict(ExperimentConfig())
+    store.store(name="settings", node={name: config[name] for name in describe(ExperimentConfig)})
+    store.store(group="hydra/help", name="settings", node={"template": manual()})
+
+
+def _node(chosen: Any) -> dict[str, Any]:
+    values = {k: list(v) if isinstance(v, tuple) else v for k, v in vars(chosen).items()}
+    if not hasattr(chosen, "usual_replay"):
+        return values
+    usual = [
+        {"override /replay@_global_.replay": chosen.usual_replay},
+        {"override /optimizer@_global_.optimizer": chosen.usual_optimizer},
+    ]
+    return {"defaults": [*usual, "_self_"], **values}
+
+
+def read(values: dict[str, Any]) -> tuple[ExperimentConfig, Path]:
+    """A run's settings, and its folder: what Hydra was told, or one below ``outputs``.
+
+    Args:
+        values (dict): the configuration.
+
+    Raises:
+        SettingError: a setting that cannot be.
+    """
+    chosen = HydraConfig.get()
+    check_preset(values, chosen.runtime.choices.get("preset"))
+    for name in ("outputs", "resume"):
+        values[name] = folder_named(name, values[name])
+    config = ExperimentConfig.from_dict(values)
+    multirun = chosen.mode == RunMode.MULTIRUN
+    folder = chosen.sweep.subdir if multirun else chosen.run.dir
+    if folder == ".":
+        return config, Path(values["outputs"]) / run_name(config)
+    return config, Path(chosen.runtime.output_dir)
+
+
+def check_preset(values: dict[str, Any], name: str | None) -> None:
+    """Refuses a task and an algorithm that a preset has no settings of.
+
+    Raises:
+        SettingError: with those that it has.
+    """
+    if values.get("preset") != "???":  # What they replace.
+        return
+    known = ", ".join(sorted(path.stem for path in (CONF / "preset" / str(name)).glob("*.yaml")))
+    task, algorithm = values["task"]["name"], values["algorithm"]["name"]
+    raise SettingError(
+        "preset",
+        f"must have settings of task={task} with algorithm={algorithm}, and {name} has those of "
+        f"{known}: choose one of these, or preset=none.",
+    )
+
+
+def folder_named(setting: str, given: Any) -> str | None:
+    """A folder, which may be named by a number; of ``resume`` there need be none.
+
+    Raises:
+        SettingError: another value.
+    """
+    named = str(given) if type(given) in (int, float) else given
+    if not (isinstance(named, str) and named) and not (setting == "resume" and given is None):
+        raise SettingError(setting, f"must be a folder, got {given!r}.")
+    return named
+
+
+def tell_tuned(config: ExperimentConfig) -> None:
+    """Says where L2C2's settings begin with the algorithm, and where none were found for it."""
+    regularizer, algorithm = config.regularizer, config.algorithm.name
+    if regularizer.name not in BEGIN_TUNED:
+        return
+    if algorithm in TUNED:
+        chosen = ", ".join(f"{name}={getattr(regularizer, name)}" for name in TUNED[algorithm])
+        where = (
+            f"found for {algorithm} on {TUNED_ON[algorithm]}, or given; larger rewards may want "
+            "larger gains; regularizer=l2c2_paper is the paper's"
+        )
+        print(f"regularizer={regularizer.name}: {chosen} ({where})", flush=True)
+    elif algorithm != ExperimentConfig().algorithm.name or config.task.name not in PAPER_TASKS:
+        found = ", ".join(TUNED)
+        print(
+            f"regularizer={regularizer.name}: the paper's gains, which are for its own tasks and "
+            f"algorithm; others were found for {found} alone",
+            flush=True,
+        )
+
+
+def tell_sweep() -> None:
+    """Says where the configuration is that of a comparison, and this is but one run of it."""
+    chosen = HydraConfig.get()
+    if chosen.sweeper.params:
+        sweeps = " ".join(f"{name}={value}" for name, value in chosen.sweeper.params.items())
+        print(f"one run of the comparison {sweeps}: add -m for all of it", flush=True)
