@@ -80,14 +80,18 @@ class Record:
 
     @property
     def place(self) -> tuple[Any, ...]:
-        """Sorts as tables do: the paper's order, and what differs least from the defaults first."""
+        """Sorts as tables do: the paper's order, and what differs least from the defaults first.
+
+        What differs in the regularizer alone, and so is compared, is together.
+        """
         task = list(TASKS).index(self.task) if self.task in TASKS else len(TASKS)
-        # The length has its place after them.
-        others = [f"{k}={v}" for k, v in self.other_settings.items() if k not in BUDGETS]
-        settings = (len(others), others, self.settings)
-        method = (self.algorithm, *method_order(self.method))
+        words = {k: f"{k}={v}" for k, v in self.other_settings.items() if k not in BUDGETS}
+        own = [word for name, word in words.items() if name.startswith("regularizer.")]
+        others = [word for word in words.values() if word not in own]
         amount, unit = self.length.split()
-        return (task, self.task, *method, *settings, unit, int(amount), self.seed)
+        reading = (len(others), others, unit, int(amount))
+        method = (*method_order(self.method), len(own), own, self.settings)
+        return (task, self.task, self.algorithm, *reading, *method, self.seed)
 
     def figure(self, figure: str, quantity: str) -> float:
         """By the names of ``FIGURES`` and ``QUANTITIES``; ``last_mean`` has ``sm_asap`` too.
