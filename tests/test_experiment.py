@@ -555,6 +555,15 @@ def test_an_error_of_the_users_own_task_is_shown_with_its_lines(tmp_path, monkey
     assert done.stderr.splitlines()[-1].startswith("error: broken_task:Broken-v0 failed beyond")
 
 
+@pytest.mark.slow
+def test_what_is_refused_with_workers_ends(tmp_path):
+    """They had played nothing yet: the process waited for a thread that Python no longer starts."""
+    gain = ["gain=target", "gain_target=0.1", "gain_of=nonsense"]
+    settings = ["num_workers=2", *(f"regularizer.{setting}" for setting in gain)]
+    done = run_train(*PENDULUM_OVERRIDES, *settings, folder=tmp_path, check=False)
+    assert done.returncode == 1 and "gain_of" in done.stderr.splitlines()[-1]
+
+
 def test_a_sweep_gives_one_table(tmp_path):
     """Methods and seeds in their order; figures over seeds with every seed's own behind them."""
     overrides = ("regularizer=none,l2c2", "seed=0,1", "hydra/launcher=basic")
