@@ -121,6 +121,7 @@ def test_a_trial_without_late_tests_is_scored_by_its_last_policies(tmp_path):
             "regularizer.beta=tag(log,interval(0,1))",
             r"'regularizer.beta=.*a logarithmic scale begins above 0, got 0\.",
         ),
+        ("outputs=elsewhere", "outputs is the trials' own, below --output"),
         ("regularizer.bta=interval(0,1)", r"Could not override 'regularizer.bta'"),
         ("regularizer.beta=interval(-2,-1)", r"regularizer.beta must be .* got -1.293"),
         ("regularizer.num_samples=interval(1,3)", "num_samples must be a valid integer, got 2.41"),

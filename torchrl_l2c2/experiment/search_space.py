@@ -57,6 +57,9 @@ def check_settings(overrides: Sequence[str]) -> None:
     register()
     # A glob stands for names that there are.
     tryable = [each for each in _parsed(overrides) if not isinstance(each.value(), Glob)]
+    own = [each.get_key_element() for each in tryable]
+    if given := sorted({"outputs", "resume"}.intersection(own)):
+        raise ValueError(f"{given[0]} is the trials' own, below --output: leave it out.")
     parsed = [each for each in tryable if not each.is_hydra_override()]
     choices = [len(_tried(override)) for override in parsed]
     with initialize_config_dir(str(CONF), version_base="1.3"):
