@@ -2,6 +2,7 @@
 
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -10,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from torchrl_l2c2.experiment.command import check_launcher
+from torchrl_l2c2.experiment.command import check_launcher, check_sweep
 from torchrl_l2c2.experiment.folder import list_checkpoints, load_checkpoint
 from torchrl_l2c2.experiment.settings import SettingError
 from torchrl_l2c2.experiment.sweep import Sweep, begin_sweep
@@ -182,6 +183,22 @@ def test_a_launcher_says_what_it_needs(name, monkeypatch):
     with pytest.raises(SystemExit, match=rf"{name}_cluster needs the extra {name}: pip install"):
         check_launcher(["train.py", "-m", f"hydra/launcher={name}_cluster"])
     check_launcher(["train.py", "-m", "hydra/launcher=joblib"])
+
+
+@pytest.mark.parametrize(
+    ("sweep", "told"),
+    [
+        ("seed=range(3,0)", "error: a sweep of no job: one of -m seed=range"),
+        ("optimizer.lr=interval(0,1)", "error: an interval is nothing to sweep over: python -m"),
+    ],
+)
+def test_a_sweep_of_nothing_says_so(sweep, told):
+    """It ended as if all were done; what a glob is, Hydra alone knows."""
+    with pytest.raises(SystemExit, match=re.escape(told)):
+        check_sweep(["-m", sweep])
+    check_sweep(["-m", "regularizer=glob(l2c2*)", "seed=0,1"])
+    with begin_sweep(["-m", "regularizer=glob(l2c2*)"]) as begun:
+        assert begun.standing(2, {}) == "run 2"
 
 
 def test_a_sweep_says_how_much_of_it_is_left():

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
@@ -32,7 +33,7 @@ from torchrl_l2c2.experiment.signals import (
     keep_ctrl_c_from_children,
     terminate,
 )
-from torchrl_l2c2.experiment.sweep import Sweep, begin_sweep
+from torchrl_l2c2.experiment.sweep import Sweep, begin_sweep, list_jobs
 
 if TYPE_CHECKING:
     from torchrl_l2c2.experiment.reports import FinishedRun
@@ -60,6 +61,19 @@ def check_launcher(arguments: Sequence[str]) -> None:
             sys.exit(f"error: hydra/launcher={name} needs the extra {extra}: {needed}.")
 
 
+def check_sweep(arguments: Sequence[str]) -> None:
+    """Ends where a sweep would have no job, or an interval stands for no number of them."""
+    try:
+        empty = not list_jobs(arguments, {})
+    except HydraException as error:  # Of which Hydra itself says more, or finds what a glob is.
+        if "INTERVAL" in str(error):
+            search = "python -m torchrl_l2c2.experiment.search"
+            sys.exit(f"error: an interval is nothing to sweep over: {search} searches in it.")
+        return
+    if empty:
+        sys.exit(f"error: a sweep of no job: one of {' '.join(arguments)} has no value.")
+
+
 def main() -> None:
     """Runs what the command line says."""
     check_launcher(sys.argv)
@@ -70,6 +84,7 @@ def main() -> None:
     if not {"-m", "--multirun", "hydra.mode=MULTIRUN"} & set(sys.argv):
         _main()
         return
+    check_sweep(sys.argv[1:])
     with begin_sweep(sys.argv[1:]) as sweep:
         try:
             _main()

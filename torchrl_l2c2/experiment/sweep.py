@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
@@ -158,7 +159,10 @@ class Sweep:
             number (int): of the job, from 1.
             params (Mapping): sweeps of the configuration, by setting.
         """
-        tasks = [job.get("task") for job in list_jobs(self.overrides, params)]
+        try:
+            tasks = [job.get("task") for job in list_jobs(self.overrides, params)]
+        except HydraException:  # A glob, which stands for as many as Hydra finds.
+            return f"run {number}"
         seconds: dict[str | None, list[float]] = defaultdict(list)
         for finished, (_, each) in self._all("finished"):
             if math.isfinite(each):
@@ -263,6 +267,9 @@ def start_guard(mark: str) -> None:
 
 def list_jobs(overrides: Sequence[str], params: Mapping[str, str]) -> list[dict[str, str]]:
     """What a sweep chooses for each of its jobs: a product, where the command's go before.
+
+    Raises:
+        HydraException: a sweep that says by itself not of what: a glob, an interval.
 
     Examples:
         >>> jobs = list_jobs(["-m", "seed=0,1", "task=ant"], {"seed": "range(0,18)", "beta": "1,2"})
