@@ -1080,6 +1080,27 @@ def test_the_fields_pages_are_those_of_their_records():
         assert all(table.markdown() in page for table in told)
 
 
+def test_the_gains_of_sac_are_those_of_their_records():
+    """Every run of the seeds that gains are chosen on is a cell; of the others the means are."""
+    page = (ROOT / "results" / "field_gains.md").read_text()
+
+    def cell(*records):
+        means = (
+            statistics.fmean(getattr(r, f"last_mean_{name}") for r in records)
+            for name in ("return", "sm_asap")
+        )
+        return "{:.1f} / {:.3f}".format(*means).replace("/ 0.", "/ .")
+
+    gains = read_records(ROOT / "results" / "sac_gains.csv")
+    assert all(cell(record) in page for record in gains if record.seed >= 100)
+    shown = [r for r in gains if r.seed < 100 and r.differences.count("lambda_") > 1]
+    shown += read_records(ROOT / "results" / "sac_pendulum.csv")
+    for group in group_records(shown):
+        of_strongest = group.first.other_settings.get("regularizer.lambda_min") == "100"
+        seeds = group.records[: 4 if of_strongest else 6]
+        assert cell(*seeds) in page, group.name
+
+
 def test_the_pages_of_other_readings_are_those_of_their_records():
     """The table before the loss was summed over the batch; Reacher's of the other length."""
     records = read_records(ROOT / "results" / "runs.csv")

@@ -235,9 +235,9 @@ def test_a_reward_may_be_an_array_of_one_number(monkeypatch, name, settings):
 @pytest.mark.parametrize(
     ("method", "raises", "message"),
     [
-        ("__init__", KeyError("licence"), "Still-v0 could not be made: KeyError: 'licence'"),
-        ("reset", TypeError("no seed"), "Still-v0 could not be reset: TypeError: no seed"),
-        ("reset", SystemExit(3), "Still-v0 could not be reset: SystemExit: 3"),
+        ("__init__", KeyError("licence"), "Still-v0 could not begin: KeyError: 'licence'"),
+        ("reset", TypeError("no seed"), "Still-v0 could not begin: TypeError: no seed"),
+        ("reset", SystemExit(3), "Still-v0 could not begin: SystemExit: 3"),
     ],
 )
 def test_what_a_task_raises_before_it_plays_names_it(monkeypatch, method, raises, message):

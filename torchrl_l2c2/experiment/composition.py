@@ -99,8 +99,10 @@ def folder_named(setting: str, given: Any) -> str | None:
     Raises:
         SettingError: another value.
     """
+    if setting == "resume" and given is None:
+        return None
     named = str(given) if type(given) in (int, float) else given
-    if not (isinstance(named, str) and named) and not (setting == "resume" and given is None):
+    if not isinstance(named, str) or not named:
         raise SettingError(setting, f"must be a folder, got {given!r}.")
     return named
 

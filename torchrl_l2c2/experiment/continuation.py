@@ -26,7 +26,7 @@ from torchrl_l2c2.experiment.folder import (
     write_settings,
 )
 from torchrl_l2c2.experiment.reports.runs import tested_run
-from torchrl_l2c2.experiment.saved import as_it_was
+from torchrl_l2c2.experiment.saved import as_it_was, by_name
 from torchrl_l2c2.experiment.tasks import Budget, TaskConfig
 
 MISSING = "none, as it is a setting since"
@@ -42,30 +42,21 @@ def check_same_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> Non
     Raises:
         OtherRunError: names the first setting that differs, with both values.
     """
-    before, after = _by_name(as_it_was(saved)), _by_name(now)
+    before, after = by_name(as_it_was(saved)), by_name(now)
     # What was chosen by name first: the settings of another choice are others anyway.
     for name in sorted(before.keys() | after.keys(), key=lambda n: (not n.endswith(".name"), n)):
         was, is_now = before.get(name, MISSING), after.get(name, MISSING)
         since = was == MISSING and is_neutral(name, is_now)
-        # As JSON, where a tuple and a list are the same; 10 and 10.0 are, too.
-        if not since and json.loads(json.dumps(was)) != json.loads(json.dumps(is_now)):
+        if was != is_now and not since and not _is_free(name):
             raise OtherRunError(
                 f"the checkpoint was made with {name.removesuffix('.name')}={was}, not {is_now}: "
                 "give the same settings, or begin in another folder. Nothing was changed."
             )
 
 
-def _by_name(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings that change a run's numbers, those of groups as ``group.name``."""
-    named: dict[str, Any] = {}
-    for group in settings.keys() - FREE_SETTINGS:
-        values = settings[group]
-        if isinstance(values, Mapping):
-            free = FREE_TASK_SETTINGS if group == "task" else set()
-            named |= {f"{group}.{name}": values[name] for name in values.keys() - free}
-        else:
-            named[group] = values
-    return named
+def _is_free(name: str) -> bool:
+    group, _, setting = name.partition(".")
+    return group in FREE_SETTINGS or (group == "task" and setting in FREE_TASK_SETTINGS)
 
 
 def check_same_versions(saved: Mapping[str, str], now: Mapping[str, str]) -> None:

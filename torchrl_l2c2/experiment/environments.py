@@ -62,7 +62,7 @@ def make_env(task: TaskConfig, seed: int, *, render: bool = False) -> EnvBase:
         simulator = observing_vector(simulator, flatten=task.flatten)
     if render:
         simulator = RenderCollection(simulator)
-    with _own_errors(task, "reset"), quiet_output():
+    with _explained(task), quiet_output():
         env = GymWrapper(simulator)
         env.reset()
     env.set_seed(seed)
@@ -119,7 +119,7 @@ def control_rate(env: EnvBase) -> float | None:
 
 def _make(task: TaskConfig, render: bool) -> Env:
     limit = time_limit(task)
-    with _explained(task), _own_errors(task, "made"), quiet_output():
+    with _explained(task), quiet_output():
         if not render:
             return gymnasium.make(task.env_id, max_episode_steps=limit)
         try:
@@ -141,17 +141,9 @@ def _explained(task: TaskConfig) -> Iterator[None]:
             "Use task=swingup|reacher|hopper|ant, or task=gymnasium with a registered id; "
             "`module:id` imports the module that registers it."
         ) from error
-
-
-@contextlib.contextmanager
-def _own_errors(task: TaskConfig, what: str) -> Iterator[None]:
-    try:
-        yield
-    except (gymnasium.error.Error, ImportError):
-        raise
     except (Exception, SystemExit) as error:
         raise SimulatorError(
-            f"{task.env_id} could not be {what}: {type(error).__name__}: {error}"
+            f"{task.env_id} could not begin: {type(error).__name__}: {error}"
         ) from error
 
 

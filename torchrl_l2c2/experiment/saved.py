@@ -84,6 +84,20 @@ def as_it_was(config: Mapping[str, Any]) -> dict[str, Any]:
     return whole
 
 
+def by_name(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings by the names of the command line, those of groups as ``group.name``.
+
+    As JSON has them, where a tuple and a list are the same.
+
+    Args:
+        settings (Mapping): of ``config.json``, of a checkpoint, or ``ExperimentConfig.to_dict()``.
+    """
+    flat: dict[str, Any] = {}
+    for name, value in json.loads(json.dumps(settings)).items():
+        flat |= {f"{name}.{k}": v for k, v in value.items()} if name in GROUPS else {name: value}
+    return flat
+
+
 def read_evaluation(run: str | Path) -> dict[str, Any]:
     """Reads a run's ``evaluation.json``.
 

@@ -14,6 +14,7 @@ from torchrl_l2c2.experiment.config import (
     ExperimentConfig,
     is_neutral,
 )
+from torchrl_l2c2.experiment.saved import by_name
 from torchrl_l2c2.experiment.tasks import TASKS
 
 # How long a run is trained, of which a longer one is another.
@@ -37,7 +38,7 @@ def fingerprint(config: Mapping[str, Any]) -> str:
     """
     compared = {
         name: value
-        for name, value in _flat(ExperimentConfig.from_dict(config)).items()
+        for name, value in by_name(ExperimentConfig.from_dict(config).to_dict()).items()
         if _counts(name) and name != "task.name" and not is_neutral(name, value)
     }
     return hashlib.sha256(json.dumps(compared, sort_keys=True).encode()).hexdigest()[:10]
@@ -62,9 +63,9 @@ def differences(config: Mapping[str, Any]) -> dict[str, str]:
         >>> differences(config)
         {'regularizer.beta': '0.5'}
     """
-    own = _flat(ExperimentConfig.from_dict(config))
-    usual = _flat(ExperimentConfig.from_dict(_names(config, _COMPARED)))
-    chosen = _flat(ExperimentConfig.from_dict(_names(config, GROUPS)))
+    own = by_name(ExperimentConfig.from_dict(config).to_dict())
+    usual = by_name(ExperimentConfig.from_dict(_names(config, _COMPARED)).to_dict())
+    chosen = by_name(ExperimentConfig.from_dict(_names(config, GROUPS)).to_dict())
     return {
         name: _word(value)
         for name, value in sorted(own.items())
@@ -95,14 +96,6 @@ def _names(config: Mapping[str, Any], groups: Any) -> dict[str, Any]:
     if named["task"]["name"] not in TASKS:  # A task of one's own is what its id says.
         named["task"]["env_id"] = config["task"]["env_id"]
     return named
-
-
-def _flat(config: ExperimentConfig) -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    # Through JSON, where a tuple and a list are the same.
-    for name, value in json.loads(json.dumps(config.to_dict())).items():
-        flat |= {f"{name}.{k}": v for k, v in value.items()} if name in GROUPS else {name: value}
-    return flat
 
 
 def _counts(name: str) -> bool:
