@@ -15,7 +15,7 @@ import torch
 from benchmarks.setups import Effort, paper_config, play_episode
 from benchmarks.timing import Row, alternate
 from torchrl_l2c2.experiment import Experiment
-from torchrl_l2c2.experiment.folder import MetricsLog
+from torchrl_l2c2.experiment.metrics_log import MetricsLog
 
 ROOT = Path(__file__).parent.parent
 

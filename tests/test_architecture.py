@@ -37,8 +37,8 @@ rsl_rl.__init__
 trainers __init__
 experiment.settings experiment.compilation experiment.spaces experiment.guard
 experiment.tracing experiment.priorities experiment.frames experiment.row_writer
-experiment.loggers experiment.acting
-experiment.folder
+experiment.loggers experiment.acting experiment.files experiment.versions
+experiment.checkpoints experiment.metrics_log
 experiment.environments experiment.lock experiment.signals
 experiment.process experiment.progress experiment.sweep experiment.optimizers
 experiment.tasks experiment.replay experiment.collection
@@ -81,7 +81,7 @@ experiment.diagnosis.__init__
 experiment.diagnose experiment.noise
 experiment.learner
 experiment.gain
-experiment.continuation experiment.schedules
+experiment.continuation experiment.folder experiment.schedules
 experiment.training
 experiment.composition
 experiment.command

@@ -6,7 +6,7 @@ import struct
 import pytest
 import torch
 
-from torchrl_l2c2.experiment.folder import (
+from torchrl_l2c2.experiment.checkpoints import (
     FORMAT_VERSION,
     HEADER,
     MAGIC,

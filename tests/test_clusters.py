@@ -12,7 +12,7 @@ import torch
 
 from tests.test_sweep import alive, episodes, numbers, runs, said, start, wait_until
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig, TaskConfig
-from torchrl_l2c2.experiment.folder import list_checkpoints
+from torchrl_l2c2.experiment.checkpoints import list_checkpoints
 from torchrl_l2c2.experiment.reports import read_runs, sweep_summary
 
 SWEEP = ("-m", "seed=0,1,2,3", "task.episodes=40", "compile=false", "checkpoint_interval=0")

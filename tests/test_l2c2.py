@@ -694,6 +694,13 @@ class TestPolicyDistances:
         with pytest.raises(TypeError, match=r"a deterministic policy.*its default"):
             L2C2Loss(base, policy_distance=distance)
 
+    @pytest.mark.parametrize("given", [{"policy_distance": "mean"}, {"hellinger_samples": 2}])
+    def test_a_loss_without_a_policy_compares_none(self, given):
+        """What would be read nowhere is refused."""
+        base = DQNLoss(action_values(), action_space="one-hot")
+        with pytest.raises(TypeError, match="DQNLoss has no policy: leave policy_distance"):
+            L2C2Loss(base, **given)
+
     def test_of_deterministic_policies_nothing_is_drawn(self):
         """Samples would change nothing, and are refused."""
         base = DDPGLoss(deterministic_actor(), qvalue())

@@ -17,7 +17,6 @@ import pytest
 from scipy.stats import mannwhitneyu, trim_mean
 
 from torchrl_l2c2.experiment import ExperimentConfig, L2C2Config, PPOConfig, PPORPEConfig, SACConfig
-from torchrl_l2c2.experiment.folder import code_commit
 from torchrl_l2c2.experiment.regularizers import REGULARIZERS
 from torchrl_l2c2.experiment.reports import (
     draw_learning_curves,
@@ -59,6 +58,7 @@ from torchrl_l2c2.experiment.reports.statistics import (
 )
 from torchrl_l2c2.experiment.reports.tables import number_range, results_tables
 from torchrl_l2c2.experiment.tasks import TASKS
+from torchrl_l2c2.experiment.versions import code_commit
 
 ROOT = Path(__file__).parents[1]
 METHODS = {
@@ -1213,3 +1213,9 @@ class TestReadme:
         """Rather than changed somewhere."""
         with pytest.raises(ValueError, match="once each"):
             fill(f"{END} and {START}", records)
+
+    def test_a_file_that_is_not_there_is_told(self, records, tmp_path):
+        """With what it would need."""
+        write_records(tmp_path / "runs.csv", records)
+        with pytest.raises(SystemExit, match=r"error: there is no file .* <!-- results: start -->"):
+            main(["--from", str(tmp_path / "runs.csv"), "--readme", str(tmp_path / "README.md")])

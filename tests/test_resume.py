@@ -28,11 +28,11 @@ from torchrl_l2c2.experiment import (
     PPORPEConfig,
     TaskConfig,
     UniformReplayConfig,
-    continuation,
 )
+from torchrl_l2c2.experiment.checkpoints import list_checkpoints, load_checkpoint, save_checkpoint
 from torchrl_l2c2.experiment.config import GROUPS, OtherRunError
 from torchrl_l2c2.experiment.continuation import check_same_settings
-from torchrl_l2c2.experiment.folder import list_checkpoints, load_checkpoint, save_checkpoint
+from torchrl_l2c2.experiment.files import write_json
 from torchrl_l2c2.experiment.reports import results
 from torchrl_l2c2.experiment.reports.runs import find_runs, finished_run
 from torchrl_l2c2.experiment.trained import load_policy
@@ -141,7 +141,7 @@ def test_a_run_can_be_continued_in_another_folder(tmp_path):
     assert [row["episode"] for row in lines(tmp_path / "b")] == [str(i) for i in range(1, 9)]
 
 
-@pytest.mark.parametrize("steps", range(6))
+@pytest.mark.parametrize("steps", range(8))
 def test_a_finished_run_that_goes_on_is_unfinished(tmp_path, monkeypatch, steps):
     """Killed after any of its first steps, it is not taken for the longer run, and goes on."""
     shorter, longer = small(), small(task=replace(SWINGUP, episodes=8))
@@ -162,8 +162,8 @@ def test_a_finished_run_that_goes_on_is_unfinished(tmp_path, monkeypatch, steps)
         return change
 
     with monkeypatch.context() as patched, contextlib.suppress(KeyboardInterrupt):
-        written = until_it_is_killed(continuation.write_settings)
-        patched.setattr(continuation, "write_settings", written)
+        write = until_it_is_killed(write_json)
+        patched.setattr("torchrl_l2c2.experiment.folder.write_json", write)
         patched.setattr(Path, "unlink", until_it_is_killed(Path.unlink))
         Experiment(longer, tmp_path).close()
     assert finished_run(tmp_path, longer.to_dict()) is None
@@ -394,7 +394,7 @@ def test_a_full_disk_names_the_file_and_the_last_good_checkpoint(tmp_path, monke
             raise full
         return open(path, *arguments, **options)
 
-    monkeypatch.setattr("torchrl_l2c2.experiment.folder.open", no_room, raising=False)
+    monkeypatch.setattr("torchrl_l2c2.experiment.files.open", no_room, raising=False)
     message = rf"No space left.*{file}'\. Last good checkpoint: .*checkpoint_00000001.pt"
     with pytest.raises(OSError, match=message):
         experiment.train()

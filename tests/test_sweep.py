@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from torchrl_l2c2.experiment.checkpoints import list_checkpoints, load_checkpoint
 from torchrl_l2c2.experiment.command import check_launcher, check_sweep
-from torchrl_l2c2.experiment.folder import list_checkpoints, load_checkpoint
 from torchrl_l2c2.experiment.settings import SettingError
 from torchrl_l2c2.experiment.sweep import Sweep, begin_sweep
 

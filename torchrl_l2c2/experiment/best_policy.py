@@ -12,8 +12,9 @@ from tensordict.nn import TensorDictModule
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
 from torchrl_l2c2.experiment.evaluate import evaluate_policy
-from torchrl_l2c2.experiment.folder import save_policy, write_json
+from torchrl_l2c2.experiment.files import write_json
 from torchrl_l2c2.experiment.process import ProcessState
+from torchrl_l2c2.experiment.trained import save_policy
 
 EPISODES = 10
 

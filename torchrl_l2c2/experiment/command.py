@@ -188,7 +188,6 @@ def run(
     """
     # Here, as settings are checked before anything waits for torch.
     from torchrl_l2c2.experiment.continuation import tell_past
-    from torchrl_l2c2.experiment.folder import save_policy
     from torchrl_l2c2.experiment.lock import wait_for_folder
     from torchrl_l2c2.experiment.process import keep_freed_memory
     from torchrl_l2c2.experiment.reports import (
@@ -196,6 +195,7 @@ def run(
         draw_learning_curves,
         finished_run,
     )
+    from torchrl_l2c2.experiment.trained import save_policy
     from torchrl_l2c2.experiment.training import Experiment
     from torchrl_l2c2.experiment.video import check_video, record_video
 

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from torchrl_l2c2.experiment.checkpoints import CheckpointError, list_checkpoints, load_newest
 from torchrl_l2c2.experiment.config import (
     FREE_SETTINGS,
     FREE_TASK_SETTINGS,
@@ -17,23 +18,13 @@ from torchrl_l2c2.experiment.config import (
     is_neutral,
 )
 from torchrl_l2c2.experiment.environments import SimulatorError
-from torchrl_l2c2.experiment.folder import (
-    CheckpointError,
-    list_checkpoints,
-    load_newest,
-    versions,
-    write_atomically,
-    write_settings,
-)
-from torchrl_l2c2.experiment.reports.runs import tested_run
 from torchrl_l2c2.experiment.saved import as_it_was, by_name
 from torchrl_l2c2.experiment.tasks import Budget, TaskConfig
+from torchrl_l2c2.experiment.versions import versions
 
 MISSING = "none, as it is a setting since"
 # Free settings that only episodes of training read.
 OF_TRAINING = ("evaluate_every", "late_share")
-# What the end of a training leaves, beside the test that marks a run as finished.
-OF_THE_END = ("video.mp4", "policy.pt", "learning_curves.png")
 
 
 def check_same_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> None:
@@ -175,35 +166,6 @@ def check_continuable(
         if not allow_other_versions:
             raise
         warnings.warn(str(error), stacklevel=5)
-
-
-def bring_files(old: Path, new: Path) -> None:
-    """Copies what a run in another folder goes on writing there."""
-    of_tests = (old / name for name in ("evaluations.json", "policy_best.pt"))
-    for path in (old / "metrics.csv", *filter(Path.exists, of_tests)):
-        write_atomically(new / path.name, path.read_bytes())
-
-
-def begin_folder(folder: Path, settings: dict[str, Any], *, ended: bool) -> None:
-    """Writes what a run begins with.
-
-    A test that was of other settings is removed before, and of a shorter run that goes on the end:
-    killed at any moment, the folder is that of the older run or of an unfinished one, and never a
-    longer one's with an older policy. A test of the same policy stays till another one replaces it.
-
-    Args:
-        folder (Path): of the run.
-        settings (dict): of the run, as in ``config.json``.
-
-    Keyword Args:
-        ended (bool): whether its training is over.
-    """
-    if not ended or tested_run(folder, settings) is None:
-        (folder / "evaluation.json").unlink(missing_ok=True)
-    if not ended:
-        for name in OF_THE_END:
-            (folder / name).unlink(missing_ok=True)
-    write_settings(folder, settings)
 
 
 @contextlib.contextmanager

@@ -16,7 +16,7 @@ from torchrl_l2c2.experiment.diagnosis import (
     write_page,
 )
 from torchrl_l2c2.experiment.environments import TEST_SEED
-from torchrl_l2c2.experiment.folder import make_folder_of
+from torchrl_l2c2.experiment.files import make_folder_of
 from torchrl_l2c2.experiment.reports.paper import method_name
 
 

@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from torchrl_l2c2.experiment.collection import EpisodeCollector, check_finite, play_episodes
 from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
-from torchrl_l2c2.experiment.folder import make_folder_of, to_json, write_json
+from torchrl_l2c2.experiment.files import make_folder_of, to_json, write_json
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.saved import read_config
 from torchrl_l2c2.experiment.tasks import TaskConfig

@@ -32,11 +32,12 @@ from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 from torchrl_l2c2.experiment.algorithms.networks import action_bounds
 from torchrl_l2c2.experiment.collection import play_episodes
 from torchrl_l2c2.experiment.environments import control_rate
-from torchrl_l2c2.experiment.folder import make_folder, versions, write_atomically, write_json
+from torchrl_l2c2.experiment.files import make_folder, write_atomically, write_json
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.saved import read_config, read_evaluation
 from torchrl_l2c2.experiment.spaces import CountedFromZero
 from torchrl_l2c2.experiment.trained import load_policy
+from torchrl_l2c2.experiment.versions import versions
 
 NEEDED = ("onnx", "onnxruntime", "onnxscript")
 # Of the largest action there is: float32 kernels that sum in another order stay far below.

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from torchrl_l2c2.experiment.folder import make_folder
+from torchrl_l2c2.experiment.files import make_folder
 from torchrl_l2c2.experiment.lock import FolderInUseError, lock_folder
 from torchrl_l2c2.experiment.reports import find_runs, write_report
 from torchrl_l2c2.experiment.reports.comparison import SIGNS

@@ -1,7 +1,8 @@
-"""What a run has trained, from its folder alone."""
+"""A run's policy: written to its folder, and read back from that alone."""
 
 from __future__ import annotations
 
+import io
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,9 +10,10 @@ import torch
 from tensordict.nn import TensorDictModule
 from torchrl.envs import EnvBase
 
+from torchrl_l2c2.experiment.checkpoints import CheckpointError, load_newest
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
-from torchrl_l2c2.experiment.folder import CheckpointError, load_newest
+from torchrl_l2c2.experiment.files import write_atomically
 from torchrl_l2c2.experiment.saved import REMEDY, read_config
 from torchrl_l2c2.experiment.settings import SettingError
 
@@ -97,3 +99,10 @@ def _load_weights(policy: TensorDictModule, path: Path) -> None:
     except Exception as error:
         what = f"{path} does not hold this run's policy ({type(error).__name__})"
         raise CheckpointError(f"{what}: {REMEDY}") from error
+
+
+def save_policy(policy: torch.nn.Module, path: str | Path) -> None:
+    """Writes the policy's ``state_dict``; read it with ``torch.load(path, weights_only=True)``."""
+    content = io.BytesIO()
+    torch.save({k: v.detach().clone() for k, v in policy.state_dict().items()}, content)
+    write_atomically(path, content.getvalue())

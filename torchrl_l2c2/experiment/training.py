@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_l2c2.experiment.best_policy import BestPolicy
+from torchrl_l2c2.experiment.checkpoints import save_checkpoint
 from torchrl_l2c2.experiment.compilation import compiler_available
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.continuation import (
-    begin_folder,
-    bring_files,
     check_continuable,
     check_length,
     check_same_settings,
@@ -23,17 +22,13 @@ from torchrl_l2c2.experiment.continuation import (
 )
 from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
 from torchrl_l2c2.experiment.evaluate import Evaluation, LateTests, evaluate_policy
-from torchrl_l2c2.experiment.folder import (
-    MetricsLog,
-    make_folder,
-    save_checkpoint,
-    save_policy,
-    versions,
-)
+from torchrl_l2c2.experiment.files import make_folder
+from torchrl_l2c2.experiment.folder import begin_folder, bring_files
 from torchrl_l2c2.experiment.gain import GainControl
 from torchrl_l2c2.experiment.learner import Learner, untrained
 from torchrl_l2c2.experiment.lock import lock_folder
 from torchrl_l2c2.experiment.loggers import check_installed
+from torchrl_l2c2.experiment.metrics_log import MetricsLog
 from torchrl_l2c2.experiment.optimizers import anneal
 from torchrl_l2c2.experiment.player import Episode, Player
 from torchrl_l2c2.experiment.process import ProcessState
@@ -43,6 +38,8 @@ from torchrl_l2c2.experiment.reports import FinishedRun, write_results
 from torchrl_l2c2.experiment.schedules import SCHEDULES
 from torchrl_l2c2.experiment.signals import Interrupted, stop_on_signals
 from torchrl_l2c2.experiment.tasks import Budget
+from torchrl_l2c2.experiment.trained import save_policy
+from torchrl_l2c2.experiment.versions import versions
 from torchrl_l2c2.experiment.workers import make_collector
 
 

@@ -19,7 +19,7 @@ from tensordict import TensorDictBase
 
 from torchrl_l2c2.experiment.collection import play_episodes
 from torchrl_l2c2.experiment.environments import control_rate
-from torchrl_l2c2.experiment.folder import make_folder_of
+from torchrl_l2c2.experiment.files import make_folder_of
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.trained import load_policy
 

@@ -120,8 +120,8 @@ class L2C2Loss(RegularizedLoss):
             ``"neighbor"``.
 
     Raises:
-        TypeError: the loss has neither a policy nor a value function, cannot be regularized, or an
-            argument has the wrong type.
+        TypeError: the loss has neither a policy nor a value function, cannot be regularized, has no
+            policy for ``policy_distance``, or an argument has the wrong type.
         ValueError: an argument is out of its range.
 
     Warns:
@@ -172,10 +172,7 @@ class L2C2Loss(RegularizedLoss):
         check_positive_int("num_samples", num_samples)
         check_choice("over_neighbors", over_neighbors, ("mean", "max"))
         if over_neighbors == "max" and num_samples == 1:
-            raise ValueError(
-                "num_samples must be above 1 with over_neighbors='max', got 1: of one neighbor the "
-                "largest is the mean."
-            )
+            raise ValueError("num_samples must be above 1 with over_neighbors='max', got 1.")
         check_real("fraction", fraction, above=0, at_most=1)
         self.l2c2_policy_distance = policy_distance
         self._l2c2_distance = choose_policy_distance(policy_distance, hellinger_samples)
@@ -191,11 +188,11 @@ class L2C2Loss(RegularizedLoss):
         self._l2c2_policies, self._l2c2_values = policies, values
         self.register_coefficient("l2c2_coeff", coeff)
         self.register_coefficient("l2c2_beta", beta, used=bool(values))
-        _check_terms(type(base_loss).__name__, policies, values, beta)
+        compared = (policy_distance, hellinger_samples) != ("hellinger", None)
+        _check_terms(type(base_loss).__name__, policies, values, beta, compared)
         self.declare_networks([*policies, *values])
         if policies:
-            stochastic = self.has_stochastic_policy()
-            name = distance_name(policy_distance, stochastic, hellinger_samples)
+            name = distance_name(policy_distance, self.has_stochastic_policy(), hellinger_samples)
             self._l2c2_policy_diagnostic = f"l2c2_{name}"
         self.declare_terms(
             policy=["loss_l2c2_actor" for _ in policies],
@@ -253,10 +250,10 @@ class L2C2Loss(RegularizedLoss):
         self._compare(neighborhood.numbers, num_samples)
 
     def _compare(self, drawn: Sequence[float], num_samples: int) -> None:
-        if self._l2c2_compared or not drawn:  # an empty batch
-            return
-        self._l2c2_compared = True
-        warn_of_other_neighbors(drawn, num_samples, self.l2c2_neighborhood, self.l2c2_num_samples)
+        if drawn and not self._l2c2_compared:  # not of an empty batch
+            self._l2c2_compared = True
+            own = self.l2c2_neighborhood, self.l2c2_num_samples
+            warn_of_other_neighbors(drawn, num_samples, *own)
 
     def _value_difference(
         self, network: str, tensordict: TensorDictBase, near: Neighbors
@@ -329,17 +326,20 @@ def _value_term(network: str) -> str:
     return "loss_l2c2_" + network.removesuffix("_network")
 
 
-def _check_terms(loss: str, policies: list[str], values: list[str], beta: float) -> None:
+def _check_terms(
+    loss: str, policies: list[str], values: list[str], beta: float, compared: bool
+) -> None:
     if not (policies or values):
         what = "trained value function" if beta else "value function to regularize, with beta=0,"
         raise TypeError(
             f"L2C2Loss finds nothing to regularize: {loss} has no actor_network, and no {what} "
             f"among {', '.join(VALUE_NETWORKS)}."
         )
+    if not policies and compared:
+        raise TypeError(f"{loss} has no policy: leave policy_distance and hellinger_samples out.")
     if not policies:
         warnings.warn(
-            f"{loss} has no policy network: L2C2Loss leaves out the policy term and regularizes "
-            f"{', '.join(values)} alone.",
+            f"{loss} has no policy: L2C2Loss leaves out the policy term; left {', '.join(values)}.",
             stacklevel=3,
         )
     if beta and not values:

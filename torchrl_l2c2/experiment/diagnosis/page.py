@@ -23,7 +23,7 @@ from torchrl_l2c2.experiment.diagnosis.words import (
     findings,
     listed,
 )
-from torchrl_l2c2.experiment.folder import write_atomically
+from torchrl_l2c2.experiment.files import write_atomically
 from torchrl_l2c2.experiment.reports.document import inside, picture, whole_page
 from torchrl_l2c2.experiment.reports.measures import MEASURES
 from torchrl_l2c2.experiment.reports.tables import Table

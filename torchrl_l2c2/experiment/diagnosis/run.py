@@ -19,11 +19,11 @@ from torchrl.objectives import LossModule
 
 from torchrl_l2c2.experiment.algorithms.agent import Agent
 from torchrl_l2c2.experiment.algorithms.normalization import Normalization
+from torchrl_l2c2.experiment.checkpoints import load_newest
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.diagnosis.measured import Diagnosis, TermShare, Value, diagnose
 from torchrl_l2c2.experiment.environments import TEST_SEED
 from torchrl_l2c2.experiment.export import entry_names
-from torchrl_l2c2.experiment.folder import load_newest
 from torchrl_l2c2.experiment.influence import gradient_shares
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.saved import read_config

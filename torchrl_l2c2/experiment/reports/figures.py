@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_l2c2.experiment.folder import write_atomically
+from torchrl_l2c2.experiment.files import write_atomically
 from torchrl_l2c2.experiment.reports.comparison import Estimate
 from torchrl_l2c2.experiment.reports.field import MEASURES, published_of
 from torchrl_l2c2.experiment.reports.front import means, pareto_front

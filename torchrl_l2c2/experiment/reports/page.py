@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from torchrl_l2c2.experiment.folder import make_folder, write_atomically, write_json
+from torchrl_l2c2.experiment.files import make_folder, write_atomically, write_json
 from torchrl_l2c2.experiment.reports.choice import choice_table
 from torchrl_l2c2.experiment.reports.comparison import statistics_tables, summary
 from torchrl_l2c2.experiment.reports.document import picture, whole_page

@@ -12,7 +12,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from torchrl_l2c2.experiment.folder import make_folder, write_atomically
+from torchrl_l2c2.experiment.files import make_folder, write_atomically
 from torchrl_l2c2.experiment.reports.differences import BUDGETS, read_differences
 from torchrl_l2c2.experiment.reports.paper import TAU, Published, method_order, paper_of
 from torchrl_l2c2.experiment.saved import read_rows

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torchrl_l2c2.experiment.folder import write_json
+from torchrl_l2c2.experiment.files import write_json
 from torchrl_l2c2.experiment.reports.choice import choice_table
 from torchrl_l2c2.experiment.reports.faster_targets import faster_targets_table
 from torchrl_l2c2.experiment.reports.field import field_table

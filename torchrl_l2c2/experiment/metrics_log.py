@@ -1,0 +1,81 @@
+"""A run's metrics while it is trained: metrics.csv, and what a logger writes."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from torchrl_l2c2.experiment.files import append_line, write_atomically
+from torchrl_l2c2.experiment.loggers import close_logger, make_logger
+
+
+class MetricsLog:
+    """Writes rows of numbers; a killed process leaves no half of a line.
+
+    Args:
+        folder (Path, optional): where ``metrics.csv`` goes, and what the logger writes; ``None``
+            writes nothing.
+        logger (str): one of :func:`~torchrl_l2c2.experiment.loggers.make_logger`.
+    """
+
+    def __init__(self, folder: Path | None, *, logger: str = "csv") -> None:
+        self.path = None if folder is None else folder / "metrics.csv"
+        self.columns: list[str] | None = None
+        self._name = logger
+        self._logger = None if folder is None else make_logger(logger, folder)
+
+    def close(self) -> None:
+        """Ends what the logger has open."""
+        if self._logger is not None:
+            self._logger = None
+            close_logger(self._name)
+
+    def write(self, row: Mapping[str, float]) -> None:
+        """Adds one line; the first line fixes the columns.
+
+        Raises:
+            ValueError: the row's names differ from the first row's.
+        """
+        if self.path is None:
+            return
+        if self.columns is None:
+            self.columns = list(row)
+            write_atomically(self.path, _line(self.columns).encode())
+        if list(row) != self.columns:
+            raise ValueError(f"the metrics changed from {self.columns} to {list(row)}.")
+        append_line(self.path, _line(row.values()))
+        if self._logger is not None:
+            for name, value in row.items():
+                self._logger.log_scalar(name, value, step=int(row["frames"]))
+
+    def state_dict(self) -> dict[str, Any]:
+        """How far the file goes."""
+        size = 0 if self.path is None or self.columns is None else self.path.stat().st_size
+        return {"columns": self.columns, "size": size}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Cuts off what was written after the state was taken, so that no line comes twice.
+
+        Raises:
+            ValueError: the file is shorter than it was.
+        """
+        self.columns = state["columns"]
+        if self.path is None or self.columns is None:
+            return
+        size = self.path.stat().st_size if self.path.exists() else 0
+        if size < state["size"]:
+            raise ValueError(
+                f"{self.path} has {size} bytes, the checkpoint was taken at {state['size']}: it "
+                "was changed since. Restore it, or choose another folder."
+            )
+        os.truncate(self.path, state["size"])
+
+
+def _line(cells: Iterable[object]) -> str:
+    line = io.StringIO()
+    csv.writer(line, lineterminator="\n").writerow(cells)
+    return line.getvalue()
