@@ -2,9 +2,10 @@
 
 import pytest
 import torch
+from torch._inductor import config as inductor_config
 from torch._inductor.utils import run_and_get_code
 
-from torchrl_l2c2.experiment.compilation import compiled, compiler_available
+from torchrl_l2c2.experiment.compilation import CompilerError, compiled, compiler_available
 
 pytestmark = pytest.mark.skipif(not compiler_available(), reason="no C++ compiler")
 
@@ -116,3 +117,17 @@ def test_biases_are_added_where_the_product_is_used():
     with torch._dynamo.config.patch(trace_autograd_ops=True):
         _, (plain,) = run_and_get_code(torch.compile(slopes, fullgraph=True), x)
     assert "addmm(" in plain
+
+
+def test_a_compiler_that_fails_is_one_line(tmp_path, monkeypatch):
+    """The one that says why, with what to do; the rest is the error's cause."""
+    broken = tmp_path / "g++"
+    lines = ("#!/bin/sh", '[ "$*" = --version ] && exec g++ "$@"', "echo In file included >&2")
+    broken.write_text("\n".join([*lines, "echo a.h:1: error: no >&2", "exit 1"]))
+    broken.chmod(0o755)
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path / "cache"))
+    options = {"cpp.cxx": (str(broken),), "force_disable_caches": True}
+    why = r"^the compiler failed \(a.h:1: error: no\): compile="
+    with inductor_config.patch(options), pytest.raises(CompilerError, match=why) as told:
+        compiled(lambda x: x.sin() + 7.5)(torch.rand(3))
+    assert "In file included" in str(told.value.__cause__)

@@ -27,6 +27,10 @@ from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_mod
 from torch.utils._pytree import tree_flatten, tree_map_only, tree_unflatten
 
 
+class CompilerError(RuntimeError):
+    """The compiler failed: of its hundreds of lines the one that says why."""
+
+
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compiles a function into one graph, with the gradients that it takes.
 
@@ -42,7 +46,7 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
             what its tensors hold, and it may keep none of them.
 
     Returns:
-        Callable: the compiled function.
+        Callable: the compiled function. It raises :class:`CompilerError` where there is none.
     """
     programs: dict[tuple[Any, ...], _Program] = {}
 
@@ -199,9 +203,20 @@ def _compile(
         "size_asserts": False,
         "post_grad_custom_post_pass": _BiasesApart(),
     }
-    with torch.no_grad(), tracing(TracingContext(mode)), inductor_config.patch(options):
-        program: Any = compile_fx(module, inputs)
+    try:
+        with torch.no_grad(), tracing(TracingContext(mode)), inductor_config.patch(options):
+            program: Any = compile_fx(module, inputs)
+    except RuntimeError as error:
+        raise CompilerError(_failure(str(error).splitlines())) from error
     return program
+
+
+def _failure(lines: Sequence[str]) -> str:
+    wrong = [line.strip() for line in lines if "error:" in line]
+    return (
+        f"the compiler failed ({(wrong or lines or ['it says nothing'])[0]}): compile=false trains "
+        "without it, several times slower."
+    )
 
 
 class _BiasesApart(CustomGraphPass):

@@ -42,7 +42,14 @@ def terminate(number: int, frame: Any) -> NoReturn:
 
 @contextlib.contextmanager
 def stop_on_signals() -> Iterator[list[int]]:
-    """Collects SIGTERM and SIGINT in a list instead of dying; a second one acts as usual."""
+    """Collects SIGTERM and SIGINT in a list instead of dying; a second one acts as usual.
+
+    A signal to all processes of a job ends compilers and workers too, and what is being done then
+    fails: that is not its fault, but the signal's.
+
+    Raises:
+        KeyboardInterrupt: a ``RuntimeError`` after a signal.
+    """
     received = list(_heard)
     if threading.current_thread() is not threading.main_thread():
         yield received
@@ -69,6 +76,10 @@ def stop_on_signals() -> Iterator[list[int]]:
         signal.signal(number, receive)
     try:
         yield received
+    except RuntimeError as error:
+        if not received:
+            raise
+        raise Terminated if received[0] == signal.SIGTERM else KeyboardInterrupt from error
     finally:
         restore()
 

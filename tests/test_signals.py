@@ -1,0 +1,32 @@
+"""What a signal does to what is being done."""
+
+import os
+import signal
+
+import pytest
+
+from torchrl_l2c2.experiment.signals import Terminated, stop_on_signals
+
+
+@pytest.mark.parametrize(
+    ("number", "ended"), [(signal.SIGTERM, Terminated), (signal.SIGINT, KeyboardInterrupt)]
+)
+def test_what_fails_after_a_signal_to_all_processes_was_ended_by_it(number, ended):
+    """A compiler, or a worker, that heard it as well: the run can go on, and a sweep ends."""
+    before = signal.getsignal(number)
+    with pytest.raises(KeyboardInterrupt) as told, stop_on_signals() as received:
+        os.kill(os.getpid(), number)
+        assert received == [number]
+        raise RuntimeError("g++ was killed")
+    assert type(told.value) is ended and "g++" in str(told.value.__cause__)
+    assert signal.getsignal(number) == before
+
+
+@pytest.mark.parametrize("error", [OSError("no space left"), FloatingPointError("NaN")])
+def test_other_failures_are_told_with_or_without_one(error):
+    """A checkpoint that could not be written is not the signal's doing."""
+    with pytest.raises(type(error), match=str(error)), stop_on_signals():
+        os.kill(os.getpid(), signal.SIGTERM)
+        raise error
+    with pytest.raises(RuntimeError, match="its own"), stop_on_signals():
+        raise RuntimeError("its own")
