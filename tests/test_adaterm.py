@@ -432,3 +432,25 @@ def test_sparse_gradients_are_refused():
     embedding(torch.tensor([1])).sum().backward()
     with pytest.raises(RuntimeError, match="sparse gradients are not supported"):
         AdaTerm(embedding.parameters()).step()
+
+
+@pytest.mark.parametrize("other", [torch.optim.Adam, torch.optim.SGD])
+def test_another_optimizers_state_is_refused(other):
+    """When it is loaded, and with nothing changed."""
+    x = torch.nn.Parameter(torch.ones(2))
+    optimizer = AdaTerm([x], lr=0.5)
+    with pytest.raises(ValueError, match=r"the state has no .*nu_min.* it is another optimizer's"):
+        optimizer.load_state_dict(other([x], lr=0.1).state_dict())
+    assert optimizer.param_groups[0]["lr"] == 0.5
+
+
+def test_a_parameter_without_numbers_stays_as_it_is():
+    """And leaves no NaN in what is saved."""
+    empty, x = torch.nn.Parameter(torch.ones(0)), torch.nn.Parameter(torch.ones(1))
+    optimizer = AdaTerm([empty, x], lr=0.5)
+    for _ in range(100):
+        optimizer.zero_grad()
+        (x.square().sum() + empty.sum()).backward()
+        optimizer.step()
+    assert x.item() < 1.0
+    assert all(state["nu"].isfinite() for state in optimizer.state.values())

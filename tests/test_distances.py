@@ -14,6 +14,7 @@ from torch import distributions as d
 from torchrl import modules as rl
 
 from torchrl_l2c2 import affinities, register_hellinger, squared_error, squared_hellinger
+from torchrl_l2c2.policy_distances import kl_divergence
 
 
 @pytest.fixture(autouse=True)
@@ -580,6 +581,47 @@ def test_other_actions_are_refused():
     p = d.Normal(torch.zeros(4, 3), 1.0)
     with pytest.raises(ValueError, match=r"\(\) and \(3,\)"):
         squared_hellinger(p, d.Independent(p, 1))
+
+
+@pytest.mark.parametrize("distance", [squared_hellinger, kl_divergence])
+@pytest.mark.parametrize(
+    ("p", "q", "error", "message"),
+    [
+        (
+            d.Normal(torch.zeros(3), 1.0),
+            d.Normal(torch.zeros(2), 1.0),
+            ValueError,
+            r"batch shapes that broadcast, got \(3,\) and \(2,\)",
+        ),
+        (
+            d.Normal(torch.zeros(4), 1.0),
+            d.Categorical(torch.ones(4, 3)),
+            ValueError,
+            "got Normal of no labels and Categorical of 3 labels",
+        ),
+        (
+            d.Categorical(torch.ones(3)),
+            d.Categorical(torch.ones(2)),
+            ValueError,
+            "Categorical of 3 labels and Categorical of 2 labels",
+        ),
+        (torch.zeros(3), torch.zeros(3), TypeError, "must be distributions, got Tensor"),
+    ],
+    ids=["batches", "kinds", "labels", "actions"],
+)
+def test_pairs_that_do_not_fit_are_refused(distance, p, q, error, message):
+    """With both of them."""
+    with pytest.raises(error, match=message):
+        distance(p, q)
+
+
+def test_samples_of_masked_policies_are_refused():
+    """They score no batch of draws; the closed form they have."""
+    logits, mask = torch.zeros(2, 3), torch.tensor([True, False, True])
+    p = rl.MaskedCategorical(logits=logits, mask=mask.expand(2, 3))
+    with pytest.raises(TypeError, match="leave num_samples, or hellinger_samples, at None"):
+        squared_hellinger(p, p, num_samples=4)
+    assert squared_hellinger(p, p).tolist() == [0.0, 0.0]
 
 
 # Values

@@ -121,6 +121,20 @@ class TestByHand:
         assert again.value == gain.value != make().value
         assert again.step(0.9) == gain.step(0.9)
 
+    def test_a_state_of_another_kind_changes_nothing(self):
+        """The value is not half of the other's."""
+        gain = GradientGain(0.1)
+        with pytest.raises(ValueError, match=r"GradientGain has .*another kind"):
+            gain.load_state_dict(TargetGain(0.1, value=3.0).state_dict())
+        assert gain.value == 1.0
+
+    @pytest.mark.parametrize("make", [lambda: GradientGain(0.1), lambda: TargetGain(0.1)])
+    @pytest.mark.parametrize("measured", ["a", None, True])
+    def test_what_is_measured_is_a_number(self, make, measured):
+        """Which may be NaN, and then says nothing."""
+        with pytest.raises(TypeError, match="measured must be a real number, got"):
+            make().step(measured)
+
     @pytest.mark.parametrize(
         ("make", "message"),
         [

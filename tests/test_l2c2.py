@@ -468,9 +468,25 @@ class TestWhichStatesAreMoved:
 
     def test_a_key_that_the_batch_lacks_is_named(self):
         """With what there is."""
-        loss, batch = self.two_part_loss(moved_keys=["speed"])
-        with pytest.raises(KeyError, match="needs 'speed', which the tensordict lacks"):
-            loss.policy_regularizer(batch)
+        loss, batch = self.two_part_loss(moved_keys=["velocity"])
+        with pytest.raises(KeyError, match=r"velocity.*position"):
+            loss.policy_regularizer(batch.exclude(("next", "velocity"), "velocity"))
+
+    @pytest.mark.parametrize(
+        ("given", "error", "message"),
+        [
+            ({"moved_keys": ["speed"]}, ValueError, r"names \['speed'\], and the networks read"),
+            ({"moved_keys": ["action"]}, ValueError, r"names \['action'\]"),
+            ({"moved_keys": 3}, TypeError, "must be a list of entries, got 3"),
+            ({"moved_keys": [3]}, TypeError, "an entry of moved_keys must be a string"),
+            ({"neighbor_key": None}, TypeError, "neighbor_key must be a string or a tuple"),
+            ({"neighbor_key": ["a", "b"]}, TypeError, "neighbor_key must be a string or a tuple"),
+        ],
+    )
+    def test_names_are_checked_when_the_loss_is_made(self, given, error, message):
+        """Not with the first batch."""
+        with pytest.raises(error, match=message):
+            self.two_part_loss(**given)
 
     def test_transitions_with_too_long_a_step_count_nothing(self):
         """The step of either part: values, gradients and diagnostics of the others remain."""

@@ -106,6 +106,12 @@ def test_neighbors_that_did_not_move_are_left_out():
         assert result[1].isnan()
 
 
+def test_a_neighbor_that_is_no_number_shows():
+    """Rather than being left out."""
+    state, neighbor = torch.zeros(1), torch.tensor([[1.0], [math.nan]])
+    assert local_lipschitz(state, neighbor, state, neighbor).isnan()
+
+
 def test_local_lipschitz_refuses_shapes_that_do_not_fit():
     """Naming the argument and the shapes."""
     state, neighbor = torch.zeros(4, 3), torch.zeros(4, 2, 3)
@@ -245,3 +251,27 @@ def test_measures_of_batches_and_what_is_too_short(measure, least):
         measure(torch.zeros(least - 1, 2))
     with pytest.raises(ValueError, match=rf"{measure.__name__}: actions must .* got \(9,\)"):
         measure(torch.zeros(9))
+
+
+@pytest.mark.parametrize(
+    "measure",
+    [
+        *(action_variation, action_rate, action_fluctuation_ratio, action_jerk),
+        *(previous_action_gain, amplitude_spectrum, spectral_smoothness, roughness),
+        lambda actions: saturation(actions, -1.0, 1.0),
+    ],
+)
+def test_labels_and_arrays_are_refused_and_half_precision_is_not(measure):
+    """Integers would be rounded to a number that means nothing."""
+    torch.manual_seed(0)
+    for given in (torch.ones(9, 2, dtype=torch.long), np.ones((9, 2))):
+        told = f"must be a floating-point tensor, got {given.dtype}"
+        with pytest.raises(TypeError, match=told):
+            measure(given)
+    drawn = torch.randn(9, 2).bfloat16()
+    for half, full in zip(
+        torch.utils._pytree.tree_leaves(measure(drawn)),
+        torch.utils._pytree.tree_leaves(measure(drawn.float())),
+        strict=True,
+    ):
+        torch.testing.assert_close(half.float(), full, rtol=0.05, atol=0.05)

@@ -191,6 +191,12 @@ def test_several_observations_are_concatenated():
     assert actor(parts)["action"].shape == (4, 1)
 
 
+def test_a_string_is_one_observation():
+    """And not its letters."""
+    assert make_actor(3, 1, in_keys="observation").in_keys == ["observation"]
+    assert make_critic(3, in_keys="observation").in_keys == ["observation"]
+
+
 def test_torchrls_ppo_trains_them_as_they_are():
     """Its default keys fit, and every parameter of both networks gets a gradient."""
     actor, critic = make_actor(3, 2), make_critic(3)
@@ -256,6 +262,12 @@ def test_compiled_they_give_the_same_numbers():
         (lambda: make_actor(3, Categorical(4)), TypeError, "must be continuous"),
         (lambda: make_actor(3, Composite(a=Unbounded((2,)))), TypeError, "single tensor"),
         (lambda: make_critic(3, num_heads=0), ValueError, "num_heads must be at least 1, got 0"),
+        (lambda: make_actor(3, 1, hidden=32), TypeError, "sizes of the layers, .* got 32"),
+        (
+            lambda: make_actor(3, 1, scale_mapping="square"),
+            ValueError,
+            "scale_mapping='square' is unknown",
+        ),
         (lambda: make_critic(2.5), TypeError, "observation_size must be "),
     ],
 )

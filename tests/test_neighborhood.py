@@ -210,7 +210,7 @@ def test_numbers_of_another_shape_are_refused():
     """The message has the shapes."""
     with pytest.raises(ValueError, match=r"uniform must have the shape \[\*B, K, \*F\].*\(4, 3\)"):
         Neighborhood().place(torch.zeros(4, 3), torch.zeros(4, 3), torch.zeros(4, 3))
-    with pytest.raises(TypeError, match="must be floating point"):
+    with pytest.raises(TypeError, match="must be a floating-point tensor"):
         Neighborhood().draw(torch.zeros(4, 3, dtype=torch.long))
 
 

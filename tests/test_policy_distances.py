@@ -13,7 +13,7 @@ from tensordict.nn import CompositeDistribution
 from torch import distributions as d
 from torchrl import modules as rl
 
-from torchrl_l2c2 import make_actor
+from torchrl_l2c2 import make_actor, squared_hellinger
 from torchrl_l2c2.policy_distances import (
     choose_policy_distance,
     kl_divergence,
@@ -29,7 +29,6 @@ def seed():
 
 LOC = torch.tensor([[0.5, -3.0], [1.0, 2.0]])
 KINDS = {
-    "normal": lambda loc: d.Normal(loc, 0.7),
     "independent": lambda loc: d.Independent(d.Normal(loc, 0.7), 1),
     "independent_normal": lambda loc: rl.IndependentNormal(loc, torch.full_like(loc, 0.7)),
     "tanh_normal": lambda loc: rl.TanhNormal(loc, torch.full_like(loc, 0.7), low=-2.0, high=4.0),
@@ -54,6 +53,26 @@ class TestMeanDistance:
         p, q = (actor.get_dist(td) for td in (batch.clone(), batch["next"].clone()))
         here, there = (actor.get_dist_params(td)["loc"] for td in (batch, batch["next"]))
         torch.testing.assert_close(mean_distance(p, q), 0.5 * (here - there).square().sum(-1))
+
+    def test_a_normal_without_a_dimension_of_its_own_is_one_number(self):
+        """As torch counts it, and by every distance alike."""
+        p, q = d.Normal(torch.zeros(2, 3), 1.0), d.Normal(torch.ones(2, 3), 1.0)
+        torch.testing.assert_close(mean_distance(p, q), torch.full((2, 3), 0.5))
+        assert squared_hellinger(p, q).shape == kl_divergence(p, q).shape == (2, 3)
+
+    def test_actions_that_a_mask_lists_are_compared_by_their_numbers(self):
+        """In whatever order each lists them."""
+        listed, logits = torch.tensor([[0, 2, 3]]), torch.tensor([[1.0, 0.0, -1.0, 2.0]])
+        p = rl.MaskedCategorical(logits=logits, indices=listed)
+        q = rl.MaskedCategorical(logits=logits, indices=listed.flip(1))
+        moved = rl.MaskedCategorical(logits=2 * logits, indices=listed.flip(1))
+        dense = [
+            rl.MaskedCategorical(logits=k * logits, mask=torch.tensor([[True, False, True, True]]))
+            for k in (1, 2)
+        ]
+        for distance in (mean_distance, kl_divergence, squared_hellinger):
+            assert distance(p, q).item() == pytest.approx(0.0, abs=1e-6)
+            torch.testing.assert_close(distance(p, moved), distance(*dense))
 
     def test_of_discrete_policies_the_probabilities_are_compared(self):
         """(.5, .5) and (.9, .1): 1/2 (.16 + .16)."""
@@ -118,6 +137,12 @@ class TestKLDivergence:
         assert kl_divergence(p, q).item() == pytest.approx(expected)
         backward = math.log(0.5) + (4 + 9) / 2 - 0.5
         assert kl_divergence(q, p).item() == pytest.approx(backward)
+
+    def test_what_one_never_does_and_the_other_does_is_infinitely_far(self):
+        """As torch has it, also of probabilities that were given as 0."""
+        often, never = d.Categorical(probs=torch.full((2,), 0.5)), torch.tensor([1.0, 0.0])
+        assert kl_divergence(often, d.Categorical(probs=never)) == math.inf
+        assert kl_divergence(d.Categorical(probs=never), often).item() == pytest.approx(math.log(2))
 
     def test_squashing_changes_nothing(self):
         """Two TanhNormals of the same bounds have the divergence of their normals, compiled too."""

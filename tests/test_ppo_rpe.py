@@ -310,6 +310,14 @@ def test_dispatch_takes_keyword_arguments():
     torch.testing.assert_close(outputs[0], loss(batch)["loss_actor"])
 
 
+def test_a_batch_without_the_likelihood_of_its_actions_is_told():
+    """Which entry it lacks."""
+    loss = make_loss()
+    batch = make_batch(loss, [1.2], [0.3]).exclude("action_log_prob")
+    with pytest.raises(KeyError, match=r"no 'action_log_prob': keep it, or take baseline='target'"):
+        loss(batch)
+
+
 def test_renamed_keys_are_read():
     """set_keys moves every key, the value estimator's among them."""
     loss = make_loss()

@@ -6,6 +6,7 @@ import copy
 import gc
 import math
 import pickle
+import threading
 
 import pytest
 import torch
@@ -175,10 +176,67 @@ class TestTheClass:
 
     def test_the_same_regularizer_is_not_applied_twice(self):
         """Neither directly nor with another one in between."""
-        with pytest.raises(TypeError, match="already wrapped by L2C2Loss"):
+        with pytest.raises(TypeError, match="has the terms of L2C2Loss already: wrap"):
             L2C2Loss(L2C2Loss(ddpg()))
-        with pytest.raises(TypeError, match="already wrapped by L2C2Loss"):
+        with pytest.raises(TypeError, match="has the terms of L2C2Loss already: wrap"):
             L2C2Loss(CAPSLoss(L2C2Loss(ddpg())))
+
+    @pytest.mark.parametrize(
+        ("declare", "error", "message"),
+        [
+            (lambda s: s.declare_networks("actor_network"), TypeError, r"\['actor_network'\] is"),
+            (lambda s: s.declare_networks(["policy"]), ValueError, "no network 'policy'"),
+            (lambda s: s.declare_terms(policy="loss_d"), TypeError, r"\['loss_d'\] is one"),
+            (lambda s: s.declare_terms(policy=["loss_actor"]), ValueError, "has .* already"),
+        ],
+    )
+    def test_wrong_declarations_are_told(self, declare, error, message):
+        """Where they are made."""
+
+        class Regularizer(RegularizedLoss):
+            def __init__(self, base_loss):
+                declare(self)
+
+        with pytest.raises(error, match=message):
+            Regularizer(ddpg())
+
+    def test_two_threads_have_a_forward_pass_each(self):
+        """What one has evaluated is not taken for the other's."""
+        loss, batches = L2C2Loss(ddpg(), NEAR), [transitions(32), transitions(32)]
+        batches = [NeighborTransform(NEAR)(batch) for batch in batches]
+        expected, wrong = [loss(batch)["loss_l2c2_actor"].item() for batch in batches], []
+
+        def ask(i):
+            for _ in range(60):
+                if loss(batches[i])["loss_l2c2_actor"].item() != expected[i]:
+                    wrong.append(i)
+
+        threads = [threading.Thread(target=ask, args=(i,)) for i in range(2)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert expected[0] != expected[1] and not wrong
+
+    def test_the_gain_may_be_a_tensor_when_it_is_made_too(self):
+        """As where it is assigned to."""
+        assert L2C2Loss(ddpg(), coeff=torch.tensor(0.25)).l2c2_coeff == 0.25
+
+    def test_noise_that_the_policy_reads_is_no_state(self):
+        """TorchRL's own entries, such as the matrix of gSDE: it does not move with the state."""
+        policy = TensorDictModule(
+            nn.Bilinear(OBSERVATION, 2, ACTION), ["observation", "_eps_gSDE"], ["action"]
+        )
+        batch = transitions(4)
+        batch["_eps_gSDE"] = batch["next", "_eps_gSDE"] = torch.ones(4, 2)
+        near = Neighborhood(lambda_min=0.1, lambda_max=1.0)
+        torch.manual_seed(0)
+        found = L2C2Loss(DDPGLoss(policy, qvalue()), near, beta=0.0).policy_regularizer(batch)
+        torch.manual_seed(0)
+        expected = L2C2Loss(
+            DDPGLoss(policy, qvalue()), near, beta=0.0, moved_keys="observation"
+        ).policy_regularizer(batch)
+        assert found["l2c2_distance"] == expected["l2c2_distance"]
 
     def test_terms_are_declared_with_what_they_train(self):
         """They follow the loss's own in out_keys; those of all regularizers are policy_terms."""
@@ -328,6 +386,22 @@ class TestWhatIsRefused:
         )
         with pytest.raises(TypeError, match="actor_network is recurrent"):
             L2C2Loss(PPOLoss(actor, critic()))
+
+    @pytest.mark.parametrize("inside", [nn.GRUCell(OBSERVATION, 1), nn.LSTM(OBSERVATION, 1)])
+    def test_recurrent_policies_of_torchs_own_layers(self, inside):
+        """Which TorchRL's modules are not around."""
+        actor = Actor(nn.Sequential(nn.Linear(OBSERVATION, OBSERVATION), inside))
+        with pytest.raises(TypeError, match="actor_network is recurrent"):
+            L2C2Loss(DDPGLoss(actor, qvalue()))
+
+    def test_policies_that_hand_a_state_on(self):
+        """What they write for the next step, they read in it."""
+        step = TensorDictModule(
+            nn.Bilinear(OBSERVATION, 2, 2), ["observation", "memory"], [("next", "memory")]
+        )
+        act = TensorDictModule(nn.Linear(2, ACTION), [("next", "memory")], ["action"])
+        with pytest.raises(TypeError, match="actor_network is recurrent"):
+            L2C2Loss(DDPGLoss(TensorDictSequential(step, act), qvalue()))
 
     def test_observations_that_are_integers(self):
         """There is nothing between two labels: the key and its type are named."""

@@ -280,6 +280,18 @@ class TestASAP:
             ASAPLoss(linear_base()).policy_regularizer(self.batch())
 
 
+@pytest.mark.parametrize(
+    "make", [lambda: SR2LLoss(linear_base()), lambda: LCPLoss(linear_normal())]
+)
+def test_what_takes_gradients_says_so_in_inference_mode(make):
+    """Torch keeps none there; under no_grad it does."""
+    loss, batch = make(), transitions(4)
+    with torch.no_grad():
+        assert not loss.policy_regularizer(batch).is_empty()
+    with torch.inference_mode(), pytest.raises(RuntimeError, match="validate under"):
+        loss.policy_regularizer(batch)
+
+
 class TestSR2L:
     def test_of_a_linear_policy_the_worst_state_is_a_corner(self):
         """1/2 max |W d|^2 over the corners of the box."""
@@ -580,7 +592,7 @@ def test_rivals_combine_with_l2c2(rival):
     make, term, _ = rival
     loss = make(L2C2Loss(PPOLoss(gaussian_actor(), None), beta=0))
     assert {"loss_l2c2_actor", term} <= set(loss.out_keys)
-    with pytest.raises(TypeError, match="already wrapped"):
+    with pytest.raises(TypeError, match=r"has the terms of .* already"):
         make(loss)
 
 

@@ -65,6 +65,12 @@ def cats(gain=3.0):
     return CATSLoss(DDPGLoss(deterministic_actor(), qvalue()), gain)
 
 
+def unread():
+    loss = cats()
+    loss.select_out_keys("loss_actor", "loss_value")
+    return loss
+
+
 def gradient(loss, value):
     return torch.autograd.grad(value, list(loss.parameters()), allow_unused=True)
 
@@ -167,7 +173,7 @@ class TestAroundALoss:
             (
                 lambda: TchebycheffLoss(DDPGLoss(deterministic_actor(), qvalue())),
                 TypeError,
-                "DDPGLoss has none: put L2C2Loss",
+                "DDPGLoss has none among its out_keys: put L2C2Loss",
             ),
             (lambda: TchebycheffLoss(cats(), 0.0), ValueError, "mu must be finite and greater"),
             (lambda: TchebycheffLoss(cats(), ideal=0.0), TypeError, "ideal must be two numbers"),
@@ -177,6 +183,12 @@ class TestAroundALoss:
                 ValueError,
                 r"objectives must name .*'loss_actor'.* got \['loss_pi'\]",
             ),
+            (
+                lambda: TchebycheffLoss(cats(), objectives=("loss_actor", "loss_cats")),
+                ValueError,
+                "which are the loss's own, got .*loss_cats",
+            ),
+            (lambda: TchebycheffLoss(unread()), TypeError, "has none among its out_keys"),
             (
                 lambda: TchebycheffLoss(
                     CATSLoss(DDPGLoss(deterministic_actor(), qvalue(), reduction="none"))

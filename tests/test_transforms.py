@@ -534,3 +534,13 @@ def test_a_state_that_was_loaded_to_an_accelerator_is_restored(make, monkeypatch
     transform = make(generator(4))
     transform.set_extra_state(loaded)
     assert transform.generator.get_state().equal(saved)
+
+
+def test_noise_is_refused_in_a_replay_buffer():
+    """Where the state would have some and its successor none."""
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(8), batch_size=4)
+    buffer.append_transform(ObservationNoise(0.1))
+    state = {"observation": torch.zeros(8, 3)}
+    buffer.extend(TensorDict({**state, "next": state}, [8]))
+    with pytest.raises(ValueError, match="belongs to an environment, not to a replay buffer"):
+        buffer.sample()

@@ -106,11 +106,12 @@ def _categorical(p: Categorical, q: Categorical) -> Tensor:
 
 @register_hellinger(MaskedCategorical)
 def _masked_categorical(p: MaskedCategorical, q: MaskedCategorical) -> Tensor:
-    return _finite_log_affinity(_all_probs(p), _all_probs(q))
+    return _finite_log_affinity(all_probs(p), all_probs(q))
 
 
-def _all_probs(distribution: MaskedCategorical) -> Tensor:
-    if not distribution._sparse_mask:
+def all_probs(distribution: Any) -> Tensor:
+    """The probabilities ``[*B, N]`` of all discrete actions, those of masked ones included."""
+    if not getattr(distribution, "_sparse_mask", False):
         return distribution.probs
     # A sparse mask keeps the probabilities of the listed actions only. Padding has none, and may
     # be listed under any number.

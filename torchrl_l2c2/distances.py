@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from tensordict.nn import CompositeDistribution
 from torch import Tensor
-from torch.distributions import Distribution
+from torch.distributions import Categorical, Distribution
 from torchrl.modules import Delta, TanhDelta
 
 from torchrl_l2c2._checks import check_positive_int
@@ -150,6 +150,11 @@ def check_pair(p: Distribution, q: Distribution) -> None:
         ValueError: they are distributions of different actions.
     """
     for distribution in (p, q):
+        if not isinstance(distribution, Distribution):
+            raise TypeError(
+                f"policies must be distributions, got {type(distribution).__name__}: compare "
+                "actions with squared_error."
+            )
         if isinstance(distribution, (Delta, TanhDelta)):
             raise TypeError(
                 f"{type(distribution).__name__} has no density, so no Hellinger distance and no "
@@ -169,6 +174,25 @@ def check_pair(p: Distribution, q: Distribution) -> None:
             "p and q must be distributions of the same actions, got event shapes "
             f"{tuple(p.event_shape)} and {tuple(q.event_shape)}."
         )
+    try:
+        torch.broadcast_shapes(p.batch_shape, q.batch_shape)
+    except RuntimeError as error:
+        raise ValueError(
+            "p and q must have batch shapes that broadcast, got "
+            f"{tuple(p.batch_shape)} and {tuple(q.batch_shape)}."
+        ) from error
+    if _labels(p) != _labels(q):
+        raise ValueError(
+            "p and q must be distributions of the same actions, got "
+            f"{type(p).__name__} of {_labels(p)} and {type(q).__name__} of {_labels(q)}."
+        )
+
+
+def _labels(distribution: Distribution) -> str:
+    if not isinstance(distribution, Categorical):
+        return "no labels"
+    # Of a mask that lists some, all.
+    return f"{getattr(distribution, 'num_samples', distribution.probs.shape[-1])} labels"
 
 
 def _monte_carlo(p: Distribution, q: Distribution, num_samples: int) -> Tensor:
@@ -179,10 +203,11 @@ def _monte_carlo(p: Distribution, q: Distribution, num_samples: int) -> Tensor:
             _mixture_difference(p, q, source.sample(draws(source, other, num_samples)))
             for source, other in ((p, q), (q, p))
         ]
-    except NotImplementedError as error:
+    except (NotImplementedError, ValueError) as error:  # Masked ones score no batch of draws.
         raise TypeError(
-            f"{type(p).__name__} and {type(q).__name__} have no closed-form Hellinger distance "
-            "and cannot be sampled and scored: register one with register_hellinger."
+            f"{type(p).__name__} and {type(q).__name__} cannot be sampled and scored: leave "
+            "num_samples, or hellinger_samples, at None where there is a closed form, or register "
+            "one with register_hellinger."
         ) from error
     return 0.5 * (halves[0] + halves[1])
 

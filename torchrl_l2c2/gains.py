@@ -10,6 +10,8 @@ also between calls of a compiled loss::
 from __future__ import annotations
 
 import math
+from numbers import Real
+from typing import Any
 
 from torchrl_l2c2._checks import as_number, check_real
 
@@ -42,7 +44,17 @@ class ConstantGain:
         return {"value": self.value}
 
     def load_state_dict(self, state: dict[str, float]) -> None:
-        """Restores what :meth:`state_dict` gave."""
+        """Restores what :meth:`state_dict` gave.
+
+        Raises:
+            ValueError: it is that of a gain of another kind; nothing is changed.
+        """
+        if state.keys() != self.state_dict().keys():
+            raise ValueError(
+                f"{type(self).__name__} has {list(self.state_dict())}, got {list(state)}: that is "
+                "the state of another kind of gain."
+            )
+        check_real("value", state["value"], at_least=0)
         self.value = state["value"]
 
 
@@ -141,7 +153,7 @@ class GradientGain(_BoundedGain):
 
     def step(self, measured: float = math.nan) -> float:
         """The next value after a share :math:`\\rho`; 0 and what is not finite change nothing."""
-        measured = as_number("measured", measured)
+        measured = _measured(measured)
         if 0.0 < measured < math.inf:
             wanted = self.share / measured
             self._measurements += 1
@@ -200,8 +212,16 @@ class TargetGain(_BoundedGain):
 
     def step(self, measured: float = math.nan) -> float:
         """The next value after a measure :math:`m`; one that is not finite changes nothing."""
-        measured = as_number("measured", measured)
+        measured = _measured(measured)
         if math.isfinite(measured):
             excess = min(max(measured / self.target - 1.0, -1.0), 1.0)
             self._multiply(math.exp(self.rate * excess))
         return self.value
+
+
+def _measured(measured: Any) -> float:
+    """A number, which need not be finite."""
+    measured = as_number("measured", measured)
+    if not isinstance(measured, Real) or isinstance(measured, bool):
+        raise TypeError(f"measured must be a real number, got {measured!r}.")
+    return float(measured)

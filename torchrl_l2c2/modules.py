@@ -136,7 +136,7 @@ def make_actor(
     squash: Literal["tanh", "sigmoid", "none"] = "tanh",
     scale_mapping: str = "biased_softplus_1.0",
     squish_b: float = 4.0,
-    in_keys: Sequence[NestedKey] = ("observation",),
+    in_keys: str | Sequence[NestedKey] = ("observation",),
     encoder: nn.Module | None = None,
 ) -> ProbabilisticActor:
     r"""Builds the paper's policy: a diagonal normal from layers of ``Linear, LayerNorm, Squish``.
@@ -161,8 +161,8 @@ def make_actor(
             :class:`~tensordict.nn.NormalParamExtractor` knows. [inferred] Default
             ``"biased_softplus_1.0"``, TorchRL's own: 1 where the network's output is 0.
         squish_b (float): bend of :class:`Squish`. Default 4.0.
-        in_keys (sequence of NestedKey): observations to read; several are concatenated. Default
-            ``("observation",)``.
+        in_keys (str or sequence of NestedKey): observations to read; several are concatenated.
+            Default ``("observation",)``.
         encoder (nn.Module, optional): makes ``[*B, F]`` of the first of them, such as a
             :class:`~torchrl.modules.ConvNet` of an image; ``observation_size`` counts ``F`` in its
             place. Default ``None``: the observation as it is.
@@ -190,12 +190,16 @@ def make_actor(
         check_positive_int("make_actor: the number of actions", action)
         spec = Bounded(low=-1.0, high=1.0, shape=(action,))
     size = _action_size(spec)
-    network = NormalNetwork(
-        _body(observation_size, hidden, 2 * size, squish_b, encoder),
-        NormalParamExtractor(scale_mapping),
-    )
+    try:
+        extractor = NormalParamExtractor(scale_mapping)
+    except (NotImplementedError, ValueError) as error:
+        raise ValueError(
+            f"make_actor: scale_mapping={scale_mapping!r} is unknown to NormalParamExtractor: it "
+            "has 'exp', 'expln', 'softplus', 'relu' and 'biased_softplus_1.0', of any number."
+        ) from error
+    network = NormalNetwork(_body(observation_size, hidden, 2 * size, squish_b, encoder), extractor)
     return ProbabilisticActor(
-        TensorDictModule(network, in_keys=list(in_keys), out_keys=["loc", "scale"]),
+        TensorDictModule(network, in_keys=_read(in_keys), out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
         spec=spec,
         distribution_class=DISTRIBUTIONS[squash],
@@ -212,7 +216,7 @@ def make_critic(
     num_heads: int = 5,
     hidden: Sequence[int] = (100, 100),
     squish_b: float = 4.0,
-    in_keys: Sequence[NestedKey] = ("observation",),
+    in_keys: str | Sequence[NestedKey] = ("observation",),
     encoder: nn.Module | None = None,
 ) -> TensorDictModule:
     """Builds the paper's critic: an ensemble of values that share all layers but the last.
@@ -229,8 +233,8 @@ def make_critic(
         hidden (sequence of int): neurons of each hidden layer. More can represent more and cost
             more. Default ``(100, 100)``.
         squish_b (float): bend of :class:`Squish`. Default 4.0.
-        in_keys (sequence of NestedKey): observations to read; several are concatenated. Default
-            ``("observation",)``.
+        in_keys (str or sequence of NestedKey): observations to read; several are concatenated.
+            Default ``("observation",)``.
         encoder (nn.Module, optional): makes ``[*B, F]`` of the first of them, such as a
             :class:`~torchrl.modules.ConvNet` of an image; ``observation_size`` counts ``F`` in its
             place. Default ``None``: the observation as it is.
@@ -254,7 +258,7 @@ def make_critic(
     check_positive_int("make_critic: num_heads", num_heads)
     return TensorDictModule(
         EnsembleNetwork(_body(observation_size, hidden, num_heads, squish_b, encoder)),
-        in_keys=list(in_keys),
+        in_keys=_read(in_keys),
         out_keys=["state_value", "state_value_heads"],
     )
 
@@ -267,6 +271,10 @@ def _body(
     encoder: nn.Module | None,
 ) -> nn.Module:
     check_positive_int("observation_size", in_features)
+    if not isinstance(hidden, Sequence) or isinstance(hidden, str):
+        raise TypeError(
+            f"hidden must be the sizes of the layers, such as (100, 100), got {hidden!r}."
+        )
     for cells in hidden:
         check_positive_int("every entry of hidden", cells)
     layers = MLP(
@@ -279,6 +287,11 @@ def _body(
         activation_kwargs={"b": squish_b},
     )
     return layers if encoder is None else EncodedNetwork(encoder, layers)
+
+
+def _read(in_keys: str | Sequence[NestedKey]) -> list[NestedKey]:
+    """A string is one key, and not its letters."""
+    return [in_keys] if isinstance(in_keys, str) else list(in_keys)
 
 
 def _action_size(spec: TensorSpec) -> int:

@@ -259,9 +259,10 @@ class Neighborhood:
 
 def _check_states(state: Tensor, next_state: Tensor, batch_dims: int) -> None:
     for name, tensor in (("state", state), ("next_state", next_state)):
-        if not tensor.is_floating_point():
+        if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
+            given = getattr(tensor, "dtype", type(tensor).__name__)
             raise TypeError(
-                f"{name} must be floating point to have neighbors, got {tensor.dtype}: convert "
+                f"{name} must be a floating-point tensor to have neighbors, got {given}: convert "
                 "it first if its values are quantities, leave it out if they are labels."
             )
     if state.shape != next_state.shape:
@@ -269,8 +270,10 @@ def _check_states(state: Tensor, next_state: Tensor, batch_dims: int) -> None:
             f"state and next_state must have the same shape, got {tuple(state.shape)} and "
             f"{tuple(next_state.shape)}."
         )
-    if not 0 <= batch_dims <= state.ndim:
+    if not isinstance(batch_dims, int) or not 0 <= batch_dims <= state.ndim:
         raise ValueError(
             f"batch_dims must lie between 0 and {state.ndim} for a state of shape "
             f"{tuple(state.shape)}, got {batch_dims!r}."
         )
+    if not all(state.shape[batch_dims:]):
+        raise ValueError(f"a state must have at least one number, got shape {tuple(state.shape)}.")

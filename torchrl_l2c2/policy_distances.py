@@ -21,7 +21,7 @@ from torchrl.modules import TanhNormal, TruncatedNormal
 from torchrl.modules.distributions import has_analytic_kl
 
 from torchrl_l2c2._checks import check_choice, check_positive_int
-from torchrl_l2c2.affinities import same_bounds, sum_to
+from torchrl_l2c2.affinities import all_probs, same_bounds, sum_to
 from torchrl_l2c2.distances import (
     MONTE_CARLO_SAMPLES,
     check_pair,
@@ -156,7 +156,15 @@ def policy_mean(policy: Distribution | Tensor, *, squashed: bool = False) -> Ten
         heads = (policy_mean(head, squashed=squashed) for head in policy.dists.values())
         # A head may have no dimension of its own, or several.
         return torch.cat([head.reshape(*head.shape[:ndim], -1) for head in heads], -1)
-    if isinstance(policy, Bernoulli | Categorical | OneHotCategorical):
+    if isinstance(policy, Categorical | OneHotCategorical):
+        return all_probs(policy)
+    mean = _mean(policy, squashed=squashed)
+    # Actions of one number without a dimension of their own, as torch counts those of a Normal.
+    return mean if policy.event_shape else mean.unsqueeze(-1)
+
+
+def _mean(policy: Distribution, *, squashed: bool) -> Tensor:
+    if isinstance(policy, Bernoulli):
         return policy.probs
     if not squashed:
         while isinstance(policy, TransformedDistribution):
@@ -279,10 +287,17 @@ def _categorical_kl(
     p: Categorical | OneHotCategorical, q: Categorical | OneHotCategorical
 ) -> Tensor:
     """Of torch's value, and with a gradient where actions are impossible, as under a mask."""
-    possible = p.probs > 0
-    log_p = torch.where(possible, p.logits, 0.0)
-    log_q = torch.where(possible, q.logits, 0.0)
-    return (p.probs * (log_p - log_q)).sum(-1)
+    probs_p, probs_q = all_probs(p), all_probs(q)
+    possible, both = probs_p > 0, (probs_p > 0) & (probs_q > 0)
+    logs = p.logits, q.logits
+    if (
+        probs_p is not p.probs or probs_q is not q.probs
+    ):  # A sparse mask lists actions in any order.
+        smallest = torch.finfo(probs_p.dtype).tiny
+        logs = probs_p.clamp_min(smallest).log(), probs_q.clamp_min(smallest).log()
+    log_p, log_q = (torch.where(both, log, 0.0) for log in logs)
+    finite = (probs_p * (log_p - log_q)).sum(-1)
+    return torch.where((possible & ~both).any(-1), torch.inf, finite)
 
 
 def _monte_carlo(p: Distribution, q: Distribution, num_samples: int) -> Tensor:

@@ -27,6 +27,7 @@ def action_variation(actions: Tensor, mask: Tensor | None = None) -> Tensor:
         Tensor: the variation of each episode, shape ``[*B]``.
 
     Raises:
+        TypeError: the actions are no floating-point tensor.
         ValueError: an episode has fewer than two steps, or the shapes do not fit.
 
     Examples:
@@ -66,6 +67,7 @@ def action_rate(actions: Tensor) -> Tensor:
         Tensor: of each episode, shape ``[*B]``.
 
     Raises:
+        TypeError: the actions are no floating-point tensor.
         ValueError: an episode has fewer than two steps.
 
     Examples:
@@ -94,6 +96,7 @@ def action_fluctuation_ratio(actions: Tensor) -> Tensor:
         Tensor: of each episode, shape ``[*B]``.
 
     Raises:
+        TypeError: the actions are no floating-point tensor.
         ValueError: an episode has fewer than two steps.
 
     Examples:
@@ -124,6 +127,7 @@ def action_jerk(actions: Tensor, sampling_rate: float = 1.0) -> Tensor:
         Tensor: of each episode, shape ``[*B]``.
 
     Raises:
+        TypeError: the actions are no floating-point tensor.
         ValueError: an episode has fewer than four steps, or the rate is not greater than 0.
 
     Examples:
@@ -155,6 +159,7 @@ def previous_action_gain(actions: Tensor) -> Tensor:
         Tensor: of each episode, shape ``[*B]``; NaN where the action never changes.
 
     Raises:
+        TypeError: the actions are no floating-point tensor.
         ValueError: an episode has fewer than two steps.
 
     Examples:
@@ -190,7 +195,8 @@ def saturation(
         Tensor: of each episode, shape ``[*B]``, over its steps and dimensions.
 
     Raises:
-        ValueError: the margin is negative.
+        TypeError: the actions are no floating-point tensor.
+        ValueError: they are no episodes, or the margin is negative.
 
     Examples:
         >>> import torch
@@ -198,6 +204,7 @@ def saturation(
         >>> saturation(torch.tensor([[-1.2], [0.0], [0.995], [0.5]]), -1.0, 1.0)
         tensor(0.5000)
     """
+    check_episodes("saturation", actions, 1)
     check_real("saturation: margin", margin, at_least=0)
     low, high = torch.as_tensor(low), torch.as_tensor(high)
     width = margin * (high - low)
@@ -206,7 +213,18 @@ def saturation(
 
 
 def check_episodes(name: str, actions: Tensor, least: int) -> None:
-    """Refuses actions that are no episodes of at least so many steps."""
+    """Refuses actions that are no numbers of episodes of at least so many steps.
+
+    Raises:
+        TypeError: they are no floating-point tensor.
+        ValueError: another shape, or fewer steps.
+    """
+    if not isinstance(actions, Tensor) or not actions.is_floating_point():
+        given = getattr(actions, "dtype", type(actions).__name__)
+        raise TypeError(
+            f"{name}: actions must be a floating-point tensor, got {given}: torch.as_tensor(...) "
+            "and .float() make one, of labels their one-hot vectors."
+        )
     if actions.ndim < 2 or actions.shape[-2] < least:
         raise ValueError(
             f"{name}: actions must have shape [*B, T, A] with T of at least {least}, got "

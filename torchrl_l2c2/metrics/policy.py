@@ -43,7 +43,7 @@ def local_lipschitz(
 
     Returns:
         Tensor: the estimate for each state, shape ``[*B]``. Neighbors equal to their state are
-        left out; where none is left the estimate is NaN.
+        left out; where none is left the estimate is NaN, as it is of one that is not a number.
 
     Raises:
         ValueError: the shapes do not fit, or ``reduction`` is not one of the two.
@@ -65,7 +65,7 @@ def local_lipschitz(
         )
     distance = (neighbor - state.unsqueeze(-2)).abs().amax(-1)
     change = torch.linalg.vector_norm(neighbor_output - output.unsqueeze(-2), dim=-1)
-    moved = distance > 0.0
+    moved = distance != 0.0  # A neighbor that is no number is told, not left out.
     quotient = torch.where(moved, change / distance, 0.0)
     if reduction == "mean":
         return quotient.sum(-1) / moved.sum(-1)

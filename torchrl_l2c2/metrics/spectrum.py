@@ -32,6 +32,7 @@ def amplitude_spectrum(actions: Tensor, sampling_rate: float = 1.0) -> tuple[Ten
         amplitudes, shape ``[*B, F, A]``, in the action's unit.
 
     Raises:
+        TypeError: the actions are no floating-point tensor.
         ValueError: an episode has fewer than four steps, or the rate is not greater than 0.
 
     Examples:
@@ -47,6 +48,8 @@ def amplitude_spectrum(actions: Tensor, sampling_rate: float = 1.0) -> tuple[Ten
     """
     check_episodes("amplitude_spectrum", actions, 4)
     check_real("amplitude_spectrum: sampling_rate", sampling_rate, above=0)
+    if actions.itemsize < 4:  # Of which there is no transform.
+        actions = actions.float()
     steps = actions.shape[-2]
     amplitudes = 2.0 / steps * torch.fft.rfft(actions, dim=-2).abs()
     amplitudes[..., 0, :] /= 2.0
@@ -83,6 +86,7 @@ def spectral_smoothness(actions: Tensor, form: Literal["caps", "asap"] = "caps")
         Tensor: of each episode, shape ``[*B]``, in the action's unit.
 
     Raises:
+        TypeError: the actions are no floating-point tensor.
         ValueError: an episode has fewer than four steps, or another form.
 
     Examples:
@@ -102,7 +106,7 @@ def spectral_smoothness(actions: Tensor, form: Literal["caps", "asap"] = "caps")
     frequencies, amplitudes = frequencies[:bins], amplitudes[..., :bins, :]
     if form == "asap":
         return (amplitudes * frequencies.unsqueeze(-1)).sum(-2).mean(-1)
-    weights = torch.linspace(0, 1, bins, dtype=actions.dtype, device=actions.device)
+    weights = torch.linspace(0, 1, bins, dtype=amplitudes.dtype, device=actions.device)
     return (amplitudes * weights.unsqueeze(-1)).mean((-2, -1))
 
 
@@ -126,6 +130,7 @@ def roughness(actions: Tensor, sampling_rate: float = 1.0) -> Tensor:
         Tensor: of each episode, shape ``[*B]``; NaN where a dimension never changes.
 
     Raises:
+        TypeError: the actions are no floating-point tensor.
         ValueError: an episode has fewer than four steps, or the rate is not greater than 0.
 
     Examples:

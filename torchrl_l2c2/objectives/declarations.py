@@ -11,6 +11,17 @@ from torchrl_l2c2._checks import as_number, check_real
 from torchrl_l2c2.objectives.mixin import LossMixin
 
 
+def listed_names(names: Iterable[str]) -> list[str]:
+    """A list of names; a string alone would be its letters.
+
+    Raises:
+        TypeError: it is a string.
+    """
+    if isinstance(names, str):
+        raise TypeError(f"a list of names is wanted, got the string {names!r}: [{names!r}] is one.")
+    return list(names)
+
+
 class DeclaredTerms(LossMixin):
     """Knows which of a loss's terms were added to it, and the gains that scale these.
 
@@ -58,10 +69,15 @@ class DeclaredTerms(LossMixin):
             diagnostics: other keys, of entries that train nothing.
 
         Raises:
-            ValueError: a key has the beginning of another kind.
+            TypeError: a string in the place of a list of them.
+            ValueError: a key has the beginning of another kind, or is one of the loss's.
         """
-        policy, auxiliary, diagnostics = list(policy), list(auxiliary), list(diagnostics)
+        policy, value, auxiliary, diagnostics = map(
+            listed_names, (policy, value, auxiliary, diagnostics)
+        )
         others = [*value, *auxiliary]
+        if taken := set(self.out_keys) & {*policy, *others, *diagnostics}:
+            raise ValueError(f"the loss has {sorted(taken)} already: choose other names.")
         for keys, trains in ((policy, True), (others, True), (diagnostics, False)):
             for key in keys:
                 if key.startswith("loss_") != trains:
@@ -79,9 +95,11 @@ class DeclaredTerms(LossMixin):
 
         Args:
             name: the attribute.
-            value: a finite number of at least 0, now and whenever it is assigned to.
+            value: a finite number of at least 0, or a tensor of one, now and whenever it is
+                assigned to.
             used: whether there is a term that it scales. If not, assigning to it is an error.
         """
+        value = as_number(name, value)
         check_real(name, value, at_least=0)
         self._coefficients = self._coefficients | {name}
         if used:

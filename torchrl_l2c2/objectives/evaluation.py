@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from threading import get_ident
 from typing import Any
 
 import torch
@@ -52,7 +53,20 @@ class Evaluation:
 
     def __init__(self, wiring: dict[str, Wiring] | None = None) -> None:
         self.wiring = {} if wiring is None else dict(wiring)
-        self.forward_pass: ForwardPass | None = None
+        self._forward_passes: dict[int, ForwardPass] = {}
+
+    @property
+    def forward_pass(self) -> ForwardPass | None:
+        """What this thread's forward pass shares; ``None`` outside of one."""
+        return self._forward_passes.get(_thread())
+
+    def begin_forward_pass(self) -> None:
+        """From here on evaluations are shared, till :meth:`end_forward_pass`."""
+        self._forward_passes[_thread()] = ForwardPass()
+
+    def end_forward_pass(self) -> None:
+        """From here on they are not, and what was shared is forgotten."""
+        del self._forward_passes[_thread()]
 
     def wire(self, loss: LossModule, networks: Iterable[str]) -> None:
         """Finds out how these networks are evaluated; refuses those that cannot be."""
@@ -247,3 +261,21 @@ def _split(
         # Explicit sizes: an inferred one does not compile.
         out = out.unflatten(dim, (sum(parts), tensordict.batch_size[0]))
     return out.split(parts, dim)
+
+
+def check_takes_gradients(regularizer: str) -> None:
+    """Refuses inference mode, for what takes gradients of its own.
+
+    Raises:
+        RuntimeError: torch keeps none in this mode.
+    """
+    if not is_compiling() and torch.is_inference_mode_enabled():
+        raise RuntimeError(
+            f"{regularizer} takes gradients by the state, of which torch.inference_mode keeps "
+            "none: validate under torch.no_grad()."
+        )
+
+
+def _thread() -> int:
+    # Not to be compiled; a compiled call has begun and ended its pass by the time that it runs.
+    return 0 if is_compiling() else get_ident()

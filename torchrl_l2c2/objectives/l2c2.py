@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 import torch
-from tensordict import NestedKey, TensorDictBase, unravel_key_list
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torch.distributions import Categorical
 from torchrl.objectives import DistributionalDQNLoss, LossModule
@@ -20,6 +20,8 @@ from torchrl_l2c2.objectives.neighbors import (
     Neighbors,
     draw_rows,
     l2c2_penalty,
+    read_key,
+    read_moved_keys,
     read_neighbors,
     warn_of_other_neighbors,
 )
@@ -106,7 +108,8 @@ class L2C2Loss(RegularizedLoss):
             and are noisier; the terms' expectation stays: a drawn transition counts
             ``1 / fraction`` times and the others 0, also with ``reduction="none"``. Defaults to 1.
         moved_keys (str or sequence of NestedKey, optional): which observations neighbors drawn here
-            differ in, such as those that carry noise. Defaults to ``None``, all that can.
+            differ in, such as those that carry noise; the networks read them. Defaults to
+            ``None``, all that can.
         policy_distance (str or callable): :math:`d_\pi`. ``"hellinger"``, the paper's, is in [0, 1]
             and relative to how wide the policies are; ``"mean"``
             (:func:`~torchrl_l2c2.policy_distances.mean_distance`) is neither; ``"kl"``
@@ -180,9 +183,8 @@ class L2C2Loss(RegularizedLoss):
         self.l2c2_num_samples = num_samples
         self.l2c2_over_neighbors: Literal["mean", "max"] = over_neighbors
         self.l2c2_fraction = float(fraction)
-        self.l2c2_moved_keys = None if moved_keys is None else _read_keys(moved_keys)
         self.l2c2_hellinger_samples = hellinger_samples
-        self.l2c2_neighbor_key = neighbor_key
+        self.l2c2_neighbor_key = read_key("neighbor_key", neighbor_key)
         self._l2c2_compared = False
         policies, values = self.policy_networks(), self.value_networks() if beta else []
         self._l2c2_policies, self._l2c2_values = policies, values
@@ -191,6 +193,8 @@ class L2C2Loss(RegularizedLoss):
         compared = (policy_distance, hellinger_samples) != ("hellinger", None)
         _check_terms(type(base_loss).__name__, policies, values, beta, compared)
         self.declare_networks([*policies, *values])
+        read = [key for wiring in self._evaluation.wiring.values() for key in wiring.states]
+        self.l2c2_moved_keys = None if moved_keys is None else read_moved_keys(moved_keys, read)
         if policies:
             name = distance_name(policy_distance, self.has_stochastic_policy(), hellinger_samples)
             self._l2c2_policy_diagnostic = f"l2c2_{name}"
@@ -293,7 +297,7 @@ class L2C2Loss(RegularizedLoss):
         """What NeighborTransform would have written."""
         networks = [*self._l2c2_policies, *self._l2c2_values]
         keys = self.l2c2_moved_keys or list(self.transitions(tensordict, networks))
-        states = tensordict.select(*keys, *map(next_key, keys), strict=False).detach()
+        states = tensordict.select(*keys, *map(next_key, keys)).detach()
         states = states if rows is None else at_rows(states, rows)
         return draw_neighbors(states, self.l2c2_neighborhood, keys, self.l2c2_num_samples)
 
@@ -309,17 +313,6 @@ class L2C2Loss(RegularizedLoss):
             "l2c2_distance": self._diagnostic(finite, near, tensordict),
             "l2c2_gain": self._diagnostic(gain, near, tensordict),
         }
-
-
-def _read_keys(moved_keys: str | Sequence[NestedKey]) -> list[NestedKey]:
-    """A string is one key, as TorchRL's transforms have it, and not its letters."""
-    keys = [moved_keys] if isinstance(moved_keys, str) else list(moved_keys)
-    if not keys:
-        raise ValueError(
-            "moved_keys must name at least one observation, got none: leave it at None for all "
-            "that can be moved, or pass coeff=0 for no regularization."
-        )
-    return unravel_key_list(keys)
 
 
 def _value_term(network: str) -> str:

@@ -10,6 +10,7 @@ from torch.distributions import Distribution
 from torchrl.objectives import LossModule
 
 from torchrl_l2c2.distances import log_prob_of
+from torchrl_l2c2.objectives.evaluation import check_takes_gradients
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
 
 
@@ -63,6 +64,7 @@ class LCPLoss(RegularizedLoss):
 
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
         terms = super().policy_regularizer(tensordict)
+        check_takes_gradients("LCPLoss")
         read = self.policy_states(tensordict)
         with torch.enable_grad():
             states = {key: state.unsqueeze(0).requires_grad_() for key, state in read.items()}

@@ -9,7 +9,7 @@ from math import isclose
 from typing import Literal, NamedTuple
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import Tensor
 
 from torchrl_l2c2._checks import check_of_each
@@ -103,6 +103,45 @@ def read_neighbors(
         )
     distance, drawn = entries.pop("distance"), entries.pop("neighborhood", None)
     return TensorDict(entries, batch_size=distance.shape), distance, drawn
+
+
+def read_key(name: str, key: NestedKey) -> NestedKey:
+    """An entry's name, flat.
+
+    Raises:
+        TypeError: it is none; says what it is of.
+    """
+    if isinstance(key, str) or (isinstance(key, tuple) and key):
+        return unravel_key(key)
+    raise TypeError(f"{name} must be a string or a tuple of strings, got {key!r}.")
+
+
+def read_moved_keys(
+    moved_keys: str | Sequence[NestedKey], read: Sequence[NestedKey]
+) -> list[NestedKey]:
+    """The entries that neighbors differ in; a string is one, as TorchRL's transforms have it.
+
+    Args:
+        moved_keys (str or sequence of NestedKey): their names.
+        read (sequence of NestedKey): those that the networks read.
+
+    Raises:
+        TypeError: they are no names.
+        ValueError: there is none, or one that no network reads.
+    """
+    if not isinstance(moved_keys, Sequence):
+        raise TypeError(f"moved_keys must be a list of entries, got {moved_keys!r}.")
+    names = [moved_keys] if isinstance(moved_keys, str) else moved_keys
+    keys = [read_key("an entry of moved_keys", key) for key in names]
+    if not keys:
+        raise ValueError(
+            "moved_keys must name at least one observation, got none: leave it at None for all "
+            "that can be moved, or pass coeff=0 for no regularization."
+        )
+    if unread := [key for key in keys if key not in read]:
+        there = sorted(set(read), key=str)
+        raise ValueError(f"moved_keys names {unread}, and the networks read {there}.")
+    return keys
 
 
 def l2c2_penalty(

@@ -322,7 +322,9 @@ class PPORPELoss(SharedEvaluation):
         parameters = self.evaluate_at_batch("actor_network", tensordict)
         log_prob = self.actor_network.build_dist_from_params(parameters).log_prob(action)
         if self.baseline == "stored":
-            return log_prob - tensordict.get(self.tensor_keys.sample_log_prob)
+            if (stored := tensordict.get(key := self.tensor_keys.sample_log_prob, None)) is None:
+                raise KeyError(f"the batch has no {key!r}: keep it, or take baseline='target'.")
+            return log_prob - stored
         states = tensordict.select(*self.actor_network.in_keys)
         with torch.no_grad(), self.target_actor_network_params.to_module(self.actor_network):
             return log_prob - self.actor_network.get_dist(states).log_prob(action)

@@ -11,8 +11,8 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_l2c2._checks import check_of_each
-from torchrl_l2c2.objectives.declarations import DeclaredTerms
-from torchrl_l2c2.objectives.evaluation import Evaluation, ForwardPass, Policy, is_ensemble
+from torchrl_l2c2.objectives.declarations import DeclaredTerms, listed_names
+from torchrl_l2c2.objectives.evaluation import Evaluation, Policy, is_ensemble
 from torchrl_l2c2.objectives.shared_evaluation import SharedEvaluation
 from torchrl_l2c2.objectives.specialization import SpecializedLoss
 from torchrl_l2c2.objectives.transitions import (
@@ -116,14 +116,14 @@ class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
         Returns:
             TensorDict: the loss's own output with the regularizer's terms and diagnostics added.
         """
-        self._evaluation.forward_pass = ForwardPass()
+        self._evaluation.begin_forward_pass()
         try:
             # The loss's own draws come first: at one seed its terms are those of the plain loss.
             terms = super().forward(tensordict)
             terms.update(self.policy_regularizer(tensordict))
             terms.update(self.value_regularizer(tensordict))
         finally:
-            self._evaluation.forward_pass = None
+            self._evaluation.end_forward_pass()
         networks = (f"{name}_params" for name in self._evaluation.wiring)
         self._clear_weakrefs(tensordict, terms, *networks)
         return terms
@@ -150,8 +150,15 @@ class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
         """Declares which networks, by their names, are evaluated.
 
         Raises:
-            TypeError: one is recurrent, does not declare its keys, or has several distributions.
+            TypeError: one is recurrent, does not declare its keys, or has several distributions; or
+                a string in the place of a list.
+            ValueError: the loss has no network of that name.
         """
+        networks = listed_names(networks)
+        there = [*self.policy_networks(), *self.value_networks()]
+        for name in networks:
+            if getattr(self, name, None) is None:
+                raise ValueError(f"the loss has no network {name!r}, but {there}.")
         self._wire([*self._evaluation.wiring, *networks])
 
     def declare_policy(self) -> None:

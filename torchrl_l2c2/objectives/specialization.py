@@ -96,7 +96,10 @@ def _specialize(extension: type[SpecializedLoss], base: type[LossModule]) -> typ
         raise TypeError(f"{extension.__name__} is made for one class of losses already.")
     for part in getattr(base, "_parts", ()):
         if issubclass(extension, part) or issubclass(part, extension):
-            raise TypeError(f"a {base.__name__} is already wrapped by {part.__name__}.")
+            raise TypeError(
+                f"{extension.__name__} cannot go around a {base.__name__}, which has the terms of "
+                f"{part.__name__} already: wrap the loss within it, or change its coefficients."
+            )
     _check_no_clash(extension, base)
     namespace = {
         "__module__": extension.__module__,

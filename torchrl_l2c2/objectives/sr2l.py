@@ -12,7 +12,7 @@ from torch.distributions import Distribution
 from torchrl.objectives import LossModule
 
 from torchrl_l2c2._checks import check_positive_int, check_real
-from torchrl_l2c2.objectives.evaluation import Policy
+from torchrl_l2c2.objectives.evaluation import Policy, check_takes_gradients
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
 from torchrl_l2c2.policy_distances import (
     PolicyDistance,
@@ -102,6 +102,7 @@ class SR2LLoss(RegularizedLoss):
 
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
         terms = super().policy_regularizer(tensordict)
+        check_takes_gradients("SR2LLoss")
         states = self.policy_states(tensordict)
 
         def policy_at(places: States) -> Policy:

@@ -54,13 +54,14 @@ class TchebycheffLoss(RegularizedLoss):
 
     Keyword Args:
         objectives (str or iterable of str): names of the terms that are :math:`f_1`; those that
-            the loss does not have are passed over. Defaults to ``OBJECTIVES``.
+            the loss does not have are passed over. Of CQL's two losses of the policy name the one
+            that is descended, ``"loss_actor"`` or ``"loss_actor_bc"``. Defaults to ``OBJECTIVES``.
 
     Raises:
         TypeError: the loss has no regularizer with a term of the policy, or an argument has the
             wrong type.
-        ValueError: an argument is out of its range, the loss has none of the objectives or, in
-            use, terms are not single numbers.
+        ValueError: an argument is out of its range, the loss has none of the objectives, one of
+            them is a regularizer's or, in use, terms are not single numbers.
 
     Examples:
         >>> import torch
@@ -91,22 +92,24 @@ class TchebycheffLoss(RegularizedLoss):
             )
         for place, value in enumerate(ideal):
             check_real(f"ideal[{place}]", value)
-        added = self.added_terms & self.policy_terms
+        added = [key for key in self.out_keys if key in self.added_terms & self.policy_terms]
         if not added:
             raise TypeError(
                 f"TchebycheffLoss weighs a regularizer of the policy against the loss, and "
-                f"{type(base_loss).__name__} has none: put L2C2Loss or another around it first."
+                f"{type(base_loss).__name__} has none among its out_keys: put L2C2Loss or another "
+                "around it first."
             )
         names = [objectives] if isinstance(objectives, str) else list(objectives)
-        own = [key for key in self.out_keys if key in names]
-        if not own:
+        offered = [key for key in self.out_keys if key not in self.added_terms]
+        own = [key for key in offered if key in names]
+        if not own or self.added_terms.intersection(names):
             raise ValueError(
-                f"objectives must name what trains the policy among {list(self.out_keys)}, got "
-                f"{names}."
+                f"objectives must name what trains the policy among {offered}, which are the "
+                f"loss's own, got {names}."
             )
         self.tchebycheff_mu = float(mu)
         self.tchebycheff_ideal = tuple(map(float, ideal))
-        self._tchebycheff_keys = (own, [key for key in self.out_keys if key in added])
+        self._tchebycheff_keys = (own, added)
         self.out_keys = [*self.out_keys, "tchebycheff", "tchebycheff_share"]
 
     @dispatch

@@ -19,6 +19,8 @@ POLICY_NETWORK = "actor_network"
 VALUE_NETWORKS = ("critic_network", "qvalue_network", "value_network", "local_value_network")
 """The names under which losses hold their value functions."""
 
+RECURRENT = (LSTMModule, GRUModule, nn.RNNBase, nn.RNNCellBase)
+
 # The vector of an ensemble, or of all actions, comes before the one number made of it.
 _VALUE_KEYS = ("value_heads", "state_action_value", "action_value", "value")
 
@@ -65,7 +67,7 @@ def wiring_of(loss: LossModule, network: str) -> Wiring:
         output = _value_key(loss, network)
     return Wiring(
         inputs=tuple(key for key in inputs if key not in trunk),
-        states=tuple(key for key in inputs if key not in made.union(actions)),
+        states=tuple(k for k in inputs if k not in made.union(actions) and not _is_private(k)),
         trunk=tuple(trunk),
         output=output,
         stochastic=stochastic,
@@ -80,6 +82,11 @@ def _unnamed_action(loss: LossModule, actor: Any, made: set[NestedKey]) -> Neste
     read = {key for network in networks if network is not None for key in network.in_keys}
     written: list[NestedKey] = list(actor.out_keys)
     return next((key for key in written if key in made & read), written[-1])
+
+
+def _is_private(key: NestedKey) -> bool:
+    """Whether it is TorchRL's own bookkeeping, such as the noise matrix of gSDE."""
+    return (key if isinstance(key, str) else key[-1]).startswith("_")
 
 
 def _action_keys(loss: LossModule) -> list[NestedKey]:
@@ -127,8 +134,11 @@ def _check_declares_keys(net: nn.Module, name: str) -> None:
 
 
 def _check_not_recurrent(net: Any, name: str) -> None:
-    recurrent = any(isinstance(module, LSTMModule | GRUModule) for module in net.modules())
-    if recurrent or "is_init" in net.in_keys:
+    recurrent = any(isinstance(module, RECURRENT) for module in net.modules())
+    # What it hands on to the next step.
+    written = {unravel_key(key) for key in net.out_keys}
+    handed_on = any(unravel_key(("next", key)) in written for key in net.in_keys)
+    if recurrent or handed_on or "is_init" in net.in_keys:
         raise TypeError(
             f"{name} is recurrent: its output depends on the states before, so that it has no "
             "value at a state near the current one alone. Only feed-forward networks can be "

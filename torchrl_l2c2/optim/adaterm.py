@@ -139,6 +139,23 @@ class AdaTerm(Optimizer):
                 ),
             }
 
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restores what ``state_dict`` gave.
+
+        Args:
+            state_dict (dict): of an AdaTerm with as many parameters.
+
+        Raises:
+            ValueError: it is another optimizer's, or of other parameters; nothing is changed.
+        """
+        for group in state_dict["param_groups"]:
+            if missing := self.defaults.keys() - group.keys():
+                raise ValueError(
+                    f"AdaTerm: the state has no {sorted(missing)}, but {sorted(group)}: it is "
+                    "another optimizer's. Begin with a new AdaTerm."
+                )
+        super().load_state_dict(state_dict)
+
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
         """Performs one step; parameters without a gradient keep their value and their state.
@@ -248,7 +265,7 @@ def _alike(params: list[Tensor]) -> Iterable[tuple[list[Tensor], list[Tensor]]]:
     """Parameters with their gradients, by device and dtype: alike ones are worked on together."""
     groups: dict[tuple[torch.device, torch.dtype], tuple[list[Tensor], list[Tensor]]] = {}
     for p in params:
-        if p.grad is None:
+        if p.grad is None or not p.numel():
             continue
         if p.grad.is_sparse:
             raise RuntimeError("AdaTerm: sparse gradients are not supported, only dense ones.")

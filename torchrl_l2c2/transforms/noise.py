@@ -19,7 +19,8 @@ class ObservationNoise(RandomTransform):
 
     The noise is drawn once per observation, at every step and reset, so the successor of a state
     and the state that follows it are the same noisy observation, as with a real sensor.
-    Environments that are not reset keep theirs. In a replay buffer it would be drawn anew.
+    Environments that are not reset keep theirs. It is for environments alone: in a replay buffer
+    it would be drawn anew, for :math:`s` and not for :math:`s'`.
 
     The paper states a "scale" of its white noise (Kobayashi, L2C2, 2022, "Setup"), read here as the
     standard deviation of a Gaussian [inferred]. The noise leaves the bounds of the observations, so
@@ -42,7 +43,7 @@ class ObservationNoise(RandomTransform):
         TypeError: if ``scale`` or ``generator`` is of another type, or, when an environment takes
             the transform, if an observation is not floating point.
         ValueError: if ``scale`` is negative or not finite, or, likewise, does not broadcast to an
-            observation.
+            observation; in use, if it is given transitions, as in a replay buffer.
         KeyError: likewise, if the environment has no such observation.
 
     Examples:
@@ -70,6 +71,16 @@ class ObservationNoise(RandomTransform):
         scale = torch.as_tensor(scale, dtype=torch.get_default_dtype())
         # A setting, not a state: a checkpoint must not overrule it.
         self.register_buffer("scale", scale, persistent=False)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Adds noise to observations without a successor, of any batch size."""
+        if "next" in tensordict.keys():
+            raise ValueError(
+                "ObservationNoise belongs to an environment, not to a replay buffer: of a "
+                "transition it would move the state and not the next one. Put it into a "
+                "TransformedEnv."
+            )
+        return super().forward(tensordict)
 
     def _apply_transform(self, obs: Tensor) -> Tensor:
         noise = torch.randn(obs.shape, generator=self.generator, dtype=obs.dtype, device=obs.device)
