@@ -30,7 +30,7 @@ from torchrl_l2c2.experiment.reports import (
 )
 from torchrl_l2c2.experiment.reports.__main__ import main
 from torchrl_l2c2.experiment.reports.choice import choice_table
-from torchrl_l2c2.experiment.reports.comparison import statistics_tables
+from torchrl_l2c2.experiment.reports.comparison import statistics_tables, summary
 from torchrl_l2c2.experiment.reports.differences import differences, fingerprint
 from torchrl_l2c2.experiment.reports.faster_targets import faster_targets_table
 from torchrl_l2c2.experiment.reports.field import BETTER, field_table
@@ -980,6 +980,13 @@ class TestReport:
         groups = json.loads((tmp_path / "report.json").read_text())["groups"]
         assert groups[2]["statistics"]["late_sampled_return"]["mean"] == 202.0
         assert groups[2]["paper"]["return_mean"] == 693.77
+
+    def test_sm_is_among_the_plain_numbers_where_it_was_measured(self, records):
+        """That of the last policy's mean actions, as in the field's tables."""
+        rough = [replace(r, last_mean_sm_asap=float(r.seed)) for r in records]
+        for group in summary(group_records(rough)):
+            assert group["statistics"]["last_mean_sm_asap"]["mean"] == 2.0
+        assert "last_mean_sm_asap" not in summary(group_records(records))[0]["statistics"]
 
     def test_the_command_prints_the_same_from_folders_and_from_their_records(
         self, forty, tmp_path, capsys

@@ -150,7 +150,7 @@ def summary(groups: Sequence[Group]) -> list[dict[str, Any]]:
 def _summary(group: Group, baseline: Group | None) -> dict[str, Any]:
     statistics: dict[str, Any] = {}
     for figure in FIGURES:
-        for quantity in QUANTITIES:
+        for quantity in (*QUANTITIES, *(["sm_asap"] if figure == "last_mean" else [])):
             scores = group.scores(figure, quantity)
             if not len(scores):
                 continue
