@@ -128,8 +128,8 @@ class ExperimentConfig:
     evaluate_every: int = Field(
         default=0,
         ge=0,
-        description="episodes of training from one test to the next, of 10 episodes; "
-        "policy_best.pt is the best one's policy; 0: none",
+        description="training episodes between tests of 10 episodes; "
+        "policy_best.pt is from the best test; 0: none",
     )
     record: bool = Field(
         default=False,
@@ -139,8 +139,7 @@ class ExperimentConfig:
         default=0.1,
         ge=0,
         le=1,
-        description="last part of training, of 1, whose every policy plays one test episode; 0: "
-        "none",
+        description="final fraction of training whose policies play one test episode each; 0: none",
     )
     checkpoint_interval: float = Field(
         default=60.0, ge=0, description="seconds between checkpoints, at the ends of episodes"

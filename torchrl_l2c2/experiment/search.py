@@ -49,7 +49,7 @@ The same command goes on; several of them, begun at the same time, share the tri
 EXAMPLE = r"""
 example:
   python -m torchrl_l2c2.experiment.search --trials 30 --output outputs/search \
-    seed=0,1 'regularizer.lambda_max=tag(log,interval(.1,10))' 'regularizer.beta=interval(0,1)'
+    seed=0,1 'regularizer.lambda_min=tag(log,interval(.001,.1))' 'regularizer.beta=interval(0,1)'
 """
 UNTESTED = "a trial is scored by tests of its policies: choose test_episodes of at least 1"
 MARK = "TORCHRL_L2C2_SEARCH"  # of the environment, by which the processes of a search are known

@@ -36,7 +36,7 @@ class PPORPEConfig(OffPolicyConfig):
     decay: float = Field(
         default=0.999, ge=0, le=1, description="of the largest deviation, per update"
     )
-    delta_min: float = Field(default=0.1, gt=0, le=1, description="lowest largest deviation")
+    delta_min: float = Field(default=0.1, gt=0, le=1, description="floor of that deviation")
     threshold: Literal["max", "ema"] = Field(
         default="max", description="how the deviation is tracked [inferred: max]"
     )
