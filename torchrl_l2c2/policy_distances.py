@@ -290,9 +290,8 @@ def _categorical_kl(
     probs_p, probs_q = all_probs(p), all_probs(q)
     possible, both = probs_p > 0, (probs_p > 0) & (probs_q > 0)
     logs = p.logits, q.logits
-    if (
-        probs_p is not p.probs or probs_q is not q.probs
-    ):  # A sparse mask lists actions in any order.
+    listed = probs_p is not p.probs or probs_q is not q.probs
+    if listed:  # by a sparse mask, in any order
         smallest = torch.finfo(probs_p.dtype).tiny
         logs = probs_p.clamp_min(smallest).log(), probs_q.clamp_min(smallest).log()
     log_p, log_q = (torch.where(both, log, 0.0) for log in logs)

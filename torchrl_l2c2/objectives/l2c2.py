@@ -175,7 +175,10 @@ class L2C2Loss(RegularizedLoss):
         check_positive_int("num_samples", num_samples)
         check_choice("over_neighbors", over_neighbors, ("mean", "max"))
         if over_neighbors == "max" and num_samples == 1:
-            raise ValueError("num_samples must be above 1 with over_neighbors='max', got 1.")
+            raise ValueError(
+                "num_samples must be above 1 with over_neighbors='max', got 1: of one neighbor the "
+                "largest is the mean."
+            )
         check_real("fraction", fraction, above=0, at_most=1)
         self.l2c2_policy_distance = policy_distance
         self._l2c2_distance = choose_policy_distance(policy_distance, hellinger_samples)
@@ -332,7 +335,8 @@ def _check_terms(
         raise TypeError(f"{loss} has no policy: leave policy_distance and hellinger_samples out.")
     if not policies:
         warnings.warn(
-            f"{loss} has no policy: L2C2Loss leaves out the policy term; left {', '.join(values)}.",
+            f"{loss} has no policy network: L2C2Loss leaves out the policy term and regularizes "
+            f"{', '.join(values)} alone.",
             stacklevel=3,
         )
     if beta and not values:
