@@ -125,3 +125,12 @@ def test_code_in_a_checkpoint_does_not_run(tmp_path):
     with pytest.raises(CheckpointError, match="content cannot be read"):
         load_checkpoint(path)
     assert not (tmp_path / "harm").exists()
+
+
+def test_a_damaged_newer_one_does_not_take_the_place_of_what_is_written(tmp_path):
+    """A run that went on from an older one has its own checkpoint, whatever the number."""
+    save_checkpoint(tmp_path, 90, STATE, keep=1)
+    emptied(save_checkpoint(tmp_path, 100, STATE, keep=2))
+    save_checkpoint(tmp_path, 95, STATE, keep=1)
+    path, state, damaged = load_newest(tmp_path)
+    assert path.name == "checkpoint_00000095.pt" and state["episode"] == 7 and len(damaged) == 1

@@ -4,6 +4,8 @@ import subprocess
 import sys
 from functools import partial
 
+import gymnasium
+import numpy as np
 import pytest
 import torch
 from torchrl.collectors import Collector
@@ -11,6 +13,7 @@ from torchrl.envs import (
     CatFrames,
     ExplorationType,
     GymEnv,
+    GymWrapper,
     SerialEnv,
     TransformedEnv,
     set_exploration_type,
@@ -24,6 +27,7 @@ from torchrl_l2c2.experiment import (
     make_env,
 )
 from torchrl_l2c2.experiment.frames import Frame, stack_frames
+from torchrl_l2c2.experiment.rollouts import RolloutCollector
 
 HOPPER = TaskConfig("hopper", "pybullet_envs_gymnasium:HopperBulletEnv-v0", noise_scale=0.001)
 
@@ -277,3 +281,34 @@ def test_a_script_that_leaves_its_workers_running_ends(tmp_path):
         [sys.executable, script], capture_output=True, text=True, timeout=120, check=True
     )
     assert "episodes 2" in done.stdout
+
+
+class Counting(gymnasium.Env):
+    """Shows the same array at every step, and writes into what it is given."""
+
+    observation_space = gymnasium.spaces.Box(-99.0, 99.0, (1,))
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.shown = np.zeros(1, dtype=np.float32)
+        return self.shown, {}
+
+    def step(self, action):
+        self.shown += 1
+        action *= 0
+        return self.shown, 0.0, False, False, {}
+
+
+@pytest.mark.parametrize(
+    "make", [EpisodeCollector, lambda env, *a, **k: RolloutCollector([env], *a, **k)]
+)
+def test_what_a_simulator_writes_over_is_kept_as_it_was(make):
+    """States, successors and actions, where it has one array for all of an episode."""
+    env = GymWrapper(Counting())
+    collector = make(env, make_actor(1, env.action_spec), frames_per_batch=4)
+    played = collector.rollout()
+    frames = played[0] if isinstance(played, list) else played
+    assert frames["observation"].flatten().tolist() == [0.0, 1.0, 2.0, 3.0]
+    assert frames["next", "observation"].flatten().tolist() == [1.0, 2.0, 3.0, 4.0]
+    assert frames["action"].abs().min() > 0

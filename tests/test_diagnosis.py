@@ -401,6 +401,21 @@ class TestRun:
         assert all(found.shares[name].gradient > 0.0 for name in added)
         assert sum(share.size for share in found.shares.values()) == pytest.approx(1.0)
 
+    def test_the_gain_is_that_of_the_runs_end(self, tmp_path):
+        """Where it set itself, the shares of the gradients are with it."""
+        shares = {}
+        for target in (0.01, 1.0):
+            regularizer = L2C2Config(gain="gradient", gain_target=target)
+            task = TaskConfig("pendulum", "Pendulum-v1", episodes=3, max_steps=60)
+            config = ExperimentConfig(task=task, regularizer=regularizer, compile=False)
+            experiment = Experiment(config, tmp_path / str(target))
+            experiment.train()
+            experiment.finish(experiment.test(1))
+            experiment.close()
+            found = diagnose_run(tmp_path / str(target), episodes=1, with_pictures=False)
+            shares[target] = found.shares["l2c2_actor"].gradient
+        assert shares[1.0] > 10 * shares[0.01]
+
     def test_pictures_are_left_out_where_they_cannot_be_drawn(self, run, monkeypatch):
         """As without pygame; all else is there."""
 

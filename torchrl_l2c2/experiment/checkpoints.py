@@ -56,7 +56,8 @@ def save_checkpoint(folder: str | Path, episode: int, state: Mapping[str, Any], 
     except CheckpointError as error:
         path.unlink()
         raise OSError(f"the checkpoint did not survive being written: {error}") from error
-    for old in list_checkpoints(folder)[keep:]:
+    # One with a larger number is damaged, or it would have been gone on from: it counts as none.
+    for old in [each for each in list_checkpoints(folder) if each.name <= path.name][keep:]:
         old.unlink()
     return path
 

@@ -108,7 +108,7 @@ class EpisodeCollector(Collector):
         self._previous: Tensor | None = None
         self._random_frames_left = random_frames
         # The collector has reset the environment when it was made.
-        self._observation: Tensor | None = self._carrier.get("observation")
+        self._observation: Tensor | None = self._carrier.get("observation").clone()
         self._policy_keys = [key for key in policy.out_keys if not key.startswith("_")]
         self._act = on_tensors(policy, self._policy_keys, compile_policy)
         # Of a policy whose samples go beyond the bounds: frames have these, the task what it takes.
@@ -117,7 +117,7 @@ class EpisodeCollector(Collector):
             self._gymnasium = self._simulator._env
             self._dtype = self._simulator.observation_spec["observation"].dtype
             continuous = self._simulator.action_spec.dtype.is_floating_point
-            self._to_action = Tensor.numpy if continuous else self._simulator.read_action
+            self._to_action = as_array if continuous else self._simulator.read_action
 
     @torch.no_grad()
     def rollout(self) -> TensorDictBase:
@@ -247,8 +247,19 @@ class EpisodeCollector(Collector):
         self._observation = None
 
     def _observe(self, seen: np.ndarray) -> Tensor:
-        observation = torch.as_tensor(seen, dtype=self._dtype)
-        return observation if self._noise is None else self._noise._apply_transform(observation)
+        return observed(seen, self._dtype, self._noise)
+
+
+def observed(seen: np.ndarray, dtype: torch.dtype, noise: ObservationNoise | None) -> Tensor:
+    """What the policy gets of an observation: a copy, as a simulator may write into its own."""
+    if noise is None:
+        return torch.tensor(seen, dtype=dtype)
+    return noise._apply_transform(torch.as_tensor(seen, dtype=dtype))
+
+
+def as_array(action: Tensor) -> np.ndarray:
+    """What the simulator gets of an action: a copy, as it may change it."""
+    return action.numpy().copy()
 
 
 def play_episodes(

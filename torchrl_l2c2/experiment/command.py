@@ -165,7 +165,7 @@ def _tell(error: Exception) -> str:
     """Says what went wrong: of a user's own environment with where it did."""
     if error.__cause__ is not None and type(error).__name__ == "SimulatorError":
         traceback.print_exception(error.__cause__)
-    told = f"{error} {HINTS.get(type(error), '')}".strip()
+    told = f"{str(error) or type(error).__name__} {HINTS.get(type(error), '')}".strip()
     print(f"error: {told}", file=sys.stderr)
     return told
 

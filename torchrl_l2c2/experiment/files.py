@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import math
 import os
@@ -68,7 +69,10 @@ def append_line(path: Path, line: str) -> None:
     """
     # Unbuffered: one call of the system writes the whole line.
     with _named(path), open(path, "ab", buffering=0) as file:
-        file.write(line.encode())
+        content, before = line.encode(), file.tell()
+        if file.write(content) != len(content):
+            file.truncate(before)
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 @contextlib.contextmanager

@@ -40,9 +40,11 @@ To play test episodes with it:
 """
 # What the end of a training leaves, beside the test that marks a run as finished.
 OF_THE_END = ("video.mp4", "policy.pt", "learning_curves.png")
+# What it writes on the way, which one that begins anew does not go on with.
+OF_THE_WAY = ("metrics.csv", "evaluations.json", "policy_best.pt")
 
 
-def begin_folder(folder: Path, settings: dict[str, Any], *, ended: bool) -> None:
+def begin_folder(folder: Path, settings: dict[str, Any], *, begun: bool, ended: bool) -> None:
     """Writes what a run begins with.
 
     A test that was of other settings is removed before, and of a shorter run that goes on the end:
@@ -54,12 +56,13 @@ def begin_folder(folder: Path, settings: dict[str, Any], *, ended: bool) -> None
         settings (dict): of the run, as in ``config.json``.
 
     Keyword Args:
+        begun (bool): whether it goes on from a checkpoint.
         ended (bool): whether its training is over.
     """
     if not ended or tested_run(folder, settings) is None:
         (folder / "evaluation.json").unlink(missing_ok=True)
     if not ended:
-        for name in OF_THE_END:
+        for name in (*OF_THE_END, *(() if begun else OF_THE_WAY)):
             (folder / name).unlink(missing_ok=True)
     write_json(folder / "config.json", settings)
     write_json(folder / "versions.json", {**versions(), "commit": code_commit()})

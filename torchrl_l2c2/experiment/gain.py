@@ -90,12 +90,8 @@ class GainControl:
     def _apply(self) -> None:
         if self._config is None or not self.gains:
             return
-        for_all = self.gains.get("all")
-        values = {
-            name: (for_all or self.gains.get(name) or ConstantGain()).value
-            for name in ("policy", "value")
-        }
-        self._config.set_gains(self._learner.agent.loss, **values)
+        values = {name: gain.value for name, gain in self.gains.items()}
+        self._config.apply(self._learner.agent.loss, values)
 
     def _terms(self) -> dict[str, list[str]]:
         """The regularizer's terms, by what they train."""

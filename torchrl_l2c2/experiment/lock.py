@@ -65,7 +65,7 @@ def wait_for_folder(folder: Path, seconds: float) -> None:
     A file server holds the lock of a machine that was lost until it notices: NFS after 90 seconds,
     as it is usually set.
     """
-    if (folder / ".lock").exists():
+    if seconds > 0 and (folder / ".lock").exists():
         lock = FileLock(folder / ".lock", timeout=0, is_singleton=True)
         with contextlib.suppress(Timeout), lock.acquire(timeout=seconds):
             pass

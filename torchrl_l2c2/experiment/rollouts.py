@@ -15,7 +15,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
 from torchrl_l2c2.experiment.acting import on_tensors
-from torchrl_l2c2.experiment.collection import PREVIOUS, simulator_and_noise
+from torchrl_l2c2.experiment.collection import PREVIOUS, observed, simulator_and_noise
 from torchrl_l2c2.experiment.frames import Frame, as_number, stack_frames
 
 
@@ -211,8 +211,7 @@ class _Stream:
             self._env.close()
 
     def _observe(self, seen: np.ndarray) -> Tensor:
-        observation = torch.as_tensor(seen, dtype=self._dtype)
-        return observation if self._noise is None else self._noise._apply_transform(observation)
+        return observed(seen, self._dtype, self._noise)
 
     def _generators(self) -> dict[str, Any]:
         simulator = self._gymnasium.unwrapped.np_random.bit_generator.state

@@ -13,6 +13,7 @@ import signal
 import statistics
 import subprocess
 import sys
+import uuid
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
@@ -194,7 +195,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
         parser.error(f"--sampler-seed must be at least 0, got {chosen.sampler_seed}")
     try:
         search = Search(Path(chosen.output), chosen.settings, seed=chosen.sampler_seed)
-        os.environ[MARK] = mark = f"{search.folder.resolve()} {os.getpid()}"
+        os.environ[MARK] = mark = uuid.uuid4().hex
         start_guard(mark)
         for number, values in search.trials(chosen.trials):
             told = ", ".join(f"{name}={short(value)}" for name, value in values.items())

@@ -9,6 +9,7 @@ from __future__ import annotations
 import _thread
 import atexit
 import contextlib
+import hashlib
 import itertools
 import json
 import math
@@ -133,15 +134,21 @@ class Sweep:
         Raises:
             SettingError: another job has it, whose results it would take the place of.
         """
-        self._put(f"folder_{number:06d}", json.dumps(str(folder)))
-        for other, claimed in self._all("folder"):
-            if other != number and claimed == str(folder):
+        claim = self._folder / f"claim_{hashlib.sha256(str(folder).encode()).hexdigest()[:16]}"
+        try:
+            # Of two that begin at once, one makes it.
+            with open(claim, "x") as file:
+                file.write(str(number))
+        except FileExistsError:
+            if (other := claim.read_text()) != str(number):
                 raise SettingError(
                     "outputs",
                     f"must be another for job {number} than for job {other} of the sweep, which "
                     f"both have {folder}: how long is trained and tested names no folder. Sweep "
                     "over outputs, too, or give two commands.",
-                )
+                ) from None
+        except FileNotFoundError:  # The sweep has ended.
+            return
 
     def add_finished(self, number: int, folder: Path, seconds: float) -> None:
         """Keeps where a finished run lies, and how long it took, until the sweep's end."""

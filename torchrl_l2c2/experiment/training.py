@@ -296,7 +296,8 @@ class Experiment:
         self._resume(resume, allow_other_versions)
         if self.folder is not None:
             ended = self._ended(self.config.task.budget)
-            begin_folder(self.folder, self.config.to_dict(), ended=ended)
+            begun = bool(self.metrics)
+            begin_folder(self.folder, self.config.to_dict(), begun=begun, ended=ended)
 
     def _resume(self, elsewhere: str | Path | None, allow_other_versions: bool) -> None:
         if (found := find_checkpoint(self.folder, elsewhere)) is None:

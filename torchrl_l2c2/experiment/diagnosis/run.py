@@ -14,18 +14,20 @@ import torch
 from gymnasium.error import DependencyNotInstalled
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
+from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 
 from torchrl_l2c2.experiment.algorithms.agent import Agent
 from torchrl_l2c2.experiment.algorithms.normalization import Normalization
 from torchrl_l2c2.experiment.checkpoints import load_newest
+from torchrl_l2c2.experiment.collection import play_episodes
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.diagnosis.measured import Diagnosis, TermShare, Value, diagnose
 from torchrl_l2c2.experiment.environments import TEST_SEED
 from torchrl_l2c2.experiment.export import entry_names
 from torchrl_l2c2.experiment.influence import gradient_shares
 from torchrl_l2c2.experiment.process import ProcessState
+from torchrl_l2c2.experiment.regularizers.base import GainConfig
 from torchrl_l2c2.experiment.saved import read_config
 from torchrl_l2c2.experiment.trained import load_policy
 from torchrl_l2c2.experiment.video import play_pictures
@@ -70,7 +72,8 @@ def diagnose_run(
     policy, env, max_steps = load_policy(folder, seed=seed, noise_scale=noise_scale, best=best)
     config = ExperimentConfig.from_dict(read_config(folder))
     noise = config.task.noise_scale if noise_scale is None else noise_scale
-    agent = _trained(folder, config, env)
+    # What learned is of the checkpoint's policy, and not of the best one's.
+    agent = None if best else _trained(folder, config, env)
     with ProcessState(seed):
         found = diagnose(
             policy,
@@ -128,6 +131,10 @@ def _trained(folder: Path, config: ExperimentConfig, env: EnvBase) -> Agent | No
         return None
     agent = replace(config, device="cpu").make_agent(env)
     agent.load_networks(newest[1])
+    gains = newest[1].get("gain", {}).get("gains", {})
+    if gains and isinstance(config.regularizer, GainConfig):
+        values = {name: gain["value"] for name, gain in gains.items()}
+        config.regularizer.apply(agent.loss, values)
     return agent
 
 
@@ -174,8 +181,8 @@ def _sizes(path: Path) -> dict[str, float]:
 
 def _batch(agent: Agent, config: ExperimentConfig, env: EnvBase, max_steps: int) -> TensorDictBase:
     """A training episode, with what the loss reads of it."""
-    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-        episode: TensorDictBase = env.rollout(max_steps, agent.policy)
+    (episode,) = play_episodes(agent.policy, env, 1, max_steps=max_steps, sampled=True)
+    with torch.no_grad():
         reward = episode["next", "reward"] * config.algorithm.reward_factor
         episode.set(("next", "reward"), reward)
         seen = episode["observation"]

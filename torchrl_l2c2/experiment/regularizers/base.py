@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
@@ -110,6 +111,16 @@ class GainConfig(RegularizerConfig):
     def targets(self) -> dict[str, float]:
         """What gains are to meet, by the names of the settings; nothing where there is none."""
         return {} if self.gain_target is None else {"gain_target": self.gain_target}
+
+    def apply(self, loss: LossModule, gains: Mapping[str, float]) -> None:
+        """Sets the gains that a loss has now.
+
+        Args:
+            loss (LossModule): made by :meth:`wrap`.
+            gains (Mapping): of ``"policy"`` and ``"value"``, or of ``"all"``; 1 where it has none.
+        """
+        for_all = gains.get("all", 1.0)
+        self.set_gains(loss, gains.get("policy", for_all), gains.get("value", for_all))
 
     def set_gains(self, loss: LossModule, policy: float, value: float) -> None:
         """Multiplies the terms that train the policy and the values, from what the settings say."""

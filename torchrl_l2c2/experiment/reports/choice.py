@@ -79,7 +79,11 @@ def _beside(group: Group, vanilla: Group) -> Beside | None:
         return None
     total, their_total, sm, their_sm = (np.mean([f[seed] for seed in seeds]) for f in figures)
     gained = float((total - their_total) / abs(their_total))
-    return Beside(group, vanilla, gained, float(sm / their_sm), seeds)
+    ours, theirs = (
+        Group(tuple(r for r in side.records if r.seed in seeds), side.name)
+        for side in (group, vanilla)
+    )
+    return Beside(ours, theirs, gained, float(sm / their_sm), seeds)
 
 
 def _sm(tasks: Sequence[Beside]) -> float:

@@ -28,7 +28,7 @@ SIGNS = {"return": 1.0, "action_variation": -1.0}
 
 @dataclass(frozen=True)
 class Estimate:
-    """A statistic and its 95% interval; a single run has none."""
+    """A statistic and its 95% interval; where a side or a task has a single run there is none."""
 
     value: float
     interval: Interval | None
@@ -39,7 +39,7 @@ class Estimate:
         if not all(len(matrix) for matrix in scores):
             return None
         value, generator = float(statistic(*scores)), np.random.default_rng(0)
-        if max(len(matrix) for matrix in scores) == 1:
+        if min((~np.isnan(matrix)).sum(0).min() for matrix in scores) <= 1:
             return cls(value, None)
         return cls(value, bootstrap_interval(statistic, *scores, generator=generator))
 
