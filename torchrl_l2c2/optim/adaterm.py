@@ -14,6 +14,7 @@ from torchrl_l2c2._checks import check_real
 
 TINY = torch.finfo(torch.float32).tiny
 SUPPORTED_DTYPES = (torch.float32, torch.float64)
+SETTINGS = {"lr", "beta", "eps", "nu_min"}
 
 
 class AdaTerm(Optimizer):
@@ -149,7 +150,7 @@ class AdaTerm(Optimizer):
             ValueError: it is another optimizer's, or of other parameters; nothing is changed.
         """
         for group in state_dict["param_groups"]:
-            if missing := self.defaults.keys() - group.keys():
+            if missing := SETTINGS - group.keys():
                 raise ValueError(
                     f"AdaTerm: the state has no {sorted(missing)}, but {sorted(group)}: it is "
                     "another optimizer's. Begin with a new AdaTerm."
