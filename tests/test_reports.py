@@ -1106,6 +1106,16 @@ def test_the_gains_of_sac_are_those_of_their_records():
         assert cell(*group.records[:4]) in page, group.name
 
 
+def test_walkings_gains_are_those_of_their_records():
+    """Every run of Walker2d is a cell."""
+    page = (ROOT / "results" / "field_gains.md").read_text()
+    records = read_records(ROOT / "results" / "walker2d_gains.csv")
+    for record in records:
+        cell = f"{record.last_mean_return:.0f} / {record.last_mean_sm_asap:.3f}"
+        assert f"| {cell.replace('/ 0.', '/ .')} |" in page
+    assert len(records) >= 9
+
+
 def test_the_pages_of_other_readings_are_those_of_their_records():
     """The table before the loss was summed over the batch; Reacher's of the other length."""
     records = read_records(ROOT / "results" / "runs.csv")
