@@ -64,3 +64,12 @@ def test_nothing_is_fetched_to_read_it(site: Path) -> None:
         assert not [tag for tag in tags if re.search(r'(?:src|href)="(?:https?:)?//', tag)], page
     for style in site.rglob("*.css"):
         assert not re.search(r"(?:url\(|@import)\s*['\"]?(?:https?:)?//", style.read_text()), style
+
+
+def test_no_page_takes_the_place_of_one_of_sphinx(site: Path) -> None:
+    """Two of one name are one file: the later one's."""
+    for page in (ROOT / "docs").glob("*.md"):
+        title = re.search(r"^# (.+)$", page.read_text(), re.M)
+        if title is not None:
+            heading = re.search(r"<h1>(.*?)<a", (site / f"{page.stem}.html").read_text(), re.S)
+            assert heading is not None and title[1].strip("`")[:8] in heading[1], page.name
