@@ -1,5 +1,6 @@
 """Checkpoint files: whole or refused, the newest whole one first, and no code inside."""
 
+import io
 import pickle
 import struct
 
@@ -16,6 +17,9 @@ from torchrl_l2c2.experiment.checkpoints import (
     load_newest,
     save_checkpoint,
 )
+from torchrl_l2c2.experiment.config import ExperimentConfig
+from torchrl_l2c2.experiment.files import append_line
+from torchrl_l2c2.experiment.folder import begin_folder
 
 STATE = {"weights": torch.arange(100.0), "episode": 7, "names": ["a", "b"]}
 
@@ -134,3 +138,30 @@ def test_a_damaged_newer_one_does_not_take_the_place_of_what_is_written(tmp_path
     save_checkpoint(tmp_path, 95, STATE, keep=1)
     path, state, damaged = load_newest(tmp_path)
     assert path.name == "checkpoint_00000095.pt" and state["episode"] == 7 and len(damaged) == 1
+
+
+def test_a_line_that_the_disk_has_no_room_for_is_taken_back(tmp_path, monkeypatch):
+    """The system may write a part of it, and say how much."""
+    path = tmp_path / "metrics.csv"
+    append_line(path, "whole\n")
+
+    class Full(io.FileIO):
+        def write(self, content):
+            return super().write(content[:2])
+
+    monkeypatch.setattr(
+        "torchrl_l2c2.experiment.files.open", lambda path, *_, **__: Full(path, "ab"), raising=False
+    )
+    with pytest.raises(OSError, match="No space left on device: this could not be written"):
+        append_line(path, "another\n")
+    assert path.read_text() == "whole\n"
+
+
+def test_a_run_that_begins_anew_keeps_nothing_of_the_one_before(tmp_path):
+    """One that goes on from a checkpoint does."""
+    of_the_way = [tmp_path / name for name in ("metrics.csv", "policy_best.pt", "evaluations.json")]
+    for begun in (True, False):
+        for path in of_the_way:
+            path.touch()
+        begin_folder(tmp_path, ExperimentConfig().to_dict(), begun=begun, ended=False)
+        assert [path.exists() for path in of_the_way] == [begun] * 3

@@ -5,6 +5,7 @@ import signal
 
 import pytest
 
+from torchrl_l2c2.experiment.command import _tell
 from torchrl_l2c2.experiment.signals import Terminated, stop_on_signals
 
 
@@ -30,3 +31,8 @@ def test_other_failures_are_told_with_or_without_one(error):
         raise error
     with pytest.raises(RuntimeError, match="its own"), stop_on_signals():
         raise RuntimeError("its own")
+
+
+def test_an_error_without_a_text_has_its_name():
+    """Which a sweep keeps a line of."""
+    assert _tell(AssertionError()) == "AssertionError"

@@ -62,8 +62,8 @@ def diagnose_run(
         with_pictures (bool): whether the first episode is drawn as well. Default ``True``.
 
     Returns:
-        Diagnosis: with the shares of the loss's terms, and with pictures where they were wanted
-        and the task draws any.
+        Diagnosis: with the shares of the loss's terms (not of the best policy, whose loss was not
+        kept), and with pictures where they were wanted and the task draws any.
 
     Raises:
         FileNotFoundError: the folder holds no run, or no policy yet.
