@@ -23,6 +23,7 @@ from torchrl_l2c2.experiment import (
     TaskConfig,
     make_env,
 )
+from torchrl_l2c2.experiment.command import run
 from torchrl_l2c2.experiment.environments import SimulatorError
 
 INF = float("inf")
@@ -251,6 +252,40 @@ def test_what_a_task_raises_before_it_plays_names_it(monkeypatch, method, raises
     with pytest.raises(SimulatorError, match=message) as raised:
         make_env(task(), 0)
     assert raised.value.__cause__ is raises
+
+
+@pytest.mark.parametrize(
+    ("where", "settings"),
+    [
+        ("the test after episode 1", {"late_share": 1.0}),
+        ("test episode 1", {"evaluate_every": 1}),
+        ("test episode 1", {}),
+    ],
+    ids=["late", "during training", "at the end"],
+)
+def test_what_a_task_raises_in_a_test_is_told_as_in_training(monkeypatch, where, settings):
+    """Tests play in environments of their own, which may fail where training's do not."""
+    still(monkeypatch)
+    trained, step = experiment("sac", task(episodes=1), **settings), Still.step
+    training = trained.player.collector._gymnasium.unwrapped
+
+    def fail(self, action):
+        if self is not training:
+            raise KeyError("cable")
+        return step(self, action)
+
+    monkeypatch.setattr(Still, "step", fail)
+    with pytest.raises(SimulatorError, match=f"failed in {where}: KeyError: 'cable'"):
+        trained.train()
+        trained.test(1)
+
+
+def test_a_task_without_pictures_is_not_trained_for_a_video(monkeypatch, tmp_path):
+    """It would be found out at the end."""
+    still(monkeypatch)
+    with pytest.raises(ValueError, match="Still-v0 draws no pictures"):
+        run(ExperimentConfig(task=task(), record=True), tmp_path / "run", {})
+    assert not (tmp_path / "run").exists()
 
 
 def test_returns_that_are_no_number_are_not_averaged(monkeypatch):

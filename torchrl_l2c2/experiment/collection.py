@@ -23,6 +23,7 @@ from torchrl.envs import (
 )
 
 from torchrl_l2c2.experiment.acting import on_tensors
+from torchrl_l2c2.experiment.environments import playing
 from torchrl_l2c2.experiment.frames import Frame, as_number, stack_frames
 from torchrl_l2c2.transforms import ObservationNoise
 
@@ -274,6 +275,9 @@ def play_episodes(
     """Episodes ``[T]`` of a policy, by its mean or by samples; the environment stays open.
 
     The arguments are those of :func:`~torchrl_l2c2.experiment.evaluate_policy`.
+
+    Raises:
+        SimulatorError: the environment or the policy failed; names the episode.
     """
     collector = EpisodeCollector(
         env,
@@ -283,8 +287,10 @@ def play_episodes(
         exploration_type=ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC,
     )
     try:
-        for _ in range(episodes):
-            yield collector.rollout()
+        for number in range(1, episodes + 1):
+            with playing(f"the task failed in test episode {number}"):
+                episode = collector.rollout()
+            yield episode
     finally:
         collector.shutdown(close_env=False)
 

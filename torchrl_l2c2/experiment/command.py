@@ -197,10 +197,11 @@ def run(
     )
     from torchrl_l2c2.experiment.trained import save_policy
     from torchrl_l2c2.experiment.training import Experiment
-    from torchrl_l2c2.experiment.video import check_video, record_video
+    from torchrl_l2c2.experiment.video import check_pictures, check_video, record_video
 
     if config.record:
         check_video()
+        check_pictures(config.task)
     for chatty in ("torchrl", "matplotlib", "torch"):
         logging.getLogger(chatty).setLevel(logging.ERROR)
     keep_freed_memory()

@@ -15,6 +15,7 @@ import torch
 from gymnasium.wrappers import RenderCollection
 from torchrl.envs import EnvBase, GymWrapper, TransformedEnv
 
+from torchrl_l2c2.experiment.compilation import CompilerError
 from torchrl_l2c2.experiment.spaces import (
     Env,
     observing_image,
@@ -32,6 +33,25 @@ TEST_SEED = 1_000_003
 
 class SimulatorError(RuntimeError):
     """The environment or the policy in it raised an error; the cause is chained."""
+
+
+@contextlib.contextmanager
+def playing(what: str) -> Iterator[None]:
+    """Makes errors of a task, or of the policy that acts in it, a :class:`SimulatorError`.
+
+    Args:
+        what (str): what failed and where: the beginning of the error's text.
+
+    Raises:
+        SimulatorError: something raised an error, or tried to end the process.
+        CompilerError: the policy could not be compiled, which is no fault of the task.
+    """
+    try:
+        yield
+    except CompilerError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise SimulatorError(f"{what}: {type(error).__name__}: {error}") from error
 
 
 def make_env(task: TaskConfig, seed: int, *, render: bool = False) -> EnvBase:

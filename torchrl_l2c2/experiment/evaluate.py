@@ -21,7 +21,7 @@ from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 from tqdm import tqdm
 
 from torchrl_l2c2.experiment.collection import EpisodeCollector, check_finite, play_episodes
-from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
+from torchrl_l2c2.experiment.environments import TEST_SEED, make_env, playing
 from torchrl_l2c2.experiment.files import make_folder_of, to_json, write_json
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.saved import read_config
@@ -114,6 +114,7 @@ def evaluate_policy(
     Raises:
         FloatingPointError: NaN or infinity in what the environment or the policy gave; names the
             key and the frame.
+        SimulatorError: the environment or the policy raised an error; names the episode.
         ValueError: fewer than one episode.
 
     Examples:
@@ -228,13 +229,15 @@ class LateTests:
 
         Raises:
             FloatingPointError: as in :func:`evaluate_policy`.
+            SimulatorError: likewise.
         """
         with ProcessState(self._seed, torch.get_num_threads()):
             # Late, as most calls of a short training need none.
             if self._collector is None:
                 self._collector = self._make_collector()
             self._collector.set_seed(self._seed + number)
-            episode = self._collector.rollout()
+            with playing(f"{self._task.env_id} failed in the test after episode {number}"):
+                episode = self._collector.rollout()
         check_finite(episode, 0, test=True)
         figures = _return(episode), _variation(episode["action"])
         return dict(zip(TESTED, figures, strict=True))

@@ -13,8 +13,7 @@ from torchrl.modules import EGreedyModule
 
 from torchrl_l2c2.experiment.algorithms.agent import Agent
 from torchrl_l2c2.experiment.collection import EpisodeCollector, check_finite
-from torchrl_l2c2.experiment.compilation import CompilerError
-from torchrl_l2c2.experiment.environments import SimulatorError
+from torchrl_l2c2.experiment.environments import playing
 from torchrl_l2c2.experiment.frames import Frame, stack_frames
 from torchrl_l2c2.experiment.rollouts import RolloutCollector
 from torchrl_l2c2.experiment.workers import MultiEpisodeCollector, RayEpisodeCollector
@@ -124,14 +123,8 @@ class Player:
         return batches
 
     def _simulate(self, play: Callable[[], Played]) -> Played:
-        try:
+        with playing(f"{self._env_id} failed beyond frame {self.frames}"):
             return play()
-        except CompilerError:  # of the policy
-            raise
-        except (Exception, SystemExit) as error:
-            raise SimulatorError(
-                f"{self._env_id} failed beyond frame {self.frames}: {type(error).__name__}: {error}"
-            ) from error
 
     def _count(self, frames: int) -> None:
         self.frames += frames

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
 from torchrl_l2c2.experiment.collection import play_episodes
-from torchrl_l2c2.experiment.environments import control_rate
+from torchrl_l2c2.experiment.environments import control_rate, make_env
 from torchrl_l2c2.experiment.files import make_folder_of
 from torchrl_l2c2.experiment.process import ProcessState
+from torchrl_l2c2.experiment.tasks import TaskConfig
 from torchrl_l2c2.experiment.trained import load_policy
 
 Picture = NDArray[np.uint8]
@@ -46,6 +47,17 @@ def check_video(path: str | Path | None = None) -> None:
     if Path(path).suffix.lower() not in ENDINGS:
         raise ValueError(f"a video's file ends in {', '.join(ENDINGS)}, got {str(path)!r}.")
     make_folder_of(path)
+
+
+def check_pictures(task: TaskConfig) -> None:
+    """Refuses a task that draws no pictures, by drawing its first one.
+
+    Raises:
+        ValueError: it has no pictures.
+        SimulatorError: it fails at drawing, for lack of a graphics library for example.
+    """
+    with _without_a_screen(), ProcessState(0):
+        make_env(task, 0, render=True).close()
 
 
 def record_video(
