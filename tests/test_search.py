@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -73,6 +74,23 @@ def test_a_search_goes_on_with_the_trial_that_was_lost(tmp_path):
     whole = dict(Search(tmp_path / "whole", GAINS).trials(3))
     assert again == whole
     assert [json.loads(line)["op_code"] for line in (tmp_path / "journal.log").open()]
+
+
+def test_searches_at_once_propose_as_one_does(tmp_path, monkeypatch):
+    """Neither the same values twice nor more trials than there are to be."""
+    ask = optuna.Study.ask
+
+    def slowly(study, *args):
+        time.sleep(0.2)  # in which another would ask
+        return ask(study, *args)
+
+    alone = dict(Search(tmp_path / "alone", GAINS).trials(4))
+    monkeypatch.setattr(optuna.Study, "ask", slowly)
+    searches = [Search(tmp_path / "shared", GAINS) for _ in range(3)]
+    with ThreadPoolExecutor() as pool:
+        found = list(pool.map(lambda search: list(search.trials(4)), searches))
+    assert {number: values for each in found for number, values in each} == alone
+    assert len(searches[0].study.get_trials()) == 4
 
 
 @pytest.mark.parametrize(

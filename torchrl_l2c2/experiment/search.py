@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from filelock import FileLock
 
 from torchrl_l2c2.experiment.files import make_folder
 from torchrl_l2c2.experiment.lock import FolderInUseError, lock_folder
@@ -32,7 +33,7 @@ from torchrl_l2c2.experiment.search_space import check_settings, read_space, sho
 from torchrl_l2c2.experiment.sweep import start_guard
 
 if TYPE_CHECKING:
-    from optuna import Study
+    from optuna import Study, Trial
 
 DESCRIPTION = """\
 Searches for settings with a large return and a small action variation, and writes a report with the
@@ -98,18 +99,13 @@ class Search:
         Args:
             most (int): how many there are to be in all.
         """
-        from optuna.samplers import TPESampler
         from optuna.trial import TrialState
 
         for lost in self.study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
             with self._taken(lost.number) as ours:
                 if ours:
                     yield lost.number, lost.params
-        while (done := len(self.study.get_trials(deepcopy=False))) < most:
-            # What has been proposed before is of no matter: a continued search is the same.
-            entropy = np.random.SeedSequence([self._seed, done])
-            self.study.sampler = TPESampler(seed=int(entropy.generate_state(1)[0]))
-            trial = self.study.ask(self.space)
+        while (trial := self._ask(most)) is not None:
             with self._taken(trial.number) as ours:
                 if ours:
                     yield trial.number, trial.params
@@ -140,6 +136,18 @@ class Search:
         from optuna.trial import TrialState
 
         self.study.tell(number, state=TrialState.FAIL, skip_if_finished=True)
+
+    def _ask(self, most: int) -> Trial | None:
+        """The next trial; one process at a time, as what is proposed follows from its number."""
+        from optuna.samplers import TPESampler
+
+        with FileLock(self.folder / ".lock_asking"):
+            if (done := len(self.study.get_trials(deepcopy=False))) >= most:
+                return None
+            # What has been proposed before is of no matter: a continued search is the same.
+            entropy = np.random.SeedSequence([self._seed, done])
+            self.study.sampler = TPESampler(seed=int(entropy.generate_state(1)[0]))
+            return self.study.ask(self.space)
 
     def _open(self) -> Study:
         import optuna
