@@ -61,7 +61,7 @@ def main(frames: int) -> None:
                 optimizer.zero_grad()
 
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
-        episode = env.rollout(200, actor.to("cpu"))
+        episode = env.rollout(200, actor)  # The collector has it on the device.
     mine = torch.cat([parameter.detach().flatten() for parameter in loss.parameters()])
     first = mine.clone()
     dist.broadcast(first, 0)

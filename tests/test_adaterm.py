@@ -444,6 +444,17 @@ def test_another_optimizers_state_is_refused(other):
     assert optimizer.param_groups[0]["lr"] == 0.5
 
 
+def test_the_state_of_parameters_of_other_shapes_is_refused():
+    """When it is loaded, and with nothing changed."""
+    small, large = (
+        AdaTerm([nn.Parameter(torch.ones(1)), nn.Parameter(torch.ones(size))], lr=0.1 * size)
+        for size in (2, 3)
+    )
+    with pytest.raises(ValueError, match=r"parameter 1 of the state has the shape \(3,\), got .*2"):
+        small.load_state_dict(large.state_dict())
+    assert small.param_groups[0]["lr"] == 0.2
+
+
 def test_a_parameter_without_numbers_stays_as_it_is():
     """And leaves no NaN in what is saved."""
     empty, x = torch.nn.Parameter(torch.ones(0)), torch.nn.Parameter(torch.ones(1))

@@ -39,6 +39,7 @@ def test_what_is_no_real_number_is_a_type_error(value):
         ({"above": 0, "below": 1}, [0.5], [0.0, 1.0, math.nan], r"in \(0, 1\)"),
         ({"at_least": 0, "at_most": 1}, [0, 1.0], [1.5, -math.inf], r"in \[0, 1\]"),
         ({"at_least": 0, "below": 0.25}, [0], [0.25], r"in \[0, 0.25\)"),
+        ({}, [-1e30], [math.nan, -math.inf], "finite"),
     ],
 )
 def test_bounds(bounds, inside, outside, allowed):

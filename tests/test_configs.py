@@ -264,6 +264,22 @@ def test_neighborhood_is_shared():
     assert instantiate(cfg.loss).l2c2_neighborhood == near
 
 
+@pytest.mark.parametrize("name", ["neighbor", "observation_noise"])
+def test_a_transforms_generator_is_on_its_device(name):
+    """Batches on a GPU want one that is there."""
+    node = composed(
+        f"+transform={name}",
+        "transform.seed=0",
+        "transform.device=cuda",
+        *(["transform.scale=1"] if name == "observation_noise" else []),
+    ).transform
+    if torch.cuda.is_available():
+        assert instantiate(node).generator.device.type == "cuda"
+        return
+    with pytest.raises(InstantiationException, match="cuda"):
+        instantiate(node)
+
+
 @pytest.mark.parametrize("scale", [0.5, [0.5, 0.0, 0.0]])
 def test_observation_noise_instantiates_and_is_seeded(scale):
     """``transform: observation_noise`` takes a number or a list, and a seed."""

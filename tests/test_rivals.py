@@ -356,6 +356,13 @@ class TestLCP:
         value = s.square().sum(-1) + 3.0 * t.squeeze(-1)
         assert lcp_term(value, [s, t], 1).tolist() == [4.0 + 16.0 + 9.0]
 
+    @pytest.mark.parametrize("features", [2, 3])
+    def test_one_state_of_three_agents(self, features):
+        """Is no state of each agent, also where it has as many features as there are agents."""
+        state = torch.ones(5, features, requires_grad=True)
+        log_prob = state.sum(-1, keepdim=True).expand(5, 3)
+        assert lcp_term(log_prob, [state], 1).tolist() == [9.0 * features] * 5
+
     def test_of_a_linear_normal_policy(self):
         """The gradient of ln pi is W^T (a - W s) / s^2."""
         batch = transitions(8)

@@ -300,6 +300,40 @@ def test_final_observations_that_lack_a_group_are_refused() -> None:
         collected(make(rsl.CATSPPO), final_obs=observations(77).select("policy"))
 
 
+def test_final_observations_of_another_shape_are_refused() -> None:
+    """They would be broadcast, or of the wrong environments."""
+    narrow = observations(77).set("policy", torch.zeros(ENVS, 1))
+    for final, found in ((narrow, r"\(6, 1\)"), (observations(77)[:2], r"\(2, 3\)")):
+        with pytest.raises(
+            ValueError, match=rf"'final_obs'.* 'policy' has {found}, where .*\(6, 3"
+        ):
+            collected(make(rsl.CATSPPO), final_obs=final)
+
+
+def test_final_observations_may_be_none() -> None:
+    """As if they were not there."""
+    absent, without = (
+        update(collected(make(rsl.CATSPPO), dones={2: [1]}, **extras))
+        for extras in ({"final_obs": None}, {})
+    )
+    assert absent == without
+
+
+@pytest.mark.parametrize(
+    "name", ["action", "loc", "state_value", "valid", "next", "_row", "nearby"]
+)
+def test_groups_with_names_that_batches_need_are_refused(
+    monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """They would be taken for what they are not."""
+    named = observations
+    monkeypatch.setattr(f"{__name__}.observations", lambda s: named(s).rename_key_("policy", name))
+    monkeypatch.setitem(GROUPS, "actor", [name])
+    monkeypatch.setitem(GROUPS, "critic", [name, "privileged"])
+    with pytest.raises(ValueError, match=rf"groups \['{name}'\] have names that batches need"):
+        make(rsl.L2C2PPO, regularizer_cfg={"neighbor_key": ("nearby", "state")})
+
+
 def mirror(env: Any, obs: TensorDict | None, actions: Tensor | None) -> tuple[Any, Any]:
     """Left for right, as rsl_rl's extension asks for it."""
     both_obs = None if obs is None else torch.cat((obs, obs.apply(torch.neg)))
@@ -343,6 +377,33 @@ def test_the_gain_rises_with_the_updates_and_is_resumed() -> None:
     resumed = make(rsl.L2C2PPO, regularizer_cfg=cfg)
     resumed.load(saved, None, strict=True)
     assert update(collected(resumed)) == losses
+
+
+def test_draws_of_another_kind_of_device_begin_anew() -> None:
+    """A policy trained on a GPU is played, exported and trained on elsewhere."""
+    ppo = make(rsl.L2C2PPO, regularizer_cfg={"ramp_updates": 4})
+    saved, before = ppo.save(), ppo.regularization.neighbors.generator.get_state()
+    saved["regularization_state_dict"] |= {"generator": torch.zeros(16).byte(), "updates": 3}
+    ppo.load(saved, None, strict=True)
+    assert ppo.regularization.updates == 3
+    assert ppo.regularization.neighbors.generator.get_state().equal(before)
+
+
+def test_only_the_first_of_several_processes_draws_as_it_did() -> None:
+    """It is the one that saves, and the others would all draw its numbers."""
+    saved = update_and_save(make(rsl.L2C2PPO))
+    for rank, same in ((0, True), (1, False)):
+        ppo = make(rsl.L2C2PPO)
+        ppo.is_multi_gpu, ppo.gpu_global_rank = True, rank
+        ppo.load(copy.deepcopy(saved), None, strict=True)
+        drawn = ppo.regularization.neighbors.generator.get_state()
+        assert drawn.equal(saved["regularization_state_dict"]["generator"]) == same
+        assert ppo.regularization.updates == 1
+
+
+def update_and_save(ppo: PPO) -> dict[str, Any]:
+    update(collected(ppo))
+    return copy.deepcopy(ppo.save())
 
 
 @pytest.mark.parametrize("before", [PPO, rsl.CATSPPO], ids=["plain", "another regularizer"])

@@ -188,6 +188,19 @@ class TestAroundALoss:
                 ValueError,
                 "which are the loss's own, got .*loss_cats",
             ),
+            *(
+                (
+                    lambda names=names: TchebycheffLoss(cats(), objectives=names),
+                    ValueError,
+                    r"must name what trains the policy among \['loss_actor', 'loss_value'\], which",
+                )
+                for names in ("pred_value", ["loss_actor", "typo"])  # a diagnostic; and no entry
+            ),
+            (
+                lambda: TchebycheffLoss(cats(), ideal=(math.nan, 0.0)),
+                ValueError,
+                r"ideal\[0\] must be finite, got nan",
+            ),
             (lambda: TchebycheffLoss(unread()), TypeError, "has none among its out_keys"),
             (
                 lambda: TchebycheffLoss(

@@ -225,6 +225,13 @@ def test_generator_must_match_what_was_saved(saved, present, words):
         build[1].load_state_dict(build[0].state_dict())
 
 
+def test_a_generator_of_another_kind_of_device_is_told():
+    """Its state has another size."""
+    transform = NeighborTransform(NEAR, generator=generator())
+    with pytest.raises(ValueError, match="a generator of another kind of device than cpu: build"):
+        transform.set_extra_state(torch.zeros(16, dtype=torch.uint8))
+
+
 def test_deep_copies_have_their_own_generator():
     """A deep copy draws the same neighbors and leaves the original's generator alone."""
     transform = NeighborTransform(NEAR, generator=generator())

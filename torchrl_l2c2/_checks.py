@@ -110,6 +110,8 @@ def _range(
     finite: bool,
 ) -> str:
     low, high = (above if at_least is None else at_least), (below if at_most is None else at_most)
+    if low is None:
+        return "finite"
     if high is not None:
         brackets = "(" if at_least is None else "[", ")" if at_most is None else "]"
         return f"in {brackets[0]}{low:.4g}, {high:.4g}{brackets[1]}"

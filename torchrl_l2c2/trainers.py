@@ -75,29 +75,30 @@ def _make_neighbor_transform(
     out_key: Any,
     neighborhood: Any = None,
     seed: int | None = None,
+    device: str = "cpu",
     **settings: Any,
 ) -> NeighborTransform:
     return NeighborTransform(
         Neighborhood() if neighborhood is None else neighborhood,
         in_keys=_normalize_hydra_keys(in_keys),
         out_key=_normalize_hydra_key(out_key),
-        generator=_generator(seed),
+        generator=_generator(seed, device),
         **settings,
     )
 
 
 def _make_observation_noise(
-    scale: Any, in_keys: list[Any] | None, seed: int | None = None
+    scale: Any, in_keys: list[Any] | None, seed: int | None = None, device: str = "cpu"
 ) -> ObservationNoise:
     # A list arrives as OmegaConf's own, which torch does not take.
     scale = list(scale) if isinstance(scale, ListConfig) else scale
     return ObservationNoise(
-        scale, in_keys=_normalize_hydra_keys(in_keys), generator=_generator(seed)
+        scale, in_keys=_normalize_hydra_keys(in_keys), generator=_generator(seed, device)
     )
 
 
-def _generator(seed: int | None) -> torch.Generator | None:
-    return None if seed is None else torch.Generator().manual_seed(seed)
+def _generator(seed: int | None, device: str) -> torch.Generator | None:
+    return None if seed is None else torch.Generator(device).manual_seed(seed)
 
 
 def _node(
@@ -207,7 +208,7 @@ def register() -> None:
     A node has the parameters of its component, with their defaults. Beside them, ``base_loss`` is
     the configuration of another loss, such as TorchRL's ``loss: sac``; ``neighborhood`` one of the
     group of that name, or nothing for the paper's; and a transform's ``seed`` gives it a generator
-    of its own.
+    of its own, on its ``device``, which is that of the batches (``cuda:0``; default ``cpu``).
 
     Examples:
         >>> from hydra import compose, initialize

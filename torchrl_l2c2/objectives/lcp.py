@@ -109,7 +109,8 @@ def lcp_term(
         log_prob.sum(), states, create_graph=True, materialize_grads=True
     )
     # Agents that have a state each are as the rows of a batch, and are not summed over either.
-    if all(state.shape[: log_prob.ndim] == log_prob.shape for state in states):
-        batch_dims = log_prob.ndim
+    agents = log_prob.ndim
+    if all(s.ndim > agents and s.shape[:agents] == log_prob.shape for s in states):
+        batch_dims = agents
     squares = [gradient.square().flatten(batch_dims).sum(-1) for gradient in gradients]
     return torch.stack(squares).sum(0)

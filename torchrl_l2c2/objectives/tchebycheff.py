@@ -53,15 +53,16 @@ class TchebycheffLoss(RegularizedLoss):
             :math:`z_1` train the regularizers more. Defaults to ``(0.0, 0.0)``.
 
     Keyword Args:
-        objectives (str or iterable of str): names of the terms that are :math:`f_1`; those that
-            the loss does not have are passed over. Of CQL's two losses of the policy name the one
-            that is descended, ``"loss_actor"`` or ``"loss_actor_bc"``. Defaults to ``OBJECTIVES``.
+        objectives (str or iterable of str): names of the terms that are :math:`f_1`, among the
+            ``loss_`` entries that train the policy. Of CQL's two losses of the policy name the one
+            that is descended, ``"loss_actor"`` or ``"loss_actor_bc"``. Defaults to those of
+            ``OBJECTIVES`` that the loss has.
 
     Raises:
         TypeError: the loss has no regularizer with a term of the policy, or an argument has the
             wrong type.
-        ValueError: an argument is out of its range, the loss has none of the objectives, one of
-            them is a regularizer's or, in use, terms are not single numbers.
+        ValueError: an argument is out of its range, the loss does not have one of the objectives,
+            or it is a regularizer's or, in use, terms are not single numbers.
 
     Examples:
         >>> import torch
@@ -100,9 +101,11 @@ class TchebycheffLoss(RegularizedLoss):
                 "around it first."
             )
         names = [objectives] if isinstance(objectives, str) else list(objectives)
-        offered = [key for key in self.out_keys if key not in self.added_terms]
+        losses = [key for key in self.out_keys if key.startswith("loss_")]
+        offered = [key for key in losses if key not in self.added_terms]
         own = [key for key in offered if key in names]
-        if not own or self.added_terms.intersection(names):
+        unknown = objectives is not OBJECTIVES and not set(names) <= set(offered)
+        if not own or unknown:
             raise ValueError(
                 f"objectives must name what trains the policy among {offered}, which are the "
                 f"loss's own, got {names}."

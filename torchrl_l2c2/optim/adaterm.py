@@ -144,7 +144,7 @@ class AdaTerm(Optimizer):
         """Restores what ``state_dict`` gave.
 
         Args:
-            state_dict (dict): of an AdaTerm with as many parameters.
+            state_dict (dict): of an AdaTerm with as many parameters, of the same shapes.
 
         Raises:
             ValueError: it is another optimizer's, or of other parameters; nothing is changed.
@@ -154,6 +154,15 @@ class AdaTerm(Optimizer):
                 raise ValueError(
                     f"AdaTerm: the state has no {sorted(missing)}, but {sorted(group)}: it is "
                     "another optimizer's. Begin with a new AdaTerm."
+                )
+        parameters = [p for group in self.param_groups for p in group["params"]]
+        saved = {n: entry["exp_avg"].shape for n, entry in state_dict["state"].items()}
+        for number, p in enumerate(parameters):
+            if saved.get(number, p.shape) != p.shape:
+                raise ValueError(
+                    f"AdaTerm: parameter {number} of the state has the shape "
+                    f"{tuple(saved[number])}, got one of {tuple(p.shape)}: it is of other "
+                    "parameters. Begin with a new AdaTerm."
                 )
         super().load_state_dict(state_dict)
 

@@ -21,6 +21,8 @@ from torchrl_l2c2.objectives import SharedEvaluation
 
 MEAN, SCALE, VALUE, VALID = "loc", "scale", "state_value", "valid"
 """Entries of a batch: the policy's parameters and the value, and whether a row is a transition."""
+ENTRIES = ("action", MEAN, SCALE, VALUE, VALID)
+"""All that the losses read or write beside observation groups, which cannot have these names."""
 
 
 class ActorCriticLoss(SharedEvaluation):

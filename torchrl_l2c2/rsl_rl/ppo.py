@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import fields
 from typing import Any, ClassVar
 
@@ -9,14 +10,14 @@ import torch
 from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
-from tensordict import TensorDict
+from tensordict import NestedKey, TensorDict
 from torch import Tensor
 
 from torchrl_l2c2.neighborhood import Neighborhood
 from torchrl_l2c2.objectives import CATSLoss, L2C2Loss, RegularizedLoss
-from torchrl_l2c2.rsl_rl.networks import ActorCriticLoss
+from torchrl_l2c2.rsl_rl.networks import ENTRIES, ActorCriticLoss
 from torchrl_l2c2.rsl_rl.regularization import Regularization
-from torchrl_l2c2.rsl_rl.storage import SuccessorStorage
+from torchrl_l2c2.rsl_rl.storage import ROW, SuccessorStorage
 from torchrl_l2c2.transforms import NeighborTransform
 
 FINAL = "final_obs"
@@ -45,6 +46,7 @@ class RegularizedPPO(PPO):
         **kwargs: Any,
     ) -> None:
         networks = ActorCriticLoss(actor, critic)
+        _check_groups(storage.observations.keys(), (*ENTRIES, ROW, "next"))
         super().__init__(actor, critic, SuccessorStorage(storage), *args, **kwargs)
         options = dict(regularizer_cfg or {})
         ramp_updates = options.pop("ramp_updates", None)
@@ -67,11 +69,12 @@ class RegularizedPPO(PPO):
     def process_env_step(
         self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]
     ) -> None:
-        if FINAL in extras:
-            _check_final(extras[FINAL], list(obs.keys()))
+        final = extras.get(FINAL)
+        if final is not None:
+            _check_final(final, obs)
         super().process_env_step(obs, rewards, dones, extras)
-        if FINAL in extras:
-            final = TensorDict({**extras[FINAL]}, [self.storage.num_envs], device=self.device)
+        if final is not None:
+            final = TensorDict({**final}, [self.storage.num_envs], device=self.device)
             self.storage.add_final(final, dones)
 
     def compute_returns(self, obs: TensorDict) -> None:
@@ -95,17 +98,37 @@ class RegularizedPPO(PPO):
         """As rsl_rl's; a checkpoint of the plain PPO, or of another regularizer, is a beginning."""
         resumes = super().load(loaded_dict, load_cfg, strict)
         if resumes and "regularization_state_dict" in loaded_dict:
-            self.regularization.load_state_dict(loaded_dict["regularization_state_dict"])
+            state = dict(loaded_dict["regularization_state_dict"])
+            # The first process has written it: others would draw as that one does.
+            if self.is_multi_gpu and self.gpu_global_rank:
+                state.pop("generator", None)
+            self.regularization.load_state_dict(state)
         return resumes
 
 
-def _check_final(final: Any, groups: list[str]) -> None:
-    missing = [group for group in groups if group not in final.keys()]
-    if missing:
+def _check_groups(names: Iterable[str], taken: Iterable[NestedKey]) -> None:
+    first = {key if isinstance(key, str) else key[0] for key in taken}
+    if clash := sorted(first.intersection(names)):
+        raise ValueError(
+            f"the observation groups {clash} have names that batches need for something else: "
+            "have the environment give them others."
+        )
+
+
+def _check_final(final: Any, obs: TensorDict) -> None:
+    groups = list(obs.keys())
+    if missing := [group for group in groups if group not in final.keys()]:
         raise KeyError(
             f"extras[{FINAL!r}] lacks the groups {missing}: let the environment give all that it "
             f"observes, {groups}, or leave {FINAL!r} out."
         )
+    for group in groups:
+        if final[group].shape != obs[group].shape:
+            raise ValueError(
+                f"extras[{FINAL!r}] must have the shapes of the observations, all environments' "
+                f"rows among them: {group!r} has {tuple(final[group].shape)}, where they have "
+                f"{tuple(obs[group].shape)}."
+            )
 
 
 class L2C2PPO(RegularizedPPO):
@@ -184,6 +207,7 @@ class L2C2PPO(RegularizedPPO):
             read += networks.critic_network.in_keys
         stored = self.storage.observations
         groups = [group for group in dict.fromkeys(read) if stored[group].is_floating_point()]
+        _check_groups(stored.keys(), [loss.l2c2_neighbor_key])
         moved = groups if loss.l2c2_moved_keys is None else [*loss.l2c2_moved_keys]
         if not set(moved) <= set(groups):
             raise ValueError(

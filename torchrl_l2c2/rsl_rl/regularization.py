@@ -105,9 +105,12 @@ class Regularization:
         self.updates = state["updates"]
         self._set_gain()
         generator = None if self.neighbors is None else self.neighbors.generator
-        # A regularizer that draws nothing has saved none: this one's begins as it would anew.
+        # None is saved by a regularizer that draws nothing, and one of another kind by another kind
+        # of device: this one's then begins as it would anew.
         if generator is not None and "generator" in state:
-            generator.set_state(state["generator"].cpu())
+            saved = state["generator"].cpu()
+            if saved.shape == generator.get_state().shape:
+                generator.set_state(saved)
 
     def _set_gain(self) -> None:
         progress = self.updates / self.ramp_updates if self.ramp_updates else 1.0

@@ -10,7 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 # Where a batch's rows lie in the rollout, among the observations while a batch is drawn.
-_ROW = "_row"
+ROW = "_row"
 
 
 class SuccessorStorage(RolloutStorage):
@@ -43,7 +43,7 @@ class SuccessorStorage(RolloutStorage):
         stored = storage.observations
         observations: TensorDict = torch.cat((stored, stored[:1]))
         rows = torch.arange(observations.numel(), device=self.device)
-        self._observations = observations.set(_ROW, rows.reshape(observations.shape))
+        self._observations = observations.set(ROW, rows.reshape(observations.shape))
         self.observations = self._observations[:-1]
         self._final_rows: list[Tensor] = []
         self._finals: list[TensorDictBase] = []
@@ -74,7 +74,7 @@ class SuccessorStorage(RolloutStorage):
         """The batches of rsl_rl, drawn as there, with their next observations."""
         finals = self._find_finals()
         for batch in super().mini_batch_generator(num_mini_batches, num_epochs):
-            rows = batch.observations.pop(_ROW)
+            rows = batch.observations.pop(ROW)
             batch.next_observations, batch.has_next = self._successors(rows, finals)
             yield batch
 
@@ -90,7 +90,7 @@ class SuccessorStorage(RolloutStorage):
     def _successors(
         self, rows: Tensor, finals: tuple[Tensor, TensorDictBase] | None
     ) -> tuple[TensorDict, Tensor]:
-        after = self._observations.exclude(_ROW).flatten(0, 1)[rows + self.num_envs]
+        after = self._observations.exclude(ROW).flatten(0, 1)[rows + self.num_envs]
         known = ~self.dones.flatten()[rows].bool()
         if finals is not None:
             place = finals[0][rows]

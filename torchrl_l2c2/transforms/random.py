@@ -35,8 +35,15 @@ class RandomTransform(Transform):
                 f"{type(self).__name__} was saved {with_or_without[saved]} a generator and built "
                 f"{with_or_without[present]} one: build it as it was built then."
             )
-        if self.generator is not None:
-            self.generator.set_state(state.cpu())  # Wherever a checkpoint was loaded to.
+        if self.generator is None:
+            return
+        state = state.cpu()  # Wherever a checkpoint was loaded to.
+        if state.shape != self.generator.get_state().shape:
+            raise ValueError(
+                f"{type(self).__name__} was saved with a generator of another kind of device than "
+                f"{self.generator.device}: build it with one of the device that it had then."
+            )
+        self.generator.set_state(state)
 
 
 def listed(entries: TensorDictBase | Composite) -> str:
