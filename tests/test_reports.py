@@ -263,7 +263,11 @@ class TestMeasures:
             path.write_text(json.dumps(content))
         runs = read_runs(tmp_path)
         table = measures_table(runs)
-        assert cells(table, "swingup", "ppo_rpe", "vanilla") == ["0-2", "1.5 (0.71)", "-"]
+        assert cells(table, "swingup", "ppo_rpe", "vanilla") == [
+            "0-2",
+            "1.5 (0.71), of 2 runs",
+            "-",
+        ]
         assert table.columns[-2:] == ["roughness", "at the bounds"]
         page = write_report(tmp_path / "report", [run.record for run in runs], runs)
         assert "1.5 (0.71)" in page.read_text()

@@ -16,7 +16,7 @@ from torchrl_l2c2.experiment.diagnosis import (
     write_page,
 )
 from torchrl_l2c2.experiment.environments import TEST_SEED
-from torchrl_l2c2.experiment.files import make_folder_of
+from torchrl_l2c2.experiment.files import make_folder_of, write_atomically
 from torchrl_l2c2.experiment.reports.paper import method_name
 
 
@@ -52,7 +52,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
         path = Path(chosen.output or Path(chosen.folders[0]) / "diagnosis.html")
         write_page(path, diagnoses)
         if chosen.actions:
-            Path(chosen.actions).write_bytes(draw_together(diagnoses))
+            write_atomically(chosen.actions, draw_together(diagnoses))
     except (ValueError, OSError, RuntimeError, ArithmeticError, ImportError) as error:
         sys.exit(f"error: {error}")
     compared = "\n".join(comparison(diagnoses))

@@ -201,13 +201,15 @@ def _microseconds(function: Callable[[], Any], repeats: int = 200) -> float:
 
 def _origin(run: Path, best: bool) -> dict[str, Any]:
     config = read_config(run)
+    policy = "policy_best.pt" if best else "policy.pt"
     return {
         "task": config["task"]["env_id"],
         "noise_scale": config["task"]["noise_scale"],
         "algorithm": config["algorithm"]["name"],
         "regularizer": config["regularizer"]["name"],
         "seed": config["seed"],
-        "policy": "policy_best.pt" if best else "policy.pt",
+        # Of a run that has not ended there is no other.
+        "policy": policy if (run / policy).exists() else "the newest checkpoint",
         "versions": versions(),
     }
 

@@ -27,6 +27,8 @@ def read_json(path: str | Path) -> dict[str, Any]:
     except json.JSONDecodeError as error:
         again = ANEW if Path(path).name == "evaluation.json" else ""
         raise ValueError(f"{path} is no JSON ({error}): {REMEDY}{again}") from None
+    except RecursionError:
+        raise ValueError(f"{path} has brackets within brackets without end: {REMEDY}") from None
     if not isinstance(value, dict):
         raise ValueError(f"{path} must hold an object, {{...}}, got {value!r:.40}: {REMEDY}")
     return value

@@ -27,7 +27,7 @@ from torchrl_l2c2.experiment.files import make_folder
 from torchrl_l2c2.experiment.lock import FolderInUseError, lock_folder
 from torchrl_l2c2.experiment.reports import find_runs, write_report
 from torchrl_l2c2.experiment.reports.comparison import SIGNS
-from torchrl_l2c2.experiment.reports.front import front_figure, front_table
+from torchrl_l2c2.experiment.reports.front import by_task, front_figure, front_table
 from torchrl_l2c2.experiment.reports.groups import group_records
 from torchrl_l2c2.experiment.search_space import check_settings, read_space, short
 from torchrl_l2c2.experiment.sweep import start_guard
@@ -154,13 +154,19 @@ class Search:
         from optuna.storages.journal import JournalFileBackend
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
-        journal = JournalFileBackend(str(self.folder / "journal.log"))
-        return optuna.create_study(
-            study_name="search",
-            storage=optuna.storages.JournalStorage(journal),
-            directions=["maximize" if sign > 0 else "minimize" for sign in SIGNS.values()],
-            load_if_exists=True,
-        )
+        path = self.folder / "journal.log"
+        try:
+            return optuna.create_study(
+                study_name="search",
+                storage=optuna.storages.JournalStorage(JournalFileBackend(str(path))),
+                directions=["maximize" if sign > 0 else "minimize" for sign in SIGNS.values()],
+                load_if_exists=True,
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"{path} is no journal of a search ({type(error).__name__}: {error}): restore it, "
+                "or choose another folder."
+            ) from error
 
     @contextmanager
     def _taken(self, number: int) -> Iterator[bool]:
@@ -245,9 +251,11 @@ def _report(folder: Path) -> None:
             f"{str(folder)!r} that began."
         )
     page = write_report(folder / "report", records, found.runs, found.notes)
-    groups = group_records(records)
-    front = front_table(groups, front_figure(groups))
-    print(front.markdown(), f"report: {page}", sep="\n\n")
+    fronts = [
+        front_table(groups, front_figure(groups)).markdown()
+        for groups in by_task(group_records(records))
+    ]
+    print(*fronts, f"report: {page}", sep="\n\n")
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from torchrl_l2c2.experiment.config import ExperimentConfig
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
 
-DIGITS = 4
+DIGITS = 6
 # Of an interval; no whole number where others are proposed.
 WITHIN = 0.5**0.5
 

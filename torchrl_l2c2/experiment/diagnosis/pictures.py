@@ -41,8 +41,8 @@ def draw_together(diagnoses: Sequence[Diagnosis]) -> bytes:
         )
         axis.set_ylabel("action")
         axis.grid(alpha=0.25)
+        _legend(axis, one)  # Policies differ in which actions change most.
     axes[-1].set_xlabel("step")
-    _legend(axes[0], diagnoses[0])
     return drawn(figure)
 
 
@@ -199,8 +199,9 @@ def _neighborhood(axes: Sequence[Any], one: Diagnosis) -> None:
     axes[0].hist(distance.numpy(), bins=BINS, range=(0.0, near.radius), color=COLORS[0])
     axes[0].set_xlabel("distance max |u|")
     low, high = near.lambda_min, near.lambda_max
-    edges = torch.logspace(math.log10(low), math.log10(high), BINS + 1).numpy()
-    axes[1].hist(gain.clamp(low, high).numpy(), bins=edges, color=COLORS[2])
+    edges = torch.logspace(math.log10(low), math.log10(high), BINS + 1, dtype=torch.float64)
+    applied = gain[gain > 0.0].double()  # Beyond max_step there is none.
+    axes[1].hist(applied.clamp(edges[0], edges[-1]).numpy(), bins=edges.numpy(), color=COLORS[2])
     axes[1].set_xscale("log")
     for bound in (low, high):
         axes[1].axvline(bound, color="black", linewidth=0.8, linestyle=":")

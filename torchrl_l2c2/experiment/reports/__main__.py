@@ -14,7 +14,7 @@ from torchrl_l2c2.experiment.reports.readme import fill_readme
 from torchrl_l2c2.experiment.reports.records import Record, merge, read_records, write_records
 from torchrl_l2c2.experiment.reports.results import printed_tables
 from torchrl_l2c2.experiment.reports.runs import FinishedRun, Found, find_runs
-from torchrl_l2c2.experiment.reports.score import readings
+from torchrl_l2c2.experiment.reports.score import Reading, readings
 from torchrl_l2c2.experiment.reports.tables import score_table
 
 DESCRIPTION = """\
@@ -103,10 +103,19 @@ def _report(chosen: argparse.Namespace) -> None:
     if chosen.output or alone:
         folder = Path(chosen.output or Path(chosen.folders[0]) / "report")
         written.append(f"report: {write_report(folder, records, runs, notes)}")
-    scores = [score_table(readings(group_records(records)))] if chosen.score else None
+    scores = [score_table(_scored(records))] if chosen.score else None
     tables = scores or printed_tables(records)
     # Last: who reads but the first lines of it has the files all the same.
     print("\n\n".join([*(table.markdown() for table in tables), *notes, *written]))
+
+
+def _scored(records: Sequence[Record]) -> list[Reading]:
+    if found := readings(group_records(records)):
+        return found
+    raise ValueError(
+        "--score is of runs of vanilla and of CAPS with the same other settings, on one of the "
+        "paper's tasks by its algorithm: there are none of both."
+    )
 
 
 def _read(

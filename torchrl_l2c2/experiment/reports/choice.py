@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -60,7 +61,7 @@ def choice_table(records: Sequence[Record]) -> Table | None:
         for algorithm, name, row in over_tasks(compared)
     ]
     # What ran on most tasks comes first: other means are of other tasks.
-    settings.sort(key=lambda setting: (setting[0], -len(setting[2]), _sm(setting[2])))
+    settings.sort(key=lambda setting: (setting[0], -len(setting[2]), _place(_sm(setting[2]))))
     rows = [[algorithm, name, *_cells(tasks)] for algorithm, name, tasks in settings]
     columns = ["algorithm", "method", "tasks", "seeds"]
     columns += [f"{what}{where}" for what in ("return", "Sm") for where in ("", ", worst task")]
@@ -78,27 +79,43 @@ def _beside(group: Group, vanilla: Group) -> Beside | None:
     if not seeds:
         return None
     total, their_total, sm, their_sm = (np.mean([f[seed] for seed in seeds]) for f in figures)
-    gained = float((total - their_total) / abs(their_total))
+    # Not beside nothing: that has no parts.
+    gained = float((total - their_total) / abs(their_total)) if their_total else math.nan
     ours, theirs = (
         Group(tuple(r for r in side.records if r.seed in seeds), side.name)
         for side in (group, vanilla)
     )
-    return Beside(ours, theirs, gained, float(sm / their_sm), seeds)
+    # Of policies that never move there is no ratio, or none that has a logarithm.
+    return Beside(ours, theirs, gained, float(sm / their_sm) if sm * their_sm else math.nan, seeds)
 
 
 def _sm(tasks: Sequence[Beside]) -> float:
     return float(np.exp(np.mean(np.log([each.sm for each in tasks]))))
 
 
+def _place(sm: float) -> float:
+    return math.inf if math.isnan(sm) else sm
+
+
+def _percent(share: float, where: str = "") -> str:
+    return "-" if math.isnan(share) else f"{share:+.0%} {where}".rstrip().replace("-0%", "+0%")
+
+
+def _ratio(ratio: float, where: str = "") -> str:
+    return "-" if math.isnan(ratio) else f"{ratio:.2f} {where}".rstrip()
+
+
 def _cells(tasks: Sequence[Beside]) -> list[str]:
     ours, theirs = ([getattr(each, side) for each in tasks] for side in ("group", "vanilla"))
-    least, roughest = min(tasks, key=lambda t: t.gained), max(tasks, key=lambda t: t.sm)
+    # A task of which it is not known tells nothing of the worst one, either.
+    least = min(tasks, key=lambda t: -math.inf if math.isnan(t.gained) else t.gained)
+    roughest = max(tasks, key=lambda t: math.inf if math.isnan(t.sm) else t.sm)
     return [
         ", ".join(each.task for each in tasks),
         "; ".join(dict.fromkeys(number_range(each.seeds) for each in tasks)),
-        f"{np.mean([each.gained for each in tasks]):+.0%}",
-        f"{least.gained:+.0%} {least.task}",
-        f"{_sm(tasks):.2f}",
-        f"{roughest.sm:.2f} {roughest.task}",
+        _percent(float(np.mean([each.gained for each in tasks]))),
+        _percent(least.gained, least.task),
+        _ratio(_sm(tasks)),
+        _ratio(roughest.sm, roughest.task),
         *(probability(improvement(ours, theirs, "last_mean", quantity)) for quantity in BETTER),
     ]

@@ -62,4 +62,4 @@ def _published(record: Record) -> str:
     tau = record.other_settings.get(TAU)
     if tau is None:
         return number(PAPER[record.task, record.method].return_mean, "return")
-    return number(FASTER_RETURNS[record.method], "return") if float(tau) == FASTER else ""
+    return number(FASTER_RETURNS[record.method], "return") if tau == str(FASTER) else ""

@@ -114,7 +114,8 @@ def _row(group: Group, vanilla: Group | None) -> list[str]:
             cells.append("-")
         else:
             write = partial(number, quantity=quantity, beside=center.value)
-            cells.append(center.text(write))
+            known, runs = len(group.scores("last_mean", quantity)), len(group.records)
+            cells.append(center.text(write) + (f", of {known} runs" if known < runs else ""))
     if vanilla is None:
         cells += [""] * len(BETTER)
     else:

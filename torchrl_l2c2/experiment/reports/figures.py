@@ -27,7 +27,7 @@ PANELS = {
 }
 POINTS = 200
 _OTHER_COLORS = ("#2a7f62", "#b0416b", "#8a6d1d", "#444444")
-_LINES, _MARKERS = ("-", "--", ":", "-."), "os^v"
+_LINES, _MARKERS = ("-", "--", ":", "-."), "os^vP*X<>"
 
 
 def draw_learning_curves(runs: Sequence[FinishedRun], path: str | Path) -> None:
@@ -81,6 +81,9 @@ def draw_plane(
     down = -(-len(panels) // across)
     picture, axes = subplots(across, down, (max(3.4 * across, 5.4), 3.2 * down + 0.6))
     first_of: dict[tuple[str, str], Any] = {}
+    # There is one legend for all panels: a name looks the same in each.
+    looks = styles([group for _, together in panels for group in together])
+    hollow = False
     for axis, (settings, together) in zip(axes, panels, strict=False):
         of = together[0].first
         # What is told apart by settings is on one scale, of all that is drawn on it.
@@ -88,17 +91,17 @@ def draw_plane(
         if axis is not first:
             axis.sharex(first)
             axis.sharey(first)
-        looks = styles(together)
         for group in together:
-            _draw_point(axis, group, figure, measure, looks[group.name])
+            hollow |= _draw_point(axis, group, figure, measure, looks[group.name])
         title = f"{of.task}, {of.algorithm}"
         axis.set_title(f"{title}\n{settings}" if settings else title, fontsize=10)
         axis.set_xlabel(MEASURES[measure])
         axis.set_ylabel("return")
     for axis in axes[len(panels) :]:
         axis.set_visible(False)
-    source = "the paper" if measure == "action_variation" else "published"
-    title = f"{FIGURES[figure]}; hollow: {source}"
+    title = FIGURES[figure]
+    if hollow:
+        title += "; hollow: " + ("the paper" if measure == "action_variation" else "published")
     drawn_of = digest(record for group in groups for record in group.records)
     finish(picture, axes, title, path, description=f"records {drawn_of}")
 
@@ -162,7 +165,8 @@ def _moving_average(values: Scores, window: int) -> Scores:
     return averages
 
 
-def _draw_point(axis: Any, group: Group, figure: str, measure: str, style: dict[str, str]) -> None:
+def _draw_point(axis: Any, group: Group, figure: str, measure: str, style: dict[str, str]) -> bool:
+    """Draws a group; whether something was published of it, which is drawn, too."""
     color = style["color"]
     estimates = [Estimate.of(mean, group.scores(figure, name)) for name in (measure, "return")]
     if None not in estimates:
@@ -173,12 +177,15 @@ def _draw_point(axis: Any, group: Group, figure: str, measure: str, style: dict[
     published, paper = published_of(group), group.first.paper
     if measure == "sm_asap" and published is not None:
         axis.errorbar([published.sm], [published.total], **hollow)
+        return True
     if measure == "action_variation" and paper is not None:
         center = ([paper.action_variation_mean], [paper.return_mean])
         deviations = {"xerr": paper.action_variation_std, "yerr": paper.return_std}
         bars = axis.errorbar(*center, **deviations, elinewidth=0.9, **hollow)
         for line in bars[2]:
             line.set_linestyle(":")
+        return True
+    return False
 
 
 def _bars(estimate: Estimate) -> list[list[float]] | None:
@@ -190,14 +197,16 @@ def _bars(estimate: Estimate) -> list[list[float]] | None:
 
 
 def styles(groups: Sequence[Group]) -> dict[str, dict[str, str]]:
-    """A color for each method, and a line and a marker for each of its groups."""
+    """By name: a color for each method, and a line and a marker for each of its names."""
     others = sorted({g.first.method for g in groups} - METHODS.keys())
     colors = {name: color for name, (_, color) in METHODS.items()}
     colors |= {name: _OTHER_COLORS[i % len(_OTHER_COLORS)] for i, name in enumerate(others)}
     seen: Counter[str] = Counter()
-    found = {}
+    found: dict[str, dict[str, str]] = {}
     for group in groups:
         method = group.first.method
+        if group.name in found:  # on another task
+            continue
         found[group.name] = {
             "color": colors[method],
             "linestyle": _LINES[seen[method] % len(_LINES)],

@@ -30,6 +30,14 @@ def searched(groups: Sequence[Group]) -> list[list[Group]]:
     ]
 
 
+def by_task(groups: Sequence[Group]) -> list[list[Group]]:
+    """Groups of a task and an algorithm together: what a front is of."""
+    together: dict[tuple[str, str], list[Group]] = defaultdict(list)
+    for group in groups:
+        together[group.first.task, group.first.algorithm].append(group)
+    return list(together.values())
+
+
 def front_figure(groups: Sequence[Group]) -> str:
     """The figure that a front of these groups is of: what most of them have, or else the first."""
     return max(MEASURED, key=lambda figure: sum(_is_known(group, figure) for group in groups))
@@ -77,8 +85,9 @@ def front_table(groups: Sequence[Group], figure: str) -> Table:
         ]
         for place, group in enumerate(front, 1)
     ]
+    measured = sum(_is_known(group, figure) for group in groups)
     note = (
-        f"{len(front)} of {len(groups)} settings; every other one returns no more and is no "
+        f"{len(front)} of {measured} settings; every other one returns no more and is no "
         "smoother than one of these. The best of many has been lucky, too: run it on new seeds."
     )
     title = f"{first.task}, {first.algorithm}: Pareto front, {FIGURES[figure]}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -74,11 +74,15 @@ def group_records(records: Iterable[Record]) -> list[Group]:
 
 
 def baseline_of(group: Group, groups: Iterable[Group]) -> Group | None:
-    """The vanilla runs with the same other settings; ``None`` for themselves or without any."""
+    """The vanilla runs with the same other settings; ``None`` for themselves or without any.
+
+    And where there are several, of other defaults: nothing says beside which of them it belongs.
+    """
     if group.first.method == "none":
         return None
-    candidates = (other for other in groups if other.first.method == "none")
-    return next((other for other in candidates if other.reading == group.reading), None)
+    vanilla = (other for other in groups if other.first.method == "none")
+    found = [other for other in vanilla if other.reading == group.reading]
+    return found[0] if len(found) == 1 else None
 
 
 def over_tasks(groups: Iterable[Group]) -> list[tuple[str, str, list[Group]]]:
@@ -105,7 +109,12 @@ def over_tasks(groups: Iterable[Group]) -> list[tuple[str, str, list[Group]]]:
             told = tuple(pair for pair in own if pair not in common)
             for others, row in _one_of_each(alike).items():
                 rows.append((algorithm, _row_name(method, told + others), row))
-    return rows
+    names = Counter((algorithm, name) for algorithm, name, _ in rows)
+    return [
+        # Methods may differ in no more than what they are called, as l2c2_policy from beta=0.
+        (algorithm, name if names[algorithm, name] == 1 else f"{name}, {row[0].first.method}", row)
+        for algorithm, name, row in rows
+    ]
 
 
 def _one_of_each(groups: Sequence[Group]) -> dict[Settings, list[Group]]:

@@ -54,4 +54,6 @@ def _pooled(values: Sequence[float | None]) -> str:
     if not present:
         return "-"
     cell = f"{np.mean(present):.3g}"
-    return f"{cell} ({np.std(present, ddof=1):.2g})" if len(present) > 1 else cell
+    if len(present) > 1:
+        cell += f" ({np.std(present, ddof=1):.2g})"
+    return f"{cell}, of {len(present)} runs" if len(present) < len(values) else cell

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
+from typing import Any
 
 from torchrl_l2c2.experiment.reports.comparison import improvement, probability
 from torchrl_l2c2.experiment.reports.field import BETTER, field_groups
@@ -27,25 +28,29 @@ def pairwise_tables(records: Sequence[Record]) -> list[Table]:
 
     Returns:
         list of Table: one of each measure, for every algorithm and set of tasks that three to
-        twelve methods ran on; of two, the table beside vanilla has said it.
+        twelve methods ran on with the same other settings, and for as long; of two, the table
+        beside vanilla has said it.
     """
-    together: dict[tuple[str, tuple[str, ...]], dict[str, list[Group]]] = defaultdict(dict)
-    for algorithm, name, found in over_tasks(field_groups(records)):
+    # By everything but the regularizer: runs of other lengths or settings are not compared.
+    together: dict[tuple[Any, ...], dict[str, list[Group]]] = defaultdict(dict)
+    for _, name, found in over_tasks(field_groups(records)):
         groups = sorted(found, key=lambda group: group.first.task)
-        together[algorithm, tuple(g.first.task for g in groups)][name] = groups
+        together[tuple(group.reading for group in groups)][name] = groups
     return [
-        _table(f"{better}, {algorithm} on {', '.join(tasks)}", quantity, methods)
-        for (algorithm, tasks), methods in together.items()
+        _table(better, quantity, methods)
+        for methods in together.values()
         if 2 < len(methods) <= MOST
         for quantity, better in BETTER.items()
     ]
 
 
-def _table(title: str, quantity: str, methods: dict[str, list[Group]]) -> Table:
+def _table(better: str, quantity: str, methods: dict[str, list[Group]]) -> Table:
     def cell(name: str, other: str) -> str:
         if name == other:
             return ""
         return probability(improvement(methods[name], methods[other], "last_mean", quantity))
 
     rows = [[name, *(cell(name, other) for other in methods)] for name in methods]
+    of = [group.first for group in next(iter(methods.values()))]
+    title = f"{better}, {of[0].algorithm} on {', '.join(record.task for record in of)}"
     return Table(title, ["method", *methods], rows, [LEGEND])

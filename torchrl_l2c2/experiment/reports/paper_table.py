@@ -27,7 +27,7 @@ LEGEND = (
 )
 DEPLOYED_LEGEND = (
     "The same runs with mean actions, as a policy is used once it is trained: late policies, a "
-    "test episode of each, and 100 of the last policy. P is of late policies."
+    "test episode of each, and those of the last policy (100 by default). P is of late policies."
 )
 # Late policies in the first column, as they are steadier than the paper's test of the last one.
 FIRST, SECOND = "late_sampled", "last_sampled"

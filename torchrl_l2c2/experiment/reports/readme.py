@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from torchrl_l2c2.experiment.files import write_atomically
+from torchrl_l2c2.experiment.files import make_folder_of, write_atomically
 from torchrl_l2c2.experiment.reports.differences import BUDGETS
 from torchrl_l2c2.experiment.reports.faster_targets import faster_targets_table
 from torchrl_l2c2.experiment.reports.figures import draw_plane
@@ -68,6 +68,7 @@ def fill_readme(path: str | Path, records: Sequence[Record]) -> None:
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {str(path)!r} with {START} and {END} to fill.")
     text = fill(path.read_text(), records)
+    make_folder_of(path.parent / PICTURE)
     draw_plane(shown_groups(records), "late_sampled", path.parent / PICTURE)
     write_atomically(path, text.encode())
 

@@ -6,6 +6,7 @@ import csv
 import hashlib
 import io
 import math
+import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -187,14 +188,23 @@ def _cell(value: Any) -> str:
     return "" if math.isnan(value) else f"{value:.6g}"
 
 
+def _number(cell: str) -> float:
+    """NaN of an empty cell: what is not known."""
+    if cell and not math.isfinite(float(cell)):
+        raise ValueError(f"a cell must be a finite number or empty, got {cell!r}")
+    return float(cell or "nan")
+
+
 def _parse(path: Path, number: int, line: dict[str, str]) -> Record:
     readers: dict[str, Callable[[str], Any]] = {
         "int": int,
-        "float": lambda cell: float(cell or "nan"),
+        "float": _number,
         "str": str,
     }
     try:
         read_differences(line["differences"])
+        if not re.fullmatch(r"\d+ (episodes|frames)", line["length"]):
+            raise ValueError(f"length must be '<N> episodes' or frames, got {line['length']!r}")
         return Record(**{f.name: readers[str(f.type)](line[f.name]) for f in fields(Record)})
     except ValueError as error:
         raise ValueError(f"{path}, line {number}: {error}.") from None

@@ -50,7 +50,8 @@ class FinishedRun:
         known = read_json(versions) if versions.exists() else {}
         _, metrics = read_rows(folder / "metrics.csv")
         # Tests of earlier releases do not say.
-        least = (evaluation.get("training") or {}).get("episodes", 1)
+        least = max(1, (evaluation.get("training") or {}).get("episodes", 1))
+        _check_numbers(folder / "metrics.csv", metrics)
         if len(metrics) < least:
             raise ValueError(
                 f"{folder / 'metrics.csv'} has {len(metrics)} episodes, fewer than the {least} "
@@ -221,15 +222,21 @@ def find_runs(folders: Iterable[str | Path]) -> Found:
     Returns:
         Found: runs in the order of their tables, and notes on folders that are unfinished, never
         started, cannot be read, or repeat another.
+
+    Raises:
+        FileNotFoundError: one of the folders is not there, or is none.
     """
+    searched = [Path(folder) for folder in folders]
+    if absent := [str(folder) for folder in searched if not folder.is_dir()]:
+        raise FileNotFoundError(f"there is no folder {', '.join(map(repr, absent))}.")
     runs: list[FinishedRun] = []
     unread: list[str] = []
-    places = _places(folders)
+    places = _places(searched)
     for folder in places["finished"]:
         try:
             run = FinishedRun.read(folder)
             _ = run.record
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, ArithmeticError) as error:
             unread.append(f"{folder} ({error})")
         else:
             runs.append(run)
@@ -259,13 +266,13 @@ def read_runs(folder: str | Path) -> list[FinishedRun]:
     return found.runs
 
 
-def _places(folders: Iterable[str | Path]) -> dict[str, list[Path]]:
+def _places(folders: Iterable[Path]) -> dict[str, list[Path]]:
     """Folders of runs by how far they came."""
     marks: dict[Path, set[str]] = {}
     shown: dict[Path, Path] = {}
     for folder in folders:
         for name in ("config.json", "evaluation.json", ".hydra"):
-            for path in Path(folder).rglob(name):
+            for path in folder.rglob(name):
                 place = path.parent.resolve()
                 marks.setdefault(place, set()).add(name)
                 shown.setdefault(place, path.parent)
@@ -275,6 +282,17 @@ def _places(folders: Iterable[str | Path]) -> dict[str, list[Path]]:
         began = "unfinished" if "config.json" in found else "failed"
         stages["finished" if "evaluation.json" in found else began].append(shown[place])
     return stages
+
+
+def _check_numbers(path: Path, metrics: Sequence[dict[str, str]]) -> None:
+    for line, row in enumerate(metrics, 2):
+        for name, cell in row.items():
+            try:
+                float(cell or "nan")
+            except ValueError:
+                raise ValueError(
+                    f"{path}, line {line}: {name} is no number, but {cell!r:.40}: {REMEDY}"
+                ) from None
 
 
 def _newest(runs: Sequence[FinishedRun]) -> tuple[list[FinishedRun], list[str]]:

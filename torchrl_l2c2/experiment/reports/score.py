@@ -6,6 +6,7 @@ import math
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 from torchrl_l2c2.experiment.reports.groups import Group
@@ -56,12 +57,14 @@ class Reading:
 
 def readings(groups: Sequence[Group]) -> list[Reading]:
     """Pairs vanilla and CAPS of the paper's tasks where their other settings are the same."""
-    pairs: dict[tuple[Any, ...], dict[str, Group]] = {}
+    found: dict[tuple[Any, ...], dict[str, list[Group]]] = {}
     for group in groups:
         if group.first.method in COMPARED and group.first.paper is not None:
-            pairs.setdefault(group.reading, {})[group.first.method] = group
+            alike = found.setdefault(group.reading, {method: [] for method in COMPARED})
+            alike[group.first.method].append(group)
+    # Several of one, of other defaults, are readings of their own.
     return [
-        Reading(*(pair[method] for method in COMPARED))
-        for pair in pairs.values()
-        if pair.keys() == set(COMPARED)
+        Reading(*pair)
+        for alike in found.values()
+        for pair in product(*(alike[method] for method in COMPARED))
     ]

@@ -1,0 +1,206 @@
+"""Reports of records and folders that are not as they should be, or unlike one another."""
+
+import json
+import math
+from dataclasses import replace
+
+import pytest
+
+from tests.test_reports import make_config, make_run
+from torchrl_l2c2.experiment import L2C2Config, PPOConfig
+from torchrl_l2c2.experiment.reports import find_runs, read_runs
+from torchrl_l2c2.experiment.reports.__main__ import main
+from torchrl_l2c2.experiment.reports.choice import choice_table
+from torchrl_l2c2.experiment.reports.field import field_table
+from torchrl_l2c2.experiment.reports.figures import draw_plane, styles
+from torchrl_l2c2.experiment.reports.front import by_task, front_table
+from torchrl_l2c2.experiment.reports.groups import baseline_of, group_records
+from torchrl_l2c2.experiment.reports.pairwise import pairwise_tables
+from torchrl_l2c2.experiment.reports.records import read_records, write_records
+from torchrl_l2c2.experiment.reports.score import readings
+
+METHODS = ("none", "caps", "cats")
+GAINS = {gain: L2C2Config(lambda_min=gain, lambda_max=100 * gain) for gain in (0.1, 1.0)}
+
+
+@pytest.fixture(scope="module")
+def field(tmp_path_factory):
+    """Records of two tasks, three methods, a weak L2C2 on both and a strong one on the first."""
+    folder = tmp_path_factory.mktemp("field")
+    for task in ("pendulum", "lunarlander"):
+        gains = list(GAINS)[: 2 if task == "pendulum" else 1]
+        for m, method in enumerate((*METHODS, *(GAINS[gain] for gain in gains))):
+            for seed in range(2):
+                config = make_config(
+                    task=task, algorithm=PPOConfig(), regularizer=method, seed=seed
+                )
+                place = folder / task / str(m) / str(seed)
+                make_run(place, config, 100.0 + m + seed, 0.1 - 0.01 * m)
+                add_sm(place, 0.5 - 0.1 * m + 0.01 * seed)
+    return [run.record for run in read_runs(folder)]
+
+
+def add_sm(folder, sm):
+    path = folder / "evaluation.json"
+    content = json.loads(path.read_text())
+    content["summary"]["sm_asap_mean"] = sm
+    path.write_text(json.dumps(content))
+
+
+def of(records, task, method="l2c2"):
+    return [r for r in records if (r.task, r.method) == (task, method)]
+
+
+class TestPictures:
+    def test_a_name_has_one_look_in_all_panels(self, field):
+        """There is one legend for them."""
+        groups = group_records(field)
+        looks = styles(groups[::-1])
+        assert looks.keys() == {group.name for group in groups}
+        assert len({tuple(look.items()) for look in looks.values()}) == len(looks)
+
+    def test_hollow_marks_are_told_of_where_there_are_some(self, field, tmp_path):
+        """Of L2C2 with these gains nothing was published."""
+        drawn = {}
+        for name, chosen in {"all": field, "own": of(field, "pendulum")}.items():
+            path = tmp_path / f"{name}.svg"
+            draw_plane(group_records(chosen), "last_mean", path, measure="sm_asap")
+            drawn[name] = path.read_text()
+        assert "hollow: published" in drawn["all"] and "hollow" not in drawn["own"]
+
+
+class TestTables:
+    def test_runs_of_another_length_are_not_compared(self, field):
+        """Each against each: CATS trained ten times as long is beside nobody."""
+        longer = [
+            replace(r, length="200 episodes", settings=f"x{r.settings}")
+            if r.method == "cats"
+            else r
+            for r in field
+        ]
+        columns = [set(table.columns) for table in pairwise_tables(longer)]
+        assert columns and not any("CATS" in found for found in columns)
+        assert all({"vanilla", "CAPS", "CATS"} <= set(t.columns) for t in pairwise_tables(field))
+
+    def test_methods_of_one_name_are_rows_of_their_own(self, field):
+        """As L2C2 with beta=0, and the method that is called so."""
+        weak = {task: of(field, task)[:2] for task in ("pendulum", "lunarlander")}
+        twins = [
+            replace(r, method="l2c2_policy", settings="twin", differences="")
+            for records in weak.values()
+            for r in records
+        ]
+        named = [replace(r, differences="regularizer.beta=0", settings="beta") for r in twins]
+        named = [replace(r, method="l2c2") for r in named]
+        vanilla = [r for r in field if r.method == "none"]
+        rows = [row[1] for row in choice_table([*vanilla, *twins, *named]).rows]
+        assert len(rows) == len(set(rows)) == 2
+
+    def test_a_mean_says_of_how_many_runs_it_is(self, field):
+        """Those that were cut to a length have no last policy."""
+        chosen = of(field, "pendulum", "none")
+        chosen[0] = replace(chosen[0], last_mean_return=math.nan)
+        (row,) = [row for row in field_table(chosen).rows if row[3]]
+        assert row[4] == "121.0, of 1 runs" and row[5].startswith("0.505 [")
+
+    def test_beside_two_kinds_of_vanilla_nothing_is_compared(self, field):
+        """Their defaults differ, and nothing says which one is the baseline."""
+        caps, vanilla = of(field, "pendulum", "caps"), of(field, "pendulum", "none")
+        groups = group_records([*caps, *vanilla, *(replace(r, settings="then") for r in vanilla)])
+        assert [baseline_of(group, groups) for group in groups] == [None] * 3
+        groups = group_records([*caps, *vanilla])
+        assert {baseline_of(group, groups) is None for group in groups} == {True, False}
+
+    def test_beside_nothing_there_are_no_parts(self, field, recwarn):
+        """Vanilla that returned 0, or did not move: a dash, and no other number suffers."""
+        still = [
+            replace(r, last_mean_return=0.0, last_mean_sm_asap=0.0)
+            if (r.task, r.method) == ("lunarlander", "none")
+            else r
+            for r in field
+        ]
+        table = choice_table(still)
+        cells = {row[1]: row[4:8] for row in table.rows}
+        assert cells["CAPS"] == ["-"] * 4
+        # 124 and 125 beside 120 and 121 on its one task, Sm .10 and .11 beside .50 and .51.
+        (strong,) = (found for name, found in cells.items() if name.endswith("lambda_min=1"))
+        assert strong == ["+3%", "+3% pendulum", "0.21", "0.21 pendulum"]
+        assert not recwarn.list and "nan" not in table.markdown()
+
+    def test_a_front_is_of_one_task_and_algorithm(self, field):
+        """And says how many settings were measured, not how many there are."""
+        fronts = by_task(group_records(field))
+        assert [{g.first.task for g in found} for found in fronts] == [
+            {"pendulum"},
+            {"lunarlander"},
+        ]
+        unknown = [replace(r, last_mean_return=math.nan) for r in of(field, "pendulum", "cats")]
+        known = [r for r in of(field, "pendulum", "none") + of(field, "pendulum", "caps")]
+        table = front_table(group_records([*known, *unknown]), "last_mean")
+        assert "of 2 settings" in table.notes[0]
+
+
+def test_each_kind_of_vanilla_is_a_reading(tmp_path):
+    """Of other defaults, when it was run; a score without any is told."""
+    for method in ("none", "caps"):
+        make_run(tmp_path / "runs" / method, make_config(regularizer=method), 100.0, 0.1)
+    records = [run.record for run in read_runs(tmp_path / "runs")]
+    then = [replace(r, settings="then") for r in records if r.method == "none"]
+    found = readings(group_records([*records, *then]))
+    assert len({reading.vanilla.first.settings for reading in found}) == len(found) == 2
+    write_records(tmp_path / "caps.csv", [r for r in records if r.method == "caps"])
+    with pytest.raises(SystemExit, match="error: --score is of runs of vanilla and of CAPS"):
+        main(["--from", str(tmp_path / "caps.csv"), "--score"])
+
+
+class TestFolders:
+    @pytest.mark.parametrize("name", ["nowhere", "file"])
+    def test_one_that_is_not_there_is_refused(self, tmp_path, name):
+        """A mistyped one would leave its runs out."""
+        make_run(tmp_path / "run", make_config(), 1.0, 0.1)
+        (tmp_path / "file").touch()
+        with pytest.raises(FileNotFoundError, match=f"there is no folder .*{name}'"):
+            find_runs([tmp_path, tmp_path / name])
+
+    @pytest.mark.parametrize(
+        ("name", "old", "new", "told"),
+        [
+            ("metrics.csv", "\n3,300,", "\n3,3x,", "line 4: frames is no number, but '3x'"),
+            ("metrics.csv", None, "episode,frames\n", "has 0 episodes, fewer than the 1"),
+            ("evaluation.json", '"return_mean": 21.0', f'"return_mean": {"9" * 400}', "too large"),
+            ("versions.json", None, "[" * 99999, "brackets within brackets"),
+        ],
+    )
+    def test_a_damaged_run_is_named_and_left_out(self, tmp_path, name, old, new, told):
+        """Whatever is wrong with it, the others are told."""
+        for run in ("good", "bad"):
+            make_run(tmp_path / run, make_config(seed=len(run)), 1.0, 0.1)
+        path = tmp_path / "bad" / name
+        text = path.read_text()
+        assert old is None or old in text
+        path.write_text(new if old is None else text.replace(old, new))
+        found = find_runs([tmp_path])
+        assert [run.folder.name for run in found.runs] == ["good"]
+        (note,) = found.notes
+        assert "1 unreadable" in note and str(tmp_path / "bad") in note and told in note
+
+
+@pytest.mark.parametrize(
+    ("column", "cell", "told"),
+    [
+        ("length", "abc", "length must be '<N> episodes' or frames, got 'abc'"),
+        ("length", "1e6 frames", "length must be"),
+        ("length", "10 weeks", "length must be"),
+        ("last_mean_return", "inf", "must be a finite number or empty, got 'inf'"),
+    ],
+)
+def test_a_cell_that_cannot_be_is_told_with_its_line(field, tmp_path, column, cell, told):
+    """In a file of records."""
+    path = tmp_path / "records.csv"
+    write_records(path, of(field, "pendulum", "none"))
+    header, first, *rest = path.read_text().splitlines()
+    cells = first.split(",")
+    cells[header.split(",").index(column)] = cell
+    path.write_text("\n".join([header, ",".join(cells), *rest]))
+    with pytest.raises(ValueError, match=f"records.csv, line 2: .*{told}"):
+        read_records(path)
