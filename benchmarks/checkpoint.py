@@ -6,6 +6,7 @@ state, writing, flushing to the disk and reading back.
 
 from __future__ import annotations
 
+import argparse
 import statistics
 import tempfile
 import time
@@ -17,6 +18,7 @@ REPETITIONS = 15
 
 def main() -> None:
     """Prints the median time of a checkpoint and its share of the default interval."""
+    argparse.ArgumentParser(prog="python -m benchmarks.checkpoint", description=__doc__).parse_args()
     config = ExperimentConfig(
         task=TaskConfig(episodes=10), algorithm=PPORPEConfig(updates=1), compile=False
     )
