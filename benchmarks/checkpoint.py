@@ -18,7 +18,9 @@ REPETITIONS = 15
 
 def main() -> None:
     """Prints the median time of a checkpoint and its share of the default interval."""
-    argparse.ArgumentParser(prog="python -m benchmarks.checkpoint", description=__doc__).parse_args()
+    argparse.ArgumentParser(
+        prog="python -m benchmarks.checkpoint", description=__doc__
+    ).parse_args()
     config = ExperimentConfig(
         task=TaskConfig(episodes=10), algorithm=PPORPEConfig(updates=1), compile=False
     )
