@@ -139,6 +139,7 @@ class TestByHand:
         ("make", "message"),
         [
             (lambda: ConstantGain(-1.0), "value must be finite and at least 0, got -1"),
+            (lambda: RampGain().step(512), r"measured must be in \[0, 2\].* It is a share of tr"),
             (lambda: RampGain(length=0.0), r"length must be in \(0, 1\], got 0"),
             (lambda: GradientGain(0.0), "share must be finite and greater than 0, got 0"),
             (lambda: TargetGain(-0.1), "target must be finite and greater than 0"),
@@ -262,16 +263,27 @@ class TestInARun:
         """Parameters, gains and metrics, to the last bit."""
         assert_continues(small(L2C2Config(**KINDS[kind]), late_share=0.0), tmp_path, 3, 6)
 
-    @pytest.mark.parametrize("kind", ["constant", "ramp"])
-    def test_only_a_constant_gain_is_told_to_be_faint(self, kind):
-        """After 100 updates; one that sets itself may be small for now."""
-        regularizer = L2C2Config(lambda_min=1e-9, lambda_max=1e-8, gain=kind)
+    @pytest.mark.parametrize("kind", ["constant", "ramp", "target"])
+    def test_a_gain_that_does_not_rise_by_itself_is_told_to_be_faint(self, kind):
+        """After 100 updates; a ramp by what it ends with, and goes on from where it is."""
+        of_kind = {"gain": kind, **({"gain_target": 0.1} if kind == "target" else {})}
+        regularizer = L2C2Config(lambda_min=1e-9, lambda_max=1e-8, **of_kind)
         run = Experiment(small(regularizer, algorithm=PPORPEConfig(hidden=(8,), updates=60)))
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             run.train(2)
         told = [w for w in caught if "regularizer's terms are less" in str(w.message)]
-        assert len(told) == (kind == "constant")
+        assert len(told) == (kind != "target")
+        if kind == "ramp":
+            assert run.agent.loss.l2c2_coeff == run.metrics[-1]["gain_measured"] > 0.0
+
+    def test_a_ramp_is_told_by_the_gain_that_it_ends_with(self):
+        """Its first updates have none."""
+        regularizer = L2C2Config(lambda_min=1.0, lambda_max=100.0, gain="ramp")
+        run = Experiment(small(regularizer, algorithm=PPORPEConfig(hidden=(8,), updates=120)))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            run.train(1)
 
     @pytest.mark.slow
     def test_a_compiled_update_follows_the_gain(self):

@@ -44,10 +44,11 @@ class ConstantGain:
         return {"value": self.value}
 
     def load_state_dict(self, state: dict[str, float]) -> None:
-        """Restores what :meth:`state_dict` gave.
+        """Restores what :meth:`state_dict` gave; the coefficient is to be set to ``value`` then.
 
         Raises:
-            ValueError: it is that of a gain of another kind; nothing is changed.
+            ValueError: it has other entries, as that of another kind of gain may; nothing is
+                changed.
         """
         if state.keys() != self.state_dict().keys():
             raise ValueError(
@@ -89,9 +90,15 @@ class RampGain(ConstantGain):
         self.end, self.length = float(end), float(length)
 
     def step(self, measured: float = math.nan) -> float:
-        """The value where a share of training, ``measured``, is over, in [0, 1]."""
+        """The value where a share of training, ``measured``, is over, from 0 to 1.
+
+        A last batch may go beyond the end of training: what is somewhat above 1 counts as 1.
+
+        Raises:
+            ValueError: it is below 0 or above 2: no share, but a number of frames or updates.
+        """
         measured = as_number("measured", measured)
-        check_real("measured", measured, at_least=0)
+        check_real("measured", measured, at_least=0, at_most=2, hint="It is a share of training.")
         self.value = self.end * min(1.0, measured / self.length)
         return self.value
 

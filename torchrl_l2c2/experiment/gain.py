@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 from torchrl_l2c2.experiment.config import ExperimentConfig
@@ -43,8 +44,9 @@ class GainControl:
             self.gains = {name: _make_gain(self._config, name) for name in names}
             if self._config.gain == "target":
                 self._check_column(self._config.gain_of, tested=config.late_share > 0)
-            # A gain that is faint for now is no mistake.
-            learner.tells_faint_regularizer = False
+            # Gains that follow a measure rise by themselves; a ramp ends where it ends.
+            learner.tells_faint_regularizer = self._config.gain == "ramp"
+            learner.at_full_gain = self._at_full_gain
             self._apply()
 
     def after(self, row: Mapping[str, float]) -> dict[str, float]:
@@ -87,6 +89,15 @@ class GainControl:
         self._updates = state["updates"]
         self._apply()
 
+    @contextmanager
+    def _at_full_gain(self) -> Iterator[None]:
+        assert self._config is not None
+        self._config.apply(self._learner.agent.loss, {"all": 1.0})
+        try:
+            yield
+        finally:
+            self._apply()
+
     def _apply(self) -> None:
         if self._config is None or not self.gains:
             return
@@ -106,7 +117,7 @@ class GainControl:
             return {}
         if self._config.gain == "ramp":
             spent = self._budget.spent(int(row["episode"]), int(row["frames"]))
-            return {"all": spent / self._budget.total}
+            return {"all": min(1.0, spent / self._budget.total)}  # A last round may go beyond it.
         if self._config.gain == "target":
             return {"all": row[self._config.gain_of]}
         if self._learner.updates == self._updates:

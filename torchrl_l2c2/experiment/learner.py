@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 import warnings
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 
 import torch
 from tensordict import TensorDictBase
@@ -60,6 +62,7 @@ class Learner:
         skipped_updates: batches that were not finite and changed nothing.
         first_update_seconds: how long the first took, compilation included; ``None`` before it.
         tells_faint_regularizer: whether to warn of a regularizer whose gradients are too small.
+        at_full_gain: within it the regularizer has the gain that it is to end with.
     """
 
     def __init__(
@@ -77,6 +80,7 @@ class Learner:
         self.skipped_updates = 0
         self.first_update_seconds: float | None = None
         self.tells_faint_regularizer = True
+        self.at_full_gain: Callable[[], AbstractContextManager[None]] = nullcontext
         self._device = agent.device
         self._reward_factor = reward_factor
         self.compiles = compile
@@ -157,7 +161,8 @@ class Learner:
             self._tell_faint_regularizer()
 
     def _tell_faint_regularizer(self) -> None:
-        shares = gradient_shares(self.agent.loss, self.update.example())
+        with self.at_full_gain():
+            shares = gradient_shares(self.agent.loss, self.update.example())
         if shares and max(shares.values()) < FAINT:
             each = ", ".join(f"{key}: {share:.1g}" for key, share in shares.items())
             warnings.warn(

@@ -113,7 +113,7 @@ class Regularization:
                 generator.set_state(saved)
 
     def _set_gain(self) -> None:
-        progress = self.updates / self.ramp_updates if self.ramp_updates else 1.0
+        progress = min(1.0, self.updates / self.ramp_updates) if self.ramp_updates else 1.0
         setattr(self.loss, self.coefficient, self._gain.step(progress))
 
     def _transitions(

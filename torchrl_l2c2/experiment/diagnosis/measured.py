@@ -194,6 +194,8 @@ def diagnose(
             f"an episode of {min(lengths)} steps is too short to be diagnosed: it needs "
             f"{LEAST_STEPS}. Give a larger max_steps, or a policy that lasts longer."
         )
+    for number, episode in enumerate(played, 1):
+        _check_actions(episode[env.action_key], episode[key], number)
     first = played[0]
     actions = _flat(first[env.action_key])
     low, high, bounded = _bounds(env.action_spec, actions)
@@ -226,6 +228,22 @@ def diagnose(
         spread=_spread(policy, states, key, env, low, high, seed),
         rate=control_rate(env) if isinstance(simulator, GymWrapper) else None,
         entries=[f"{key}[{i}]" for i in range(_flat(states).shape[1])],
+    )
+
+
+def _check_actions(actions: Tensor, observations: Tensor, episode: int) -> None:
+    """Refuses what has no smoothness: it would be told as numbers that are none."""
+    bad = ~actions.isfinite().flatten(1).all(1)
+    if not bad.any():
+        return
+    step = int(bad.nonzero()[0])
+    seen = observations[step]
+    why = (
+        "" if seen.isfinite().all() else ", as its observation is (a normalization that is empty?)"
+    )
+    raise ValueError(
+        f"the policy's action is not finite at step {step} of episode {episode}{why}: "
+        f"{actions[step].flatten().tolist()}."
     )
 
 
