@@ -16,8 +16,9 @@ from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase, ExplorationType, GymWrapper, set_exploration_type
 
 from torchrl_l2c2._checks import check_positive_int, check_real
+from torchrl_l2c2.experiment.diagnosis.playing import observed_key, play
 from torchrl_l2c2.experiment.environments import control_rate
-from torchrl_l2c2.experiment.evaluate import LEAST_STEPS, measure
+from torchrl_l2c2.experiment.evaluate import measure
 from torchrl_l2c2.metrics import action_variation, local_lipschitz, noise_sensitivity
 from torchrl_l2c2.neighborhood import Neighborhood
 
@@ -185,17 +186,8 @@ def diagnose(
     """
     check_positive_int("episodes", episodes)
     check_real("noise_scale", noise_scale, above=0)
-    key = _observed(policy, env)
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        played = [env.rollout(max_steps, policy).detach() for _ in range(episodes)]
-    lengths = [len(episode) for episode in played]
-    if min(lengths) < LEAST_STEPS:
-        raise ValueError(
-            f"an episode of {min(lengths)} steps is too short to be diagnosed: it needs "
-            f"{LEAST_STEPS}. Give a larger max_steps, or a policy that lasts longer."
-        )
-    for number, episode in enumerate(played, 1):
-        _check_actions(episode[env.action_key], episode[key], number)
+    key = observed_key(policy, env)
+    played = play(policy, env, key, episodes, max_steps)
     first = played[0]
     actions = _flat(first[env.action_key])
     low, high, bounded = _bounds(env.action_spec, actions)
@@ -229,37 +221,6 @@ def diagnose(
         rate=control_rate(env) if isinstance(simulator, GymWrapper) else None,
         entries=[f"{key}[{i}]" for i in range(_flat(states).shape[1])],
     )
-
-
-def _check_actions(actions: Tensor, observations: Tensor, episode: int) -> None:
-    """Refuses what has no smoothness: it would be told as numbers that are none."""
-    bad = ~actions.isfinite().flatten(1).all(1)
-    if not bad.any():
-        return
-    step = int(bad.nonzero()[0])
-    seen = observations[step]
-    why = (
-        "" if seen.isfinite().all() else ", as its observation is (a normalization that is empty?)"
-    )
-    raise ValueError(
-        f"the policy's action is not finite at step {step} of episode {episode}{why}: "
-        f"{actions[step].flatten().tolist()}."
-    )
-
-
-def _observed(policy: TensorDictModule, env: EnvBase) -> NestedKey:
-    if env.batch_size:
-        raise ValueError(
-            f"one environment is diagnosed, got a batch of {tuple(env.batch_size)}: give the one "
-            "that it is made of."
-        )
-    keys = list(policy.in_keys)
-    if len(keys) != 1:
-        raise ValueError(
-            f"the policy must read one observation, this one reads {keys}: join them with "
-            "torchrl.envs.CatTensors."
-        )
-    return keys[0]
 
 
 def _act(
