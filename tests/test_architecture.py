@@ -73,7 +73,6 @@ experiment.video
 experiment.workers
 experiment.evaluate experiment.update experiment.player experiment.manual
 experiment.influence experiment.best_policy experiment.export
-experiment.diagnosis.playing
 experiment.diagnosis.measured
 experiment.diagnosis.words experiment.diagnosis.pictures experiment.diagnosis.run
 experiment.diagnosis.film

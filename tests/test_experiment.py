@@ -35,9 +35,9 @@ from torchrl_l2c2.experiment import (
     UniformReplayConfig,
     make_env,
 )
-from torchrl_l2c2.experiment.collection import check_finite
 from torchrl_l2c2.experiment.environments import SimulatorError
 from torchrl_l2c2.experiment.evaluate import LateTests, evaluate_policy
+from torchrl_l2c2.experiment.frames import check_finite
 from torchrl_l2c2.experiment.regularizers import LCPConfig
 from torchrl_l2c2.experiment.reports import read_runs
 

@@ -76,6 +76,14 @@ def test_a_search_goes_on_with_the_trial_that_was_lost(tmp_path):
     assert [json.loads(line)["op_code"] for line in (tmp_path / "journal.log").open()]
 
 
+@pytest.mark.parametrize("line", ["{}", "[1]", "no JSON"])
+def test_a_damaged_journal_is_named(tmp_path, line):
+    """Whatever Optuna says of it."""
+    (tmp_path / "journal.log").write_text(f"{line}\n")
+    with pytest.raises(ValueError, match=r"journal.log is no journal of a search \("):
+        Search(tmp_path, GAINS)
+
+
 def test_searches_at_once_propose_as_one_does(tmp_path, monkeypatch):
     """Neither the same values twice nor more trials than there are to be."""
     ask = optuna.Study.ask

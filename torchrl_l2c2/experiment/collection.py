@@ -23,7 +23,7 @@ from torchrl.envs import (
 )
 
 from torchrl_l2c2.experiment.acting import on_tensors
-from torchrl_l2c2.experiment.environments import playing
+from torchrl_l2c2.experiment.environments import simulating
 from torchrl_l2c2.experiment.frames import Frame, as_number, stack_frames
 from torchrl_l2c2.transforms import ObservationNoise
 
@@ -288,41 +288,11 @@ def play_episodes(
     )
     try:
         for number in range(1, episodes + 1):
-            with playing(f"the task failed in test episode {number}"):
+            with simulating(f"the task failed in test episode {number}"):
                 episode = collector.rollout()
             yield episode
     finally:
         collector.shutdown(close_env=False)
-
-
-def check_finite(batch: TensorDictBase, first_frame: int, *, test: bool = False) -> None:
-    """Stops at the first NaN or infinity that the environment or the policy gave.
-
-    Args:
-        batch (TensorDictBase): frames, ``[T]``.
-        first_frame (int): frames before them, for the error.
-
-    Keyword Args:
-        test (bool): whether they are of a test, which has frames of its own. Default ``False``.
-
-    Raises:
-        FloatingPointError: names the key and the frame.
-    """
-    found = []
-    # In the order in which they come about: what follows a bad action is bad as well.
-    for key in ("observation", "action", ("next", "observation"), ("next", "reward")):
-        bad = ~batch[key].isfinite()
-        if bad.any():
-            found.append((int(bad.flatten(1).any(1).nonzero()[0]), key))
-    if found:
-        step, key = min(found, key=lambda each: each[0])
-        giver = "policy" if key == "action" else "environment"
-        frame = f"frame {first_frame + step}{' of a test' if test else ''}"
-        left = "" if test else "; nothing is learned from this episode"
-        raise FloatingPointError(
-            f"{key} is not finite at {frame}: {batch[key][step].flatten().tolist()}. "
-            f"The {giver} gave it{left}."
-        )
 
 
 def simulator_and_noise(env: EnvBase) -> tuple[GymWrapper | None, ObservationNoise | None]:

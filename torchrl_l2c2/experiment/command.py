@@ -199,7 +199,9 @@ def run(
     from torchrl_l2c2.experiment.training import Experiment
     from torchrl_l2c2.experiment.video import check_pictures, check_video, record_video
 
-    if config.record:
+    video = folder / "video.mp4"
+    records = config.record and not video.exists()
+    if records:
         check_video()
         check_pictures(config.task)
     for chatty in ("torchrl", "matplotlib", "torch"):
@@ -225,8 +227,7 @@ def run(
                 log(folder, f"finished:\n{compare_with_paper(finished)}")
             else:
                 save_policy(experiment.agent.policy, folder / "policy.pt")
-    video = folder / "video.mp4"
-    if config.record and not video.exists():
+    if records:
         record_video(folder, video)
     if finished is not None:
         print(compare_with_paper(finished))

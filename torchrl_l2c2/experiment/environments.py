@@ -36,7 +36,7 @@ class SimulatorError(RuntimeError):
 
 
 @contextlib.contextmanager
-def playing(what: str) -> Iterator[None]:
+def simulating(what: str) -> Iterator[None]:
     """Makes errors of a task, or of the policy that acts in it, a :class:`SimulatorError`.
 
     Args:

@@ -20,9 +20,10 @@ from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 from tqdm import tqdm
 
-from torchrl_l2c2.experiment.collection import EpisodeCollector, check_finite, play_episodes
-from torchrl_l2c2.experiment.environments import TEST_SEED, make_env, playing
+from torchrl_l2c2.experiment.collection import EpisodeCollector, play_episodes
+from torchrl_l2c2.experiment.environments import TEST_SEED, make_env, simulating
 from torchrl_l2c2.experiment.files import make_folder_of, to_json, write_json
+from torchrl_l2c2.experiment.frames import check_finite
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.saved import read_config
 from torchrl_l2c2.experiment.tasks import TaskConfig
@@ -236,7 +237,7 @@ class LateTests:
             if self._collector is None:
                 self._collector = self._make_collector()
             self._collector.set_seed(self._seed + number)
-            with playing(f"{self._task.env_id} failed in the test after episode {number}"):
+            with simulating(f"{self._task.env_id} failed in the test after episode {number}"):
                 episode = self._collector.rollout()
         check_finite(episode, 0, test=True)
         figures = _return(episode), _variation(episode["action"])

@@ -1,4 +1,4 @@
-"""One frame of an episode, as it is while it is being played: before there is a batch."""
+"""Frames of an episode: one as it is while it is being played, and whether all are finite."""
 
 from __future__ import annotations
 
@@ -94,3 +94,42 @@ def stack_frames(frames: Sequence[Frame]) -> TensorDictBase:
         },
         [len(frames)],
     )
+
+
+def check_finite(
+    batch: TensorDictBase,
+    first_frame: int,
+    *,
+    test: bool = False,
+    observation: NestedKey = "observation",
+    action: NestedKey = "action",
+) -> None:
+    """Stops at the first NaN or infinity that the environment or the policy gave.
+
+    Args:
+        batch (TensorDictBase): frames, ``[T]``.
+        first_frame (int): frames before them, for the error.
+
+    Keyword Args:
+        test (bool): whether they are of a test, which has frames of its own. Default ``False``.
+        observation (NestedKey): what the environment shows.
+        action (NestedKey): what the policy does.
+
+    Raises:
+        FloatingPointError: names the key and the frame.
+    """
+    found = []
+    # In the order in which they come about: what follows a bad action is bad as well.
+    for key in (observation, action, ("next", observation), ("next", "reward")):
+        bad = ~batch[key].isfinite()
+        if bad.any():
+            found.append((int(bad.flatten(1).any(1).nonzero()[0]), key))
+    if found:
+        step, key = min(found, key=lambda each: each[0])
+        giver = "policy" if key == action else "environment"
+        frame = f"frame {first_frame + step}{' of a test' if test else ''}"
+        left = "" if test else "; nothing is learned from this episode"
+        raise FloatingPointError(
+            f"{key} is not finite at {frame}: {batch[key][step].flatten().tolist()}. "
+            f"The {giver} gave it{left}."
+        )

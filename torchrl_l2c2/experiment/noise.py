@@ -19,10 +19,11 @@ from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 from tqdm import tqdm
 
-from torchrl_l2c2.experiment.collection import check_finite, play_episodes
+from torchrl_l2c2.experiment.collection import play_episodes
 from torchrl_l2c2.experiment.environments import TEST_SEED
 from torchrl_l2c2.experiment.evaluate import evaluate_policy
 from torchrl_l2c2.experiment.files import make_folder, write_atomically, write_json
+from torchrl_l2c2.experiment.frames import check_finite
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.reports import FinishedRun, find_runs
 from torchrl_l2c2.experiment.reports.comparison import Estimate

@@ -12,9 +12,9 @@ from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.modules import EGreedyModule
 
 from torchrl_l2c2.experiment.algorithms.agent import Agent
-from torchrl_l2c2.experiment.collection import EpisodeCollector, check_finite
-from torchrl_l2c2.experiment.environments import playing
-from torchrl_l2c2.experiment.frames import Frame, stack_frames
+from torchrl_l2c2.experiment.collection import EpisodeCollector
+from torchrl_l2c2.experiment.environments import simulating
+from torchrl_l2c2.experiment.frames import Frame, check_finite, stack_frames
 from torchrl_l2c2.experiment.rollouts import RolloutCollector
 from torchrl_l2c2.experiment.workers import MultiEpisodeCollector, RayEpisodeCollector
 from torchrl_l2c2.metrics import action_variation
@@ -123,7 +123,7 @@ class Player:
         return batches
 
     def _simulate(self, play: Callable[[], Played]) -> Played:
-        with playing(f"{self._env_id} failed beyond frame {self.frames}"):
+        with simulating(f"{self._env_id} failed beyond frame {self.frames}"):
             return play()
 
     def _count(self, frames: int) -> None:

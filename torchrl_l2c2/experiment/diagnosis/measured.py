@@ -16,9 +16,9 @@ from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase, ExplorationType, GymWrapper, set_exploration_type
 
 from torchrl_l2c2._checks import check_positive_int, check_real
-from torchrl_l2c2.experiment.diagnosis.playing import observed_key, play
 from torchrl_l2c2.experiment.environments import control_rate
-from torchrl_l2c2.experiment.evaluate import measure
+from torchrl_l2c2.experiment.evaluate import LEAST_STEPS, measure
+from torchrl_l2c2.experiment.frames import check_finite
 from torchrl_l2c2.metrics import action_variation, local_lipschitz, noise_sensitivity
 from torchrl_l2c2.neighborhood import Neighborhood
 
@@ -175,6 +175,7 @@ def diagnose(
     Raises:
         ValueError: the environment is a batch of several, the policy reads more than one of its
             observations, or an episode is shorter than four steps.
+        FloatingPointError: an observation, an action or a reward is not finite.
 
     Examples:
         >>> from torchrl.envs import GymEnv
@@ -186,8 +187,17 @@ def diagnose(
     """
     check_positive_int("episodes", episodes)
     check_real("noise_scale", noise_scale, above=0)
-    key = observed_key(policy, env)
-    played = play(policy, env, key, episodes, max_steps)
+    key = _observed(policy, env)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        played = [env.rollout(max_steps, policy).detach() for _ in range(episodes)]
+    lengths = [len(episode) for episode in played]
+    if min(lengths) < LEAST_STEPS:
+        raise ValueError(
+            f"an episode of {min(lengths)} steps is too short to be diagnosed: it needs "
+            f"{LEAST_STEPS}. Give a larger max_steps, or a policy that lasts longer."
+        )
+    for episode in played:
+        check_finite(episode, 0, test=True, observation=key, action=env.action_key)
     first = played[0]
     actions = _flat(first[env.action_key])
     low, high, bounded = _bounds(env.action_spec, actions)
@@ -221,6 +231,21 @@ def diagnose(
         rate=control_rate(env) if isinstance(simulator, GymWrapper) else None,
         entries=[f"{key}[{i}]" for i in range(_flat(states).shape[1])],
     )
+
+
+def _observed(policy: TensorDictModule, env: EnvBase) -> NestedKey:
+    if env.batch_size:
+        raise ValueError(
+            f"one environment is diagnosed, got a batch of {tuple(env.batch_size)}: give the one "
+            "that it is made of."
+        )
+    keys = list(policy.in_keys)
+    if len(keys) != 1:
+        raise ValueError(
+            f"the policy must read one observation, this one reads {keys}: join them with "
+            "torchrl.envs.CatTensors."
+        )
+    return keys[0]
 
 
 def _act(

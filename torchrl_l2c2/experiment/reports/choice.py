@@ -12,7 +12,7 @@ from torchrl_l2c2.experiment.reports.comparison import improvement, probability
 from torchrl_l2c2.experiment.reports.field import BETTER, field_groups
 from torchrl_l2c2.experiment.reports.groups import Group, baseline_of, over_tasks
 from torchrl_l2c2.experiment.reports.records import Record
-from torchrl_l2c2.experiment.reports.tables import Table, number_range
+from torchrl_l2c2.experiment.reports.tables import Table, number_range, or_dash
 
 LEGEND = (
     "Beside vanilla's runs of the same seeds and other settings, smoothest first; tests of the "
@@ -61,7 +61,13 @@ def choice_table(records: Sequence[Record]) -> Table | None:
         for algorithm, name, row in over_tasks(compared)
     ]
     # What ran on most tasks comes first: other means are of other tasks.
-    settings.sort(key=lambda setting: (setting[0], -len(setting[2]), _place(_sm(setting[2]))))
+    settings.sort(
+        key=lambda setting: (
+            setting[0],
+            -len(setting[2]),
+            np.nan_to_num(_sm(setting[2]), nan=np.inf),
+        )
+    )
     rows = [[algorithm, name, *_cells(tasks)] for algorithm, name, tasks in settings]
     columns = ["algorithm", "method", "tasks", "seeds"]
     columns += [f"{what}{where}" for what in ("return", "Sm") for where in ("", ", worst task")]
@@ -93,29 +99,17 @@ def _sm(tasks: Sequence[Beside]) -> float:
     return float(np.exp(np.mean(np.log([each.sm for each in tasks]))))
 
 
-def _place(sm: float) -> float:
-    return math.inf if math.isnan(sm) else sm
-
-
-def _percent(share: float, where: str = "") -> str:
-    return "-" if math.isnan(share) else f"{share:+.0%} {where}".rstrip().replace("-0%", "+0%")
-
-
-def _ratio(ratio: float, where: str = "") -> str:
-    return "-" if math.isnan(ratio) else f"{ratio:.2f} {where}".rstrip()
-
-
 def _cells(tasks: Sequence[Beside]) -> list[str]:
     ours, theirs = ([getattr(each, side) for each in tasks] for side in ("group", "vanilla"))
-    # A task of which it is not known tells nothing of the worst one, either.
-    least = min(tasks, key=lambda t: -math.inf if math.isnan(t.gained) else t.gained)
-    roughest = max(tasks, key=lambda t: math.inf if math.isnan(t.sm) else t.sm)
+    gained, rough = [each.gained for each in tasks], [each.sm for each in tasks]
+    # Of NumPy's, what is not a number is the worst: it may be.
+    least, roughest = tasks[int(np.argmin(gained))], tasks[int(np.argmax(rough))]
     return [
         ", ".join(each.task for each in tasks),
         "; ".join(dict.fromkeys(number_range(each.seeds) for each in tasks)),
-        _percent(float(np.mean([each.gained for each in tasks]))),
-        _percent(least.gained, least.task),
-        _ratio(_sm(tasks)),
-        _ratio(roughest.sm, roughest.task),
+        or_dash(float(np.mean(gained)), "+.0%"),
+        f"{or_dash(least.gained, '+.0%')} {least.task}",
+        or_dash(_sm(tasks), ".2f"),
+        f"{or_dash(roughest.sm, '.2f')} {roughest.task}",
         *(probability(improvement(ours, theirs, "last_mean", quantity)) for quantity in BETTER),
     ]

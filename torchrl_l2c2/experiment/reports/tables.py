@@ -156,8 +156,8 @@ def score_table(readings: Sequence[Reading]) -> Table:
                 [
                     *(first.task, first.differences or "the defaults", "; ".join(seeds)),
                     *(f"{reading.updates:.0f}", FIGURES[figure].split(", ")[1]),
-                    _or_dash(reading.score(figure), ".2f"),
-                    *(_or_dash(cells[m, q], ".2f") for m in COMPARED for q in QUANTITIES),
+                    or_dash(reading.score(figure), ".2f"),
+                    *(or_dash(cells[m, q], ".2f") for m in COMPARED for q in QUANTITIES),
                 ]
             )
     notes = [
@@ -177,7 +177,7 @@ def number(value: float, quantity: str, beside: float | None = None) -> str:
     """
     size = abs(value if beside is None else beside)
     digits = 3 if quantity != "return" else 1 if size >= 100 else 2
-    return _or_dash(value, f".{digits}f")
+    return or_dash(value, f".{digits}f")
 
 
 def number_range(values: Sequence[int]) -> str:
@@ -211,7 +211,8 @@ def pooled(group: Group, figure: str, quantity: str) -> str:
     return f"{cell}, of {len(scores)} runs" if missing else cell
 
 
-def _or_dash(value: float, spec: str) -> str:
+def or_dash(value: float, spec: str) -> str:
+    """A number as it is to be written; a dash where it is not known."""
     return "-" if math.isnan(value) else format(value, spec)
 
 
