@@ -9,6 +9,7 @@ import pytest
 import torch
 from losses import (
     BOUNDS,
+    OBSERVATION,
     action_values,
     critic,
     deterministic_actor,
@@ -675,10 +676,11 @@ class TestPolicyDistances:
         [
             ("hellinger", "l2c2_hellinger", HELLINGER),
             ("mean", "l2c2_mean_distance", 0.5 * 2.0**2),
+            ("mse", "l2c2_mse", 2.0**2),
             ("kl", "l2c2_kl", 2.0**2 / (2 * 0.5**2)),
             (lambda p, q: (p.mean - q.mean).abs().sum(-1), "l2c2_policy_distance", 2.0),
         ],
-        ids=["hellinger", "mean", "kl", "function"],
+        ids=["hellinger", "mean", "mse", "kl", "function"],
     )
     def test_the_one_that_was_chosen_is_trained_and_logged(self, distance, diagnostic, difference):
         """The term has its gain, the diagnostic its name."""
@@ -703,6 +705,16 @@ class TestPolicyDistances:
         found = L2C2Loss(base, NEAR, policy_distance=distance).policy_regularizer(batch)
         assert found["l2c2_action_distance"] == expected["l2c2_action_distance"]
 
+    def test_the_mean_squared_error_of_deterministic_policies_is_that_of_their_actions(self):
+        """Of four joints a half of half the squared distance."""
+        torch.manual_seed(0)
+        base = DDPGLoss(Actor(mlp(OBSERVATION, 4)), qvalue())
+        batch = NeighborTransform(NEAR)(transitions(4))
+        summed = L2C2Loss(base, NEAR).policy_regularizer(batch)
+        mean = L2C2Loss(base, NEAR, policy_distance="mse").policy_regularizer(batch)
+        torch.testing.assert_close(mean["l2c2_mse"], summed["l2c2_action_distance"] / 2)
+        torch.testing.assert_close(mean["loss_l2c2_actor"], summed["loss_l2c2_actor"] / 2)
+
     @pytest.mark.parametrize("distance", ["kl", lambda p, q: p.mean])
     def test_deterministic_policies_have_no_other(self, distance):
         """The error says what to do."""
@@ -723,7 +735,7 @@ class TestPolicyDistances:
         with pytest.raises(TypeError, match=r"nothing is drawn, got hellinger_samples=8"):
             L2C2Loss(base, hellinger_samples=8)
 
-    @pytest.mark.parametrize("distance", ["mean", "kl"])
+    @pytest.mark.parametrize("distance", ["mean", "mse", "kl"])
     def test_they_compile_into_one_graph(self, distance):
         """With the eager numbers, squashed policies included."""
         torch.manual_seed(0)

@@ -18,6 +18,7 @@ from torchrl_l2c2.policy_distances import (
     choose_policy_distance,
     kl_divergence,
     mean_distance,
+    mean_squared_error,
     policy_mean,
 )
 
@@ -119,6 +120,24 @@ class TestMeanDistance:
         """A wide policy is as far away as a narrow one."""
         p, q = (rl.TanhNormal(LOC, torch.full_like(LOC, scale)) for scale in (0.1, 5.0))
         assert mean_distance(p, q).tolist() == [0.0, 0.0]
+
+
+class TestMeanSquaredError:
+    @pytest.mark.parametrize("kind", KINDS)
+    def test_it_is_a_mean_over_the_actions_dimensions(self, kind):
+        """(1^2 + 0^2) / 2 and (0^2 + 2^2) / 2."""
+        moved = LOC + torch.tensor([[1.0, 0.0], [0.0, -2.0]])
+        found = mean_squared_error(KINDS[kind](LOC), KINDS[kind](moved))
+        torch.testing.assert_close(found, torch.tensor([0.5, 2.0]))
+
+    @pytest.mark.parametrize("dims", [1, 2, 7])
+    def test_more_joints_that_move_alike_do_not_make_it_larger(self, dims):
+        """As torch's own counts it, of policies and of actions."""
+        here, there = torch.zeros(3, dims), torch.full((3, dims), 0.5)
+        expected = torch.nn.functional.mse_loss(here, there).expand(3)
+        p, q = (rl.TanhNormal(loc, torch.ones_like(loc)) for loc in (here, there))
+        torch.testing.assert_close(mean_squared_error(p, q), expected)
+        torch.testing.assert_close(mean_squared_error(here, there), expected)
 
 
 def kl_by_quadrature(p: d.Distribution, q: d.Distribution, low: float, high: float) -> float:
@@ -270,7 +289,7 @@ class TestChoice:
                 "wasserstein",
                 None,
                 ValueError,
-                "'hellinger' or 'mean' or 'kl', got 'wasserstein'. Or",
+                "'hellinger' or 'mean' or 'mse' or 'kl', got 'wasserstein'. Or",
             ),
             (2.0, None, TypeError, "policy_distance must be .* Or give a function"),
             ("kl", 4, ValueError, "hellinger_samples is for policy_distance='hellinger' alone"),

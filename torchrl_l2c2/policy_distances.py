@@ -1,4 +1,4 @@
-"""Distances between policies other than Hellinger's: that of their means, and the KL divergence."""
+"""Distances between policies other than Hellinger's: of their means, and the KL divergence."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ PolicyDistance = Callable[[Distribution, Distribution], Tensor]
 """A distance of two policies of batch shape ``[*B]``: a tensor of that shape, at least 0."""
 
 # What a distance is called where it is logged.
-_NAMES = {"hellinger": "hellinger", "mean": "mean_distance", "kl": "kl"}
+_NAMES = {"hellinger": "hellinger", "mean": "mean_distance", "mse": "mse", "kl": "kl"}
 
 
 def choose_policy_distance(
@@ -44,7 +44,7 @@ def choose_policy_distance(
     """The function that a name stands for, or one's own with the shape of its result checked.
 
     Args:
-        chosen: ``"hellinger"``, ``"mean"``, ``"kl"`` or a function.
+        chosen: ``"hellinger"``, ``"mean"``, ``"mse"``, ``"kl"`` or a function.
         hellinger_samples: actions drawn from each policy for an estimate of the first; ``None``
             for its closed form.
 
@@ -72,7 +72,7 @@ def choose_policy_distance(
     check_choice("policy_distance", chosen, tuple(_NAMES), hint=hint)
     if chosen == "hellinger":
         return functools.partial(squared_hellinger, num_samples=hellinger_samples)
-    return mean_distance if chosen == "mean" else kl_divergence
+    return {"mean": mean_distance, "mse": mean_squared_error, "kl": kl_divergence}[chosen]
 
 
 def _checked(distance: PolicyDistance, p: Distribution, q: Distribution) -> Tensor:
@@ -89,7 +89,9 @@ def _checked(distance: PolicyDistance, p: Distribution, q: Distribution) -> Tens
 def compare_policies(
     distance: PolicyDistance, p: Distribution | Tensor, q: Distribution | Tensor
 ) -> Tensor:
-    """A distance of two policies; of actions, half the squared one."""
+    """A distance of two policies; of actions their mean squared error, or half the squared one."""
+    if distance is mean_squared_error:
+        return mean_squared_error(p, q)
     if isinstance(p, Distribution) and isinstance(q, Distribution):
         return distance(p, q)
     assert isinstance(p, Tensor) and isinstance(q, Tensor)
@@ -112,7 +114,7 @@ def distance_name(
     """
     if stochastic:
         return _NAMES[chosen] if isinstance(chosen, str) else "policy_distance"
-    if chosen not in ("hellinger", "mean"):
+    if chosen not in ("hellinger", "mean", "mse"):
         raise TypeError(
             "the loss has a deterministic policy, which is no distribution to compare by "
             f"policy_distance={chosen!r}: leave it at its default, which then is half the squared "
@@ -123,7 +125,7 @@ def distance_name(
             "the loss has a deterministic policy, of which nothing is drawn, got hellinger_samples="
             f"{hellinger_samples!r}: leave it at None."
         )
-    return "action_distance"
+    return "mse" if chosen == "mse" else "action_distance"
 
 
 def policy_mean(policy: Distribution | Tensor, *, squashed: bool = False) -> Tensor:
@@ -217,6 +219,39 @@ def mean_distance(p: Distribution, q: Distribution) -> Tensor:
         tensor([1.])
     """
     return squared_error(policy_mean(p), policy_mean(q))
+
+
+def mean_squared_error(p: Distribution | Tensor, q: Distribution | Tensor) -> Tensor:
+    r"""The mean squared error of two policies' means before they are squashed.
+
+    .. math::
+        d(p, q) = \frac 1 A \lVert \mu_p - \mu_q \rVert_2^2
+
+    over :math:`A` dimensions of the action: :func:`mean_distance` times :math:`2 / A`, so that a
+    gain that fits one robot does not grow stronger with the joints of the next. Its gradient
+    flows into both policies.
+
+    Args:
+        p: one policy, batch shape ``[*B]``, or its actions, ``[*B, A]``.
+        q: the other, of the same actions.
+
+    Returns:
+        The distances, shape ``[*B]``, at least 0, in squared units of the action before the
+        squashing.
+
+    Raises:
+        NotImplementedError: a policy has no mean.
+        ValueError: the means have other shapes.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl.modules import TanhNormal
+        >>> p, q = TanhNormal(torch.zeros(1, 4), 1.0), TanhNormal(torch.ones(1, 4), 3.0)
+        >>> mean_squared_error(p, q), mean_distance(p, q)
+        (tensor([1.]), tensor([2.]))
+    """
+    mean = policy_mean(p)
+    return squared_error(mean, policy_mean(q)) * (2 / mean.shape[-1])
 
 
 def kl_divergence(

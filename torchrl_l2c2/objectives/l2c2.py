@@ -79,8 +79,8 @@ class L2C2Loss(RegularizedLoss):
     * ``l2c2_distance``, the mean :math:`d`, and ``l2c2_gain``, the mean gain applied,
       :math:`\lambda_\pi / d`;
     * the mean :math:`d_\pi`, named after the distance: ``l2c2_hellinger``,
-      ``l2c2_mean_distance``, ``l2c2_kl``, ``l2c2_policy_distance`` for a function of one's own,
-      ``l2c2_action_distance`` for deterministic policies;
+      ``l2c2_mean_distance``, ``l2c2_mse``, ``l2c2_kl``, ``l2c2_policy_distance`` for a function of
+      one's own, ``l2c2_action_distance`` for deterministic policies;
     * ``l2c2_value_distance``, the mean :math:`d_V`, summed over the value functions. With
       ``reduction="none"`` diagnostics are not averaged either.
 
@@ -112,11 +112,12 @@ class L2C2Loss(RegularizedLoss):
             ``None``, all that can.
         policy_distance (str or callable): :math:`d_\pi`. ``"hellinger"``, the paper's, is in [0, 1]
             and relative to how wide the policies are; ``"mean"``
-            (:func:`~torchrl_l2c2.policy_distances.mean_distance`) is neither; ``"kl"``
-            (:func:`~torchrl_l2c2.policy_distances.kl_divergence`), of the policy at :math:`s` from
-            the other, is relative and unbounded. Each wants its own gains. A function takes two
-            distributions ``[K, *B]`` and returns ``[K, *B]``. Only the first two take deterministic
-            policies. Defaults to ``"hellinger"``.
+            (:func:`~torchrl_l2c2.policy_distances.mean_distance`) is neither; nor is ``"mse"``
+            (:func:`~torchrl_l2c2.policy_distances.mean_squared_error`), a mean over the action's
+            dimensions; ``"kl"`` (:func:`~torchrl_l2c2.policy_distances.kl_divergence`), of the
+            policy at :math:`s` from the other, is relative and unbounded. Each wants its own gains.
+            A function takes two distributions ``[K, *B]`` and returns ``[K, *B]``; neither it nor
+            ``"kl"`` takes deterministic policies. Defaults to ``"hellinger"``.
         hellinger_samples (int, optional): actions drawn from each policy for the paper's Monte
             Carlo estimate of :math:`d_\pi`, at least 1. Defaults to ``None``, its closed form.
         neighbor_key (NestedKey): the entry that ``NeighborTransform`` writes. Defaults to
@@ -165,7 +166,7 @@ class L2C2Loss(RegularizedLoss):
         over_neighbors: Literal["mean", "max"] = "mean",
         fraction: float = 1.0,
         moved_keys: str | Sequence[NestedKey] | None = None,
-        policy_distance: Literal["hellinger", "mean", "kl"] | PolicyDistance = "hellinger",
+        policy_distance: Literal["hellinger", "mean", "mse", "kl"] | PolicyDistance = "hellinger",
         hellinger_samples: int | None = None,
         neighbor_key: NestedKey = "neighbor",
     ) -> None:

@@ -54,8 +54,8 @@ class SR2LLoss(RegularizedLoss):
         steps (int): of the ascent, at least 1. More come nearer to the maximum. Defaults to ``10``.
         policy_distance (str or callable): :math:`D`. ``"jeffreys"``, the mean of the KL divergences
             either way, the paper's; or as for :class:`L2C2Loss`. Of deterministic
-            policies half the squared distance of the actions, the paper's but for the half.
-            Defaults to ``"jeffreys"``.
+            policies half the squared distance of the actions, the paper's but for the half, or with
+            ``"mse"`` their mean squared error. Defaults to ``"jeffreys"``.
 
     Raises:
         TypeError: the loss has no policy or cannot be regularized, or an argument has the wrong
@@ -85,7 +85,7 @@ class SR2LLoss(RegularizedLoss):
         coeff: float = 0.1,
         *,
         steps: int = 10,
-        policy_distance: Literal["jeffreys", "hellinger", "mean", "kl"]
+        policy_distance: Literal["jeffreys", "hellinger", "mean", "mse", "kl"]
         | PolicyDistance = "jeffreys",
     ) -> None:
         check_real("epsilon", epsilon, above=0)

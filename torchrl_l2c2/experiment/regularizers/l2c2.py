@@ -65,10 +65,11 @@ class L2C2Config(GainConfig):
         description="share of the batch that has neighbors; smaller ones cost less in large "
         "batches, and are noisier [paper: all]",
     )
-    policy_distance: Literal["hellinger", "mean", "kl"] = Field(
+    policy_distance: Literal["hellinger", "mean", "mse", "kl"] = Field(
         default="hellinger",
         description="how policies are compared: hellinger [paper], half the squared distance of "
-        "their means before the squashing, or the KL divergence; they need other gains",
+        "their means before the squashing, these means' squared error, a mean over the action's "
+        "dimensions, or the KL divergence; they need other gains",
     )
 
     tchebycheff_mu: float | None = Field(

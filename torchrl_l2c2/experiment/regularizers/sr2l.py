@@ -23,7 +23,7 @@ class SR2LConfig(GainConfig):
     )
     coeff: float = Field(default=0.1, ge=0, description="gain of the largest distance in it")
     steps: int = Field(default=10, ge=1, description="of the ascent to it")
-    policy_distance: Literal["jeffreys", "hellinger", "mean", "kl"] = Field(
+    policy_distance: Literal["jeffreys", "hellinger", "mean", "mse", "kl"] = Field(
         default="jeffreys",
         description="how policies are compared; deterministic ones always by their actions",
     )
