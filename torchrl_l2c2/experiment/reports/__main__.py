@@ -1,4 +1,4 @@
-"""The command line: tables of runs, a report, a file of records, a README's results."""
+"""The command line: tables of runs, a report, a file of records, a page's results."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from collections.abc import Iterable, Sequence
 from itertools import chain
 from pathlib import Path
 
+from torchrl_l2c2.experiment.reports.filling import fill_page
 from torchrl_l2c2.experiment.reports.groups import group_records
 from torchrl_l2c2.experiment.reports.page import write_report
-from torchrl_l2c2.experiment.reports.readme import fill_readme
 from torchrl_l2c2.experiment.reports.records import Record, merge, read_records, write_records
 from torchrl_l2c2.experiment.reports.results import printed_tables
 from torchrl_l2c2.experiment.reports.runs import FinishedRun, Found, find_runs
@@ -25,7 +25,7 @@ EXAMPLES = """\
 examples:
   python -m torchrl_l2c2.experiment.reports outputs
   python -m torchrl_l2c2.experiment.reports outputs --csv results/runs.csv
-  python -m torchrl_l2c2.experiment.reports --from results/runs.csv --readme README.md
+  python -m torchrl_l2c2.experiment.reports --from results/runs.csv --page README.md
   python -m torchrl_l2c2.experiment.reports outputs --length 200 300 --score
 """
 
@@ -68,7 +68,7 @@ def _parser() -> argparse.ArgumentParser:
         "--output",
         metavar="FOLDER",
         help="of the report (default: report/ in the first folder; with --from, --csv, --score or "
-        "--readme there is a report only if this is given)",
+        "--page there is a report only if this is given)",
     )
     add("--csv", metavar="CSV", help="file that gets a line for every run, or its newer line")
     add("--score", action="store_true", help="print how near vanilla and CAPS come to the paper")
@@ -81,7 +81,7 @@ def _parser() -> argparse.ArgumentParser:
         "as long as so many frames); of a longer run by its training's own episodes",
     )
     add(
-        "--readme",
+        "--page",
         metavar="FILE",
         help="make the results between this file's marks anew, of all records of --csv or --from",
     )
@@ -93,13 +93,13 @@ def _report(chosen: argparse.Namespace) -> None:
     kept = merge(read_records(chosen.csv), records) if chosen.csv else records
     written = []
     # Before the records, as it may be refused.
-    if chosen.readme:
-        fill_readme(chosen.readme, kept)
-        written.append(f"results: {chosen.readme}")
+    if chosen.page:
+        fill_page(chosen.page, kept)
+        written.append(f"results: {chosen.page}")
     if chosen.csv:
         write_records(chosen.csv, kept)
         written.append(f"records: {chosen.csv}")
-    alone = not (chosen.records or chosen.csv or chosen.score or chosen.readme)
+    alone = not (chosen.records or chosen.csv or chosen.score or chosen.page)
     if chosen.output or alone:
         folder = Path(chosen.output or Path(chosen.folders[0]) / "report")
         written.append(f"report: {write_report(folder, records, runs, notes)}")

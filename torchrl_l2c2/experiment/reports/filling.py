@@ -1,4 +1,4 @@
-"""The part of a README that is made from records: the paper's table and its picture."""
+"""The part of a page that is made from records: tables and a picture between two marks."""
 
 from __future__ import annotations
 
@@ -7,10 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from torchrl_l2c2.experiment.files import make_folder_of, write_atomically
+from torchrl_l2c2.experiment.reports.choice import choice_table
 from torchrl_l2c2.experiment.reports.differences import BUDGETS
 from torchrl_l2c2.experiment.reports.faster_targets import faster_targets_table
+from torchrl_l2c2.experiment.reports.field import field_groups, field_table
 from torchrl_l2c2.experiment.reports.figures import draw_plane
 from torchrl_l2c2.experiment.reports.groups import Group, group_records
+from torchrl_l2c2.experiment.reports.pairwise import pairwise_tables
 from torchrl_l2c2.experiment.reports.paper import PAPER, TAU, is_of_paper
 from torchrl_l2c2.experiment.reports.paper_table import deployed_table, paper_table
 from torchrl_l2c2.experiment.reports.records import Record
@@ -21,55 +24,82 @@ START, END = "<!-- results: start -->", "<!-- results: end -->"
 PICTURE = Path("docs") / "results.svg"
 
 
-def results_text(records: Sequence[Record]) -> str:
-    """What stands between the marks: a picture, the paper's table, and what it has beside it.
+def paper_text(records: Sequence[Record]) -> str | None:
+    """The paper's table with its picture, :data:`PICTURE`, and what it has beside it.
 
     Where a task has runs of its default length and settings, others are not told: they compare
     lengths and readings of the paper. Regularizers' settings may be others.
 
-    Raises:
-        ValueError: no record is of the paper's tasks with its algorithm.
+    Returns:
+        str or None: nothing without a record of the paper's tasks with its algorithm.
     """
     groups = shown_groups(records)
     table = paper_table(groups)
     if table is None:
-        tasks = ", ".join(dict.fromkeys(task for task, _ in PAPER))
-        raise ValueError(
-            f"none of {len(records)} records is of the paper's {tasks} with ppo_rpe, of which a "
-            "README's results are: name a file that has some, by --from or --csv."
-        )
+        return None
     picture = f"![Return against action variation of every method]({PICTURE.as_posix()})"
     faster = faster_targets_table([r for r in records if is_as_usual(r, TAU)])
     more = [each.markdown() for each in (deployed_table(groups), faster) if each]
     return "\n\n".join([picture, table.markdown(), *settings_notes(groups), *more])
 
 
-def fill(text: str, records: Sequence[Record]) -> str:
-    """A README's text with its results made anew.
+def field_text(records: Sequence[Record], picture: str) -> str | None:
+    """The field's table with a picture of that name, and the methods beside one another.
+
+    Returns:
+        str or None: nothing without a record of a task that has a published row.
+    """
+    table = field_table(records)
+    if table is None:
+        return None
+    drawn = f"![Return against Sm of every method, beside what was published]({picture})"
+    tables = [table, *filter(None, [choice_table(records)]), *pairwise_tables(records)]
+    return "\n\n".join([drawn, *(each.markdown() for each in tables)])
+
+
+def fill(text: str, results: str) -> str:
+    """A page's text with these results between its marks.
 
     Raises:
-        ValueError: the marks are not there, once each and in order, or there are no results.
+        ValueError: the marks are not there, once each and in order.
     """
     pattern = re.compile(f"{re.escape(START)}.*?{re.escape(END)}", re.S)
     if (text.count(START), text.count(END), len(pattern.findall(text))) != (1, 1, 1):
         raise ValueError(f"the text must have {START} and behind it {END}, once each.")
-    made = f"{START}\n{results_text(records)}\n{END}"
+    made = f"{START}\n{results}\n{END}"
     return pattern.sub(lambda _: made, text)
 
 
-def fill_readme(path: str | Path, records: Sequence[Record]) -> None:
-    """Makes a README's results anew, and the picture in the ``docs`` folder beside it.
+def fill_page(path: str | Path, records: Sequence[Record]) -> None:
+    """Makes a page's results anew, and their picture.
+
+    The paper's table where there are records of its tasks, with its picture in the ``docs`` folder
+    beside the page; else the field's, with a picture of the page's own name beside it.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: as :func:`fill`; nothing is written then.
+        ValueError: as :func:`fill`, or the records give neither table; nothing is written then.
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {str(path)!r} with {START} and {END} to fill.")
-    text = fill(path.read_text(), records)
-    make_folder_of(path.parent / PICTURE)
-    draw_plane(shown_groups(records), "late_sampled", path.parent / PICTURE)
+    picture = path.with_suffix(".svg")
+    of_paper, of_field = paper_text(records), field_text(records, picture.name)
+    results = of_paper or of_field
+    if results is None:
+        tasks = ", ".join(dict.fromkeys(task for task, _ in PAPER))
+        raise ValueError(
+            f"none of {len(records)} records is of the paper's {tasks} with ppo_rpe, or of a task "
+            "of the field's table, of which a page's results are: name a file that has some, by "
+            "--from or --csv."
+        )
+    text = fill(path.read_text(), results)
+    if of_paper:
+        picture = path.parent / PICTURE
+        make_folder_of(picture)
+        draw_plane(shown_groups(records), "late_sampled", picture)
+    else:
+        draw_plane(field_groups(records), "last_mean", picture, "sm_asap")
     write_atomically(path, text.encode())
 
 
