@@ -9,6 +9,7 @@ import os
 import re
 import statistics
 import subprocess
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -787,6 +788,19 @@ class TestStatistics:
         generator = np.random.default_rng(0)
         interval = bootstrap_interval(mean, scores, generator=generator, confidence=0.8)
         assert interval == (0.25, 0.75)
+
+    def test_the_bootstrap_of_many_pairs_fits_into_memory(self):
+        """All resamples of 200 runs beside 200 at once would be 40 million pairs."""
+        scores, generator = np.arange(200.0)[:, None], np.random.default_rng(0)
+        tracemalloc.start()
+        try:
+            bootstrap_interval(
+                probability_of_improvement, scores, scores, generator=generator, resamples=1000
+            )
+            peak = tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+        assert peak < 100e6
 
     def test_the_bootstraps_settings_have_ranges(self):
         """Said with what was given."""

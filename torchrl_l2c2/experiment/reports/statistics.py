@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 Scores = NDArray[np.float64]
 Interval = tuple[float, float]
 
+RESAMPLES_AT_ONCE = 50
+
 
 def mean_and_deviation(scores: Scores) -> tuple[Scores, Scores]:
     """Mean and sample standard deviation over runs, as in the paper's Table III.
@@ -129,7 +131,11 @@ def bootstrap_interval(
         absent = np.arange(len(matrix))[:, None] >= runs
         drawn.append(np.where(absent, np.nan, np.take_along_axis(matrix[None], rows, 1)))
     tail = (1.0 - confidence) / 2.0
-    lower, upper = np.quantile(statistic(*drawn), [tail, 1.0 - tail])
+    # Of every pair of runs there is a number in each resample: a few resamples at a time.
+    cuts = range(RESAMPLES_AT_ONCE, resamples, RESAMPLES_AT_ONCE)
+    parts = zip(*(np.split(matrices, cuts) for matrices in drawn), strict=True)
+    found = np.concatenate([statistic(*part) for part in parts])
+    lower, upper = np.quantile(found, [tail, 1.0 - tail])
     return float(lower), float(upper)
 
 
