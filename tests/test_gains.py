@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import math
 import re
+import statistics
 import warnings
 
 import pytest
@@ -366,9 +367,28 @@ class TestRollouts:
             assert row["updates"] < after["updates"]
 
     @pytest.mark.parametrize("kind", ROLLOUTS)
-    def test_a_continued_run_is_the_uninterrupted_one(self, tmp_path, kind):
+    def test_a_target_is_of_all_episodes_since_the_gain_was_set(self, kind):
+        """A single one of a rollout's is noisy, and the first that ends in it a short one."""
+        of_kind = {"gain": "target", "gain_target": 0.1, "gain_rate": 0.5}
+        rows = Experiment(small_ppo(kind, **of_kind)).train(12)
+        seen, updates, several = [], 0, 0
+        for row, after in itertools.pairwise(rows):
+            seen.append(row["action_variation"])
+            assert row["gain_measured"] == pytest.approx(statistics.fmean(seen))
+            excess = min(row["gain_measured"] / 0.1 - 1.0, 1.0)
+            learned = row["updates"] > updates
+            moved = math.exp(0.5 * excess) if learned else 1.0
+            assert after["gain"] == pytest.approx(row["gain"] * moved)
+            if learned:
+                several += len(seen) > 1
+                seen, updates = [], row["updates"]
+        assert several
+
+    @pytest.mark.parametrize("gain", ["gradient", "target"])
+    @pytest.mark.parametrize("kind", ROLLOUTS)
+    def test_a_continued_run_is_the_uninterrupted_one(self, tmp_path, kind, gain):
         """To the last bit, wherever in the rollouts it was interrupted."""
-        assert_continues(small_ppo(kind), tmp_path, 5, 10)
+        assert_continues(small_ppo(kind, gain=gain), tmp_path, 5, 10)
 
     def test_the_values_have_a_share_of_their_own(self):
         """A fifth of the policy's, by the log and in the gradients."""

@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from statistics import fmean
 from typing import Any
 
 from torchrl_l2c2.experiment.config import ExperimentConfig
@@ -38,6 +39,8 @@ class GainControl:
         self._learner, self._updates, self._budget = learner, 0, config.task.budget
         self._config = regularizer if isinstance(regularizer, GainConfig) else None
         self._tells_measured = True
+        # Of the episodes since the gain was set: of a rollout several end, and any one is noisy.
+        self._seen: list[float] = []
         self.gains: dict[str, ConstantGain] = {}
         if self._config is not None and self._config.gain != "constant":
             names = self._terms() if self._config.gain == "gradient" else ["all"]
@@ -52,7 +55,8 @@ class GainControl:
     def after(self, row: Mapping[str, float]) -> dict[str, float]:
         """Sets the gains for what follows an episode; gives what they were and were set from.
 
-        Without an update since the last time nothing is set, and no gradient measured.
+        Without an update since the last time nothing is set, and no gradient measured. Where one
+        is, a measure is the mean over the episodes since then.
 
         Args:
             row (Mapping): what is logged of the episode.
@@ -70,7 +74,7 @@ class GainControl:
         if self.gains and self._config is not None:
             logged |= self._config.targets
         if self.gains and self._learner.updates > self._updates:
-            self._updates = self._learner.updates
+            self._updates, self._seen = self._learner.updates, []
             for name, gain in self.gains.items():
                 gain.step(measured[name])
             self._apply()
@@ -78,15 +82,15 @@ class GainControl:
         return logged
 
     def state_dict(self) -> dict[str, Any]:
-        """The gains, and the updates that they have followed."""
+        """The gains, the updates that they have followed, and what was measured since."""
         gains = {name: gain.state_dict() for name, gain in self.gains.items()}
-        return {"gains": gains, "updates": self._updates}
+        return {"gains": gains, "updates": self._updates, "seen": list(self._seen)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restores what :meth:`state_dict` gave; the loss has the gains then, too."""
         for name, gain in self.gains.items():
             gain.load_state_dict(state["gains"][name])
-        self._updates = state["updates"]
+        self._updates, self._seen = state["updates"], list(state.get("seen", []))
         self._apply()
 
     @contextmanager
@@ -119,7 +123,9 @@ class GainControl:
             spent = self._budget.spent(int(row["episode"]), int(row["frames"]))
             return {"all": min(1.0, spent / self._budget.total)}  # A last round may go beyond it.
         if self._config.gain == "target":
-            return {"all": row[self._config.gain_of]}
+            self._seen.append(row[self._config.gain_of])
+            numbers = [measured for measured in self._seen if math.isfinite(measured)]
+            return {"all": fmean(numbers) if numbers else self._seen[-1]}
         if self._learner.updates == self._updates:
             return dict.fromkeys(self.gains, float("nan"))
         shares = gradient_shares(self._learner.agent.loss, self._learner.example())
