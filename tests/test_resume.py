@@ -193,11 +193,23 @@ def test_what_changes_no_number_leaves_a_run_finished(tmp_path):
         {"logger": GROUPS["logger"]["tensorboard"]},
         {"record": True},
         {"checkpoint_interval": 5.0},
+        {"task": replace(small().task, solved_at=1e6)},
     ):
         assert finished_run(tmp_path, small(**settings).to_dict()) is not None
         Experiment(small(**settings), tmp_path).close()
         assert (tmp_path / "evaluation.json").read_bytes() == test
         assert finished_run(tmp_path, small().to_dict()) is not None
+
+
+def test_a_setting_that_is_new_and_off_leaves_a_run_finished(tmp_path):
+    """A release that adds one has no test played again."""
+    finished(tmp_path)
+    saved = json.loads((tmp_path / "config.json").read_text())
+    del saved["task"]["images"], saved["task"]["frames"], saved["regularizer"]["max_step"]
+    (tmp_path / "config.json").write_text(json.dumps(saved))
+    assert finished_run(tmp_path, small().to_dict()) is not None
+    longer = small(task=replace(small().task, episodes=7))
+    assert finished_run(tmp_path, longer.to_dict()) is None
 
 
 def test_a_run_is_finished_when_all_of_its_files_are_there(tmp_path, monkeypatch):

@@ -318,6 +318,16 @@ NEUTRAL_SETTINGS = {
 }
 
 
+def is_free(name: str) -> bool:
+    """Whether a setting may differ between a run and its continuation.
+
+    Args:
+        name (str): with its group, such as ``"task.solved_at"``; or of a group as a whole.
+    """
+    group, _, setting = name.partition(".")
+    return group in FREE_SETTINGS or (group == "task" and setting in FREE_TASK_SETTINGS)
+
+
 def is_neutral(name: str, value: Any) -> bool:
     """Whether a run of before there was this setting has the numbers of one with this value.
 

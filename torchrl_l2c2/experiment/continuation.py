@@ -11,18 +11,14 @@ from typing import Any
 
 from torchrl_l2c2.experiment.checkpoints import CheckpointError, list_checkpoints, load_newest
 from torchrl_l2c2.experiment.config import (
-    FREE_SETTINGS,
-    FREE_TASK_SETTINGS,
     ExperimentConfig,
     OtherRunError,
-    is_neutral,
 )
 from torchrl_l2c2.experiment.environments import SimulatorError
-from torchrl_l2c2.experiment.saved import as_it_was, by_name
+from torchrl_l2c2.experiment.saved import differing
 from torchrl_l2c2.experiment.tasks import Budget, TaskConfig
 from torchrl_l2c2.experiment.versions import versions
 
-MISSING = "none, as it is a setting since"
 # Free settings that only episodes of training read.
 OF_TRAINING = ("evaluate_every", "late_share")
 
@@ -33,21 +29,11 @@ def check_same_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> Non
     Raises:
         OtherRunError: names the first setting that differs, with both values.
     """
-    before, after = by_name(as_it_was(saved)), by_name(now)
-    # What was chosen by name first: the settings of another choice are others anyway.
-    for name in sorted(before.keys() | after.keys(), key=lambda n: (not n.endswith(".name"), n)):
-        was, is_now = before.get(name, MISSING), after.get(name, MISSING)
-        since = was == MISSING and is_neutral(name, is_now)
-        if was != is_now and not since and not _is_free(name):
-            raise OtherRunError(
-                f"the checkpoint was made with {name.removesuffix('.name')}={was}, not {is_now}: "
-                "give the same settings, or begin in another folder. Nothing was changed."
-            )
-
-
-def _is_free(name: str) -> bool:
-    group, _, setting = name.partition(".")
-    return group in FREE_SETTINGS or (group == "task" and setting in FREE_TASK_SETTINGS)
+    for name, (was, is_now) in differing(saved, now).items():
+        raise OtherRunError(
+            f"the checkpoint was made with {name.removesuffix('.name')}={was}, not {is_now}: "
+            "give the same settings, or begin in another folder. Nothing was changed."
+        )
 
 
 def check_same_versions(saved: Mapping[str, str], now: Mapping[str, str]) -> None:

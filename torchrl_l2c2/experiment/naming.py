@@ -14,10 +14,9 @@ from pathlib import PurePosixPath
 from typing import Any
 
 from torchrl_l2c2.experiment.config import (
-    FREE_SETTINGS,
-    FREE_TASK_SETTINGS,
     GROUPS,
     ExperimentConfig,
+    is_free,
 )
 from torchrl_l2c2.experiment.tasks import TaskConfig
 
@@ -61,19 +60,19 @@ def _unusual(config: ExperimentConfig) -> Iterator[tuple[str, str, Any]]:
         "optimizer": config.algorithm.usual_optimizer,
     }
     names = Counter(name for group in GROUPS for name in vars(getattr(config, group)))
-    for group in sorted(GROUPS.keys() - FREE_SETTINGS):
+    for group in sorted(group for group in GROUPS if not is_free(group)):
         chosen = getattr(config, group)
         if chosen.name != usual_names.get(group, chosen.name):
             yield group, group, chosen.name
         usual = _usual(group, chosen)
         for name, value in vars(chosen).items():
-            free = name == "name" or (group == "task" and name in FREE_TASK_SETTINGS)
+            free = name == "name" or is_free(f"{group}.{name}")
             if not free and value != getattr(usual, name):
                 alone = group == "regularizer" or names[name] == 1
                 yield group, name if alone else f"{group}.{name}", value
     usual = ExperimentConfig()
-    for name in sorted(vars(config).keys() - GROUPS.keys() - FREE_SETTINGS - {"seed"}):
-        if getattr(config, name) != getattr(usual, name):
+    for name in sorted(vars(config).keys() - GROUPS.keys() - {"seed"}):
+        if not is_free(name) and getattr(config, name) != getattr(usual, name):
             yield "", name, getattr(config, name)
 
 

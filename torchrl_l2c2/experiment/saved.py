@@ -10,8 +10,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from torchrl_l2c2.experiment.config import GROUPS, NEUTRAL_SETTINGS
+from torchrl_l2c2.experiment.config import GROUPS, NEUTRAL_SETTINGS, is_free, is_neutral
 
+NOT_THEN = "none, as it is a setting since"
 REMEDY = "it was changed or cut since it was written; restore it."
 ANEW = " Or delete it: the command that made the run tests its policy again."
 
@@ -98,6 +99,27 @@ def by_name(settings: Mapping[str, Any]) -> dict[str, Any]:
     for name, value in json.loads(json.dumps(settings)).items():
         flat |= {f"{name}.{k}": v for k, v in value.items()} if name in GROUPS else {name: value}
     return flat
+
+
+def differing(saved: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """The settings that decide a run's numbers, and are others now than they were then.
+
+    Args:
+        saved (Mapping): of ``config.json`` or of a checkpoint.
+        now (Mapping): of ``ExperimentConfig.to_dict()``.
+
+    Returns:
+        dict: by their names, what is chosen by name first, the value then and the one now.
+    """
+    before, after = by_name(as_it_was(saved)), by_name(now)
+    # The settings of another choice are others anyway.
+    names = sorted(before.keys() | after.keys(), key=lambda n: (not n.endswith(".name"), n))
+    pairs = {n: (before.get(n, NOT_THEN), after.get(n, NOT_THEN)) for n in names if not is_free(n)}
+    return {
+        name: (was, is_now)
+        for name, (was, is_now) in pairs.items()
+        if was != is_now and not (was == NOT_THEN and is_neutral(name, is_now))
+    }
 
 
 def read_evaluation(run: str | Path) -> dict[str, Any]:

@@ -8,10 +8,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from torchrl_l2c2.experiment.config import (
-    FREE_SETTINGS,
-    FREE_TASK_SETTINGS,
     GROUPS,
     ExperimentConfig,
+    is_free,
     is_neutral,
 )
 from torchrl_l2c2.experiment.saved import by_name
@@ -99,12 +98,7 @@ def _names(config: Mapping[str, Any], groups: Any) -> dict[str, Any]:
 
 
 def _counts(name: str) -> bool:
-    group, _, setting = name.partition(".")
-    return (
-        name != "seed"
-        and group not in {"logger", *FREE_SETTINGS}
-        and not (group == "task" and setting in FREE_TASK_SETTINGS)
-    )
+    return name != "seed" and not is_free(name)
 
 
 def _word(value: Any) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import statistics
 from collections.abc import Iterable, Sequence
@@ -11,11 +10,17 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from torchrl_l2c2.experiment.config import FREE_SETTINGS
-from torchrl_l2c2.experiment.reports.differences import differences, fingerprint, write_differences
+from torchrl_l2c2.experiment.reports.differences import (
+    BUDGETS,
+    differences,
+    fingerprint,
+    write_differences,
+)
 from torchrl_l2c2.experiment.reports.records import QUANTITIES, Record
 from torchrl_l2c2.experiment.saved import (
     REMEDY,
+    by_name,
+    differing,
     read_config,
     read_evaluation,
     read_json,
@@ -181,13 +186,14 @@ class FinishedRun:
 def tested_run(folder: str | Path, settings: dict[str, Any]) -> FinishedRun | None:
     """The run in a folder whose test is of these settings; ``None`` where there is none.
 
-    Settings that change none of the numbers may differ.
+    Settings that change none of the numbers may differ, but for how long the training is.
     """
     folder = Path(folder)
     if not (folder / "evaluation.json").exists():
         return None
     saved = read_config(folder)
-    return FinishedRun.read(folder) if _deciding(saved) == _deciding(settings) else None
+    before, after = ([by_name(each).get(name) for name in BUDGETS] for each in (saved, settings))
+    return None if before != after or differing(saved, settings) else FinishedRun.read(folder)
 
 
 def finished_run(folder: str | Path, settings: dict[str, Any]) -> FinishedRun | None:
@@ -196,11 +202,6 @@ def finished_run(folder: str | Path, settings: dict[str, Any]) -> FinishedRun | 
     if run is None or settings["test_episodes"] in (0, run.test_episodes):
         return run
     return None
-
-
-def _deciding(settings: dict[str, Any]) -> Any:
-    """What decides a run's numbers, as JSON, where a tuple and a list are the same."""
-    return json.loads(json.dumps({k: v for k, v in settings.items() if k not in FREE_SETTINGS}))
 
 
 @dataclass(frozen=True)
