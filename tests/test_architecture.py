@@ -72,7 +72,7 @@ experiment.trained
 experiment.video
 experiment.workers
 experiment.evaluate experiment.update experiment.player experiment.manual
-experiment.influence experiment.best_policy experiment.export
+experiment.best_policy experiment.export
 experiment.diagnosis.measured
 experiment.diagnosis.words experiment.diagnosis.pictures experiment.diagnosis.run
 experiment.diagnosis.film

@@ -18,11 +18,14 @@ from torchrl_l2c2.experiment import (
     Experiment,
     ExperimentConfig,
     L2C2Config,
+    PPOConfig,
     PPORPEConfig,
+    RolloutReplayConfig,
     TaskConfig,
     TD3Config,
     evaluate_policy,
     load_policy,
+    make_env,
 )
 from torchrl_l2c2.experiment.diagnose import main
 from torchrl_l2c2.experiment.diagnosis import (
@@ -38,6 +41,8 @@ from torchrl_l2c2.experiment.diagnosis import (
 )
 from torchrl_l2c2.experiment.diagnosis.film import film
 from torchrl_l2c2.experiment.diagnosis.page import page
+from torchrl_l2c2.experiment.diagnosis.run import _batch
+from torchrl_l2c2.experiment.learner import Learner
 from torchrl_l2c2.metrics import action_variation, previous_action_gain
 
 STEPS = torch.arange(100.0)
@@ -417,6 +422,32 @@ class TestRun:
             found = diagnose_run(tmp_path / str(target), episodes=1, with_pictures=False)
             shares[target] = found.shares["l2c2_actor"].gradient
         assert shares[1.0] > 10 * shares[0.01]
+
+    def test_gradients_are_of_what_training_learns_from(self, monkeypatch):
+        """Rewards of 1, 50 and -200 are cut off at 10 before they are scaled by .01."""
+        algorithm = PPOConfig(
+            **{"hidden": (8,), "frames": 64, "num_envs": 2, "clip_actions": True},
+            **{"normalize_observations": True, "normalize_rewards": True, "reward_scale": 0.01},
+        )
+        task = TaskConfig("pendulum", "Pendulum-v1", episodes=2, max_steps=3)
+        config = ExperimentConfig(
+            task=task, algorithm=algorithm, replay=RolloutReplayConfig(batch_size=16)
+        )
+        env = make_env(task, 0)
+        agent, episode = config.make_agent(env), env.rollout(3, auto_reset=True)
+        episode["next", "reward"] = torch.tensor([[1.0], [50.0], [-200.0]])
+        monkeypatch.setattr(
+            "torchrl_l2c2.experiment.diagnosis.run.play_episodes", lambda *_, **__: [episode]
+        )
+        learned, read = [], _batch(agent, config, env, 3)
+        learner = Learner(
+            agent, config.make_replay(), reward_factor=0.01, compile=False, skip_nonfinite=False
+        )
+        monkeypatch.setattr(learner.replay, "extend", learned.append)
+        learner.remember(agent.normalization.normalized(episode))
+        expected = torch.tensor([[0.01], [0.1], [-0.1]])
+        for batch in (read, learned[0]):
+            torch.testing.assert_close(batch["next", "reward"], expected)
 
     def test_pictures_are_left_out_where_they_cannot_be_drawn(self, run, monkeypatch):
         """As without pygame; all else is there."""

@@ -27,9 +27,14 @@ from torchrl_l2c2.experiment import (
     TD3Config,
     UniformReplayConfig,
 )
-from torchrl_l2c2.experiment.influence import gradient_shares
 from torchrl_l2c2.experiment.settings import SettingError
-from torchrl_l2c2.gains import ConstantGain, GradientGain, RampGain, TargetGain
+from torchrl_l2c2.gains import (
+    ConstantGain,
+    GradientGain,
+    RampGain,
+    TargetGain,
+    gradient_shares,
+)
 
 
 class TestByHand:

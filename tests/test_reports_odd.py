@@ -13,8 +13,8 @@ from torchrl_l2c2.experiment.reports.__main__ import main
 from torchrl_l2c2.experiment.reports.choice import choice_table
 from torchrl_l2c2.experiment.reports.field import field_table
 from torchrl_l2c2.experiment.reports.figures import draw_plane, styles
-from torchrl_l2c2.experiment.reports.front import by_task, front_table
-from torchrl_l2c2.experiment.reports.groups import baseline_of, group_records
+from torchrl_l2c2.experiment.reports.front import front_table
+from torchrl_l2c2.experiment.reports.groups import baseline_of, by_task, group_records
 from torchrl_l2c2.experiment.reports.pairwise import pairwise_tables
 from torchrl_l2c2.experiment.reports.records import read_records, write_records
 from torchrl_l2c2.experiment.reports.score import readings

@@ -24,7 +24,7 @@ from torchrl_l2c2.experiment import (
     TaskConfig,
     TD3Config,
 )
-from torchrl_l2c2.experiment.influence import gradient_shares
+from torchrl_l2c2.gains import gradient_shares
 
 PENDULUM = TaskConfig("pendulum", "Pendulum-v1", episodes=2, max_steps=40)
 

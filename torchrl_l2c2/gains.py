@@ -10,8 +10,14 @@ also between calls of a compiled loss::
 from __future__ import annotations
 
 import math
+from copy import deepcopy
 from numbers import Real
 from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.objectives import LossModule
 
 from torchrl_l2c2._checks import as_number, check_real
 
@@ -232,3 +238,79 @@ def _measured(measured: Any) -> float:
     if not isinstance(measured, Real) or isinstance(measured, bool):
         raise TypeError(f"measured must be a real number, got {measured!r}.")
     return float(measured)
+
+
+def is_loss(key: str) -> bool:
+    """Whether an entry of a loss's output is one of the terms that are summed."""
+    return key == "loss" or key.startswith("loss_")
+
+
+@torch.enable_grad()
+def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]:
+    r"""The gradients' norms of a regularizer's terms, relative to those of the loss's own terms.
+
+    .. math::
+        \frac{\lVert \nabla_\theta L_r \rVert_2}{\lVert \nabla_\theta L \rVert_2}
+
+    for every term :math:`L_r` that a regularizer has added to a loss :math:`L`, in the parameters
+    :math:`\theta` that the term trains. Nothing of the loss changes, and no number is drawn from
+    torch's global generators.
+
+    Args:
+        loss (LossModule): as it is trained; one that is not regularized has no shares.
+        batch (TensorDictBase): what it reads; not written to.
+
+    Returns:
+        dict: at least 0 for every added ``loss_*`` key; infinite where the loss's own gradient is
+        zero.
+
+    Raises:
+        ValueError: a term is not a single number.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.modules import MLP, Actor, ValueOperator
+        >>> from torchrl.objectives import DDPGLoss
+        >>> from torchrl_l2c2 import CATSLoss
+        >>> _ = torch.manual_seed(0)
+        >>> critic = ValueOperator(MLP(4, 1), in_keys=["observation", "action"])
+        >>> loss = CATSLoss(DDPGLoss(Actor(torch.nn.Linear(3, 1)), critic), lambda_temporal=0.5)
+        >>> flags = torch.zeros(8, 1, dtype=torch.bool)
+        >>> then = {"observation": torch.randn(8, 3), "reward": torch.randn(8, 1)}
+        >>> now = {"observation": torch.randn(8, 3), "action": torch.randn(8, 1)}
+        >>> batch = TensorDict({**now, "next": {**then, "done": flags, "terminated": flags}}, [8])
+        >>> gain = GradientGain(0.1, value=0.5)
+        >>> loss.cats_lambda_temporal = gain.step(gradient_shares(loss, batch)["loss_cats"])
+        >>> round(gradient_shares(loss, batch)["loss_cats"], 6)
+        0.1
+    """
+    added = [key for key in loss.out_keys if key in getattr(loss, "added_terms", ())]
+    if not added:
+        return {}
+    # A copy, as some losses keep statistics of what they have seen.
+    devices = {parameter.device for parameter in loss.parameters() if parameter.is_cuda}
+    with torch.random.fork_rng(devices=devices):
+        twin = deepcopy(loss)
+        terms = twin(batch.copy())
+    if any(terms[key].ndim for key in terms.keys() if is_loss(key)):
+        raise ValueError(
+            "gradient_shares needs terms that are single numbers, one for the whole batch: make "
+            "the loss with reduction='mean'."
+        )
+    parameters = list(twin.parameters())
+
+    def gradients(value: Tensor) -> tuple[Tensor | None, ...]:
+        return torch.autograd.grad(value, parameters, allow_unused=True, retain_graph=True)
+
+    own = gradients(sum(terms[key] for key in terms.keys() if is_loss(key) and key not in added))
+    shares = {}
+    for key in added:
+        pairs = [(g, o) for g, o in zip(gradients(terms[key]), own, strict=True) if g is not None]
+        norms = [_norm(side) for side in zip(*pairs, strict=True)]
+        shares[key] = norms[0] / norms[1] if norms[1] else float("inf")
+    return shares
+
+
+def _norm(gradients: tuple[Tensor | None, ...]) -> float:
+    return sum(float(g.square().sum()) for g in gradients if g is not None) ** 0.5

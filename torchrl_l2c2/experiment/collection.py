@@ -24,10 +24,9 @@ from torchrl.envs import (
 
 from torchrl_l2c2.experiment.acting import on_tensors
 from torchrl_l2c2.experiment.environments import simulating
-from torchrl_l2c2.experiment.frames import Frame, as_number, stack_frames
+from torchrl_l2c2.experiment.frames import PREVIOUS, Frame, as_number, stack_frames
 from torchrl_l2c2.transforms import ObservationNoise
 
-PREVIOUS = "previous_observation"
 # Added to the seed of an environment for its noise: the two are not to draw the same numbers.
 NOISE_SEED = 7_919
 

@@ -11,6 +11,9 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
+# The entry of the observation before a state, for regularizers that read it.
+PREVIOUS = "previous_observation"
+
 
 class Frame(NamedTuple):
     """One transition.

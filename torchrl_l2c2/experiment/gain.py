@@ -11,12 +11,17 @@ from typing import Any
 
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.evaluate import TESTED
-from torchrl_l2c2.experiment.influence import gradient_shares
 from torchrl_l2c2.experiment.learner import Learner
 from torchrl_l2c2.experiment.player import MEASURES
 from torchrl_l2c2.experiment.regularizers import GainConfig
 from torchrl_l2c2.experiment.settings import SettingError
-from torchrl_l2c2.gains import ConstantGain, GradientGain, RampGain, TargetGain
+from torchrl_l2c2.gains import (
+    ConstantGain,
+    GradientGain,
+    RampGain,
+    TargetGain,
+    gradient_shares,
+)
 
 
 class GainControl:

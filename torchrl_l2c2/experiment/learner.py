@@ -13,9 +13,9 @@ from torchrl.data import TensorDictReplayBuffer
 
 from torchrl_l2c2.experiment.algorithms.agent import Agent
 from torchrl_l2c2.experiment.frames import Frame
-from torchrl_l2c2.experiment.influence import gradient_shares
 from torchrl_l2c2.experiment.row_writer import RowWriter
-from torchrl_l2c2.experiment.update import ReplayUpdate, is_loss
+from torchrl_l2c2.experiment.update import ReplayUpdate
+from torchrl_l2c2.gains import gradient_shares, is_loss
 from torchrl_l2c2.objectives import L2C2Loss
 from torchrl_l2c2.transforms import NeighborTransform
 
@@ -23,7 +23,7 @@ from torchrl_l2c2.transforms import NeighborTransform
 # below which they are told to be too small. It is far below what changes a result: the share of
 # a policy that begins flat, as PPO's with orthogonal weights, grows while the policy forms.
 MEASURED_AFTER = 100
-FAINT = 1e-4
+TOLD_BELOW = 1e-4
 
 
 def untrained(frames: int, updates: int, random_frames: int) -> str | None:
@@ -81,7 +81,6 @@ class Learner:
         self.first_update_seconds: float | None = None
         self.tells_faint_regularizer = True
         self.at_full_gain: Callable[[], AbstractContextManager[None]] = nullcontext
-        self._device = agent.device
         self._reward_factor = reward_factor
         self.compiles = compile
         self._skip_nonfinite = skip_nonfinite
@@ -109,12 +108,7 @@ class Learner:
     @torch.no_grad()
     def remember(self, transitions: TensorDictBase) -> None:
         """Keeps the entries that the loss reads, and no others: sampling copies every one."""
-        scaled = transitions["next", "reward"] * self._reward_factor
-        transitions = transitions.copy().set(("next", "reward"), scaled)
-        if self._device.type != "cpu":  # Finding out that all is there takes long, too.
-            transitions = transitions.to(self._device)
-        if self.agent.advantage is not None:
-            transitions = self.agent.advantage(transitions)
+        transitions = self.agent.as_learned(transitions, self._reward_factor)
         self.replay.extend(transitions.select(*self._read_keys, strict=False))
 
     @torch.no_grad()
@@ -163,12 +157,12 @@ class Learner:
     def _tell_faint_regularizer(self) -> None:
         with self.at_full_gain():
             shares = gradient_shares(self.agent.loss, self.update.example())
-        if shares and max(shares.values()) < FAINT:
+        if shares and max(shares.values()) < TOLD_BELOW:
             each = ", ".join(f"{key}: {share:.1g}" for key, share in shares.items())
             warnings.warn(
                 f"after {self.updates} updates the gradients of the regularizer's terms are less "
-                f"than {FAINT:g} of the loss's own ({each}), which is likely to change nothing: "
-                "raise the gains of the regularizer, or lower algorithm.reward_scale.",
+                f"than {TOLD_BELOW:g} of the loss's own ({each}), which is likely to change "
+                "nothing: raise the gains of the regularizer, or lower algorithm.reward_scale.",
                 stacklevel=2,
             )
 

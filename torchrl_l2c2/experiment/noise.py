@@ -267,10 +267,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
     add("--output", metavar="FOLDER", help="of the files (default: noise/ in the first folder)")
     chosen = parser.parse_args(None if arguments is None else list(arguments))
     try:
-        found = find_runs(chosen.folders)
-        if not found.runs:
-            named = ", ".join(map(repr, chosen.folders))
-            raise FileNotFoundError(f"no finished run (evaluation.json) below {named}.")
+        found = find_runs(chosen.folders, required=True)
         played = play_with_noise(found.runs, chosen.levels, episodes=chosen.episodes, progress=True)
         written = write_noise(chosen.output or Path(chosen.folders[0]) / "noise", played)
     except (ValueError, OSError, RuntimeError, ArithmeticError, ImportError) as error:

@@ -15,8 +15,8 @@ from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
 from torchrl_l2c2.experiment.acting import on_tensors
-from torchrl_l2c2.experiment.collection import PREVIOUS, observed, simulator_and_noise
-from torchrl_l2c2.experiment.frames import Frame, as_number, stack_frames
+from torchrl_l2c2.experiment.collection import observed, simulator_and_noise
+from torchrl_l2c2.experiment.frames import PREVIOUS, Frame, as_number, stack_frames
 
 
 class Ended(NamedTuple):

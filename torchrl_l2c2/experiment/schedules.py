@@ -41,7 +41,12 @@ def by_episode(player: Player, learner: Learner, algorithm: OffPolicyConfig) -> 
 def by_rollout(player: Player, learner: Learner, algorithm: PPOConfig) -> Iterator[Episode]:
     """Updates with everything that one policy has played, once it is enough."""
     if algorithm.num_envs is not None:
-        yield from by_frames(player, learner, algorithm)
+        return by_frames(player, learner, algorithm)
+    return by_episodes(player, learner, algorithm)
+
+
+def by_episodes(player: Player, learner: Learner, algorithm: PPOConfig) -> Iterator[Episode]:
+    """Updates after so many frames at least, of whole episodes."""
     while True:
         episodes = player.play()
         for episode in episodes:

@@ -27,8 +27,8 @@ from torchrl_l2c2.experiment.files import make_folder
 from torchrl_l2c2.experiment.lock import FolderInUseError, lock_folder
 from torchrl_l2c2.experiment.reports import find_runs, write_report
 from torchrl_l2c2.experiment.reports.comparison import SIGNS
-from torchrl_l2c2.experiment.reports.front import by_task, front_figure, front_table
-from torchrl_l2c2.experiment.reports.groups import group_records
+from torchrl_l2c2.experiment.reports.front import front_figure, front_table
+from torchrl_l2c2.experiment.reports.groups import by_task, group_records
 from torchrl_l2c2.experiment.search_space import check_settings, read_space, short
 from torchrl_l2c2.experiment.sweep import start_guard
 

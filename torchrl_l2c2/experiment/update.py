@@ -20,15 +20,11 @@ from torchrl_l2c2.experiment.algorithms.agent import Agent
 from torchrl_l2c2.experiment.compilation import compiled
 from torchrl_l2c2.experiment.priorities import draw_by_priority, set_priorities
 from torchrl_l2c2.experiment.tracing import traceable_step, traceable_targets
+from torchrl_l2c2.gains import is_loss
 from torchrl_l2c2.transforms import NeighborTransform
 
 Step = Callable[..., tuple[Tensor, Tensor | None] | None]
 """A gradient step: the means of the loss's entries and new priorities, or ``None`` if skipped."""
-
-
-def is_loss(key: str) -> bool:
-    """Whether an entry of a loss's output is one of the terms that are summed."""
-    return key == "loss" or key.startswith("loss_")
 
 
 def make_update(

@@ -27,6 +27,7 @@ from torchrl_l2c2.objectives.relative_pearson import (
     update_deviation,
 )
 from torchrl_l2c2.objectives.shared_evaluation import SharedEvaluation
+from torchrl_l2c2.objectives.transitions import next_key
 
 # exp(20) is far beyond any ratio that the loss treats differently (the relative ratio is within
 # 1e-8 of its end there) and far below what overflows when it is squared in float32.
@@ -206,7 +207,7 @@ class PPORPELoss(SharedEvaluation):
             keys = self.tensor_keys
             taken = [keys.action] + ([keys.sample_log_prob] if self.baseline == "stored" else [])
             outcome = (keys.reward, keys.done, keys.terminated, *self.critic_network.in_keys)
-            self._in_keys = list(dict.fromkeys([*states, *taken, *map(_next, outcome)]))
+            self._in_keys = list(dict.fromkeys([*states, *taken, *map(next_key, outcome)]))
         return self._in_keys
 
     @in_keys.setter
@@ -343,7 +344,3 @@ class PPORPELoss(SharedEvaluation):
         )
         self.delta.copy_(delta)
         return deviation, self.kappa * self.delta
-
-
-def _next(key: NestedKey) -> NestedKey:
-    return ("next", key) if isinstance(key, str) else ("next", *key)

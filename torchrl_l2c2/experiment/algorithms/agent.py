@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torch.optim import Optimizer
@@ -61,6 +62,14 @@ class Agent:
     def device(self) -> torch.device:
         """Where the loss's parameters are, and batches have to be."""
         return next(self.loss.parameters()).device
+
+    def as_learned(self, transitions: TensorDictBase, reward_factor: float) -> TensorDictBase:
+        """A copy of transitions as the loss reads them: scaled rewards, its device, advantages."""
+        scaled = transitions["next", "reward"] * reward_factor
+        transitions = transitions.copy().set(("next", "reward"), scaled)
+        if self.device.type != "cpu":  # Finding out that all is there takes long, too.
+            transitions = transitions.to(self.device)
+        return transitions if self.advantage is None else self.advantage(transitions)
 
     def load_networks(self, state: Mapping[str, Any]) -> None:
         """Restores what a policy acts by: networks, their inputs' scales, exploration."""

@@ -11,6 +11,8 @@ from torch import Tensor, nn
 from torchrl.envs import ExplorationType
 from torchrl.envs.utils import exploration_type
 
+from torchrl_l2c2.experiment.frames import PREVIOUS
+
 LARGEST = 10.0  # of what is normalized
 EPSILON = 1e-8  # added to variances
 
@@ -97,7 +99,7 @@ class Normalization(nn.Module):
     def normalized(self, frames: TensorDictBase) -> TensorDictBase:
         """A copy of frames with both observations and the reward normalized; nothing is counted."""
         copied = frames.copy()
-        for key in ("observation", ("next", "observation"), "previous_observation"):
+        for key in ("observation", ("next", "observation"), PREVIOUS):
             if key not in frames.keys(True):
                 continue
             copied.set(key, self.normalize(frames[key].to(self.mean.device)))

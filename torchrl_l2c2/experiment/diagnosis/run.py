@@ -25,12 +25,13 @@ from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.diagnosis.measured import Diagnosis, TermShare, Value, diagnose
 from torchrl_l2c2.experiment.environments import TEST_SEED
 from torchrl_l2c2.experiment.export import entry_names
-from torchrl_l2c2.experiment.influence import gradient_shares
+from torchrl_l2c2.experiment.frames import PREVIOUS
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.regularizers.base import GainConfig
 from torchrl_l2c2.experiment.saved import read_config
 from torchrl_l2c2.experiment.trained import load_policy
 from torchrl_l2c2.experiment.video import play_pictures
+from torchrl_l2c2.gains import gradient_shares
 from torchrl_l2c2.objectives.evaluation import Evaluation, is_ensemble
 from torchrl_l2c2.objectives.wiring import VALUE_NETWORKS
 
@@ -183,15 +184,11 @@ def _batch(agent: Agent, config: ExperimentConfig, env: EnvBase, max_steps: int)
     """A training episode, with what the loss reads of it."""
     (episode,) = play_episodes(agent.policy, env, 1, max_steps=max_steps, sampled=True)
     with torch.no_grad():
-        reward = episode["next", "reward"] * config.algorithm.reward_factor
-        episode.set(("next", "reward"), reward)
         seen = episode["observation"]
-        episode.set("previous_observation", torch.cat((seen[:1], seen[:-1])))
+        episode.set(PREVIOUS, torch.cat((seen[:1], seen[:-1])))
         if agent.normalization is not None:
             episode = agent.normalization.normalized(episode)
-        if agent.advantage is not None:
-            episode = agent.advantage(episode)
-    return episode
+        return agent.as_learned(episode, config.algorithm.reward_factor)
 
 
 def _pictures(folder: Path, seed: int, noise_scale: float | None, best: bool) -> list[Any]:

@@ -43,6 +43,7 @@ class ASAPConfig(GainConfig):
     )
 
     def wrap(self, loss: LossModule) -> LossModule:
+        from torchrl_l2c2.experiment.frames import PREVIOUS
         from torchrl_l2c2.objectives import ASAPLoss
 
         return ASAPLoss(
@@ -51,7 +52,7 @@ class ASAPConfig(GainConfig):
             self.lambda_temporal,
             self.lambda_grad,
             self.epsilon,
-            previous_key="previous_observation",
+            previous_key=PREVIOUS,
             mean=self.mean,
         )
 

@@ -31,13 +31,14 @@ class GradCAPSConfig(GainConfig):
     )
 
     def wrap(self, loss: LossModule) -> LossModule:
+        from torchrl_l2c2.experiment.frames import PREVIOUS
         from torchrl_l2c2.objectives import GradCAPSLoss
 
         return GradCAPSLoss(
             loss,
             self.lambda_temporal,
             self.epsilon,
-            previous_key="previous_observation",
+            previous_key=PREVIOUS,
             mean=self.mean,
         )
 

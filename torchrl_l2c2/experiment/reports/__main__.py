@@ -130,11 +130,7 @@ def _read(
             named = ", ".join(map(repr, chosen.records))
             raise ValueError(f"no record of a run in {named}; make them with --csv.")
         return records, [], []
-    found = find_runs(chosen.folders)
-    if not found.runs:
-        named = ", ".join(map(repr, chosen.folders))
-        nothing = f"no finished run (evaluation.json) below {named}; name a folder of train.py's."
-        raise FileNotFoundError(" ".join([nothing, *found.notes]))
+    found = find_runs(chosen.folders, required=True)
     if chosen.length:
         return _shortened(found, chosen.length)
     return [run.record for run in found.runs], found.runs, found.notes

@@ -7,7 +7,7 @@ from functools import partial
 from typing import NamedTuple
 
 from torchrl_l2c2.experiment.reports.comparison import Estimate, improvement, probability
-from torchrl_l2c2.experiment.reports.groups import Group, baseline_of, group_records
+from torchrl_l2c2.experiment.reports.groups import Group, baseline_of, by_task, group_records
 from torchrl_l2c2.experiment.reports.records import Record
 from torchrl_l2c2.experiment.reports.statistics import mean
 from torchrl_l2c2.experiment.reports.tables import Table, number, number_range
@@ -80,8 +80,8 @@ def field_table(records: Sequence[Record]) -> Table | None:
     if not groups:
         return None
     rows = []
-    for task, algorithm in dict.fromkeys((g.first.task, g.first.algorithm) for g in groups):
-        together = [g for g in groups if (g.first.task, g.first.algorithm) == (task, algorithm)]
+    for together in by_task(groups):
+        task, algorithm = together[0].first.task, together[0].first.algorithm
         rows += [_row(group, baseline_of(group, groups)) for group in together]
         rows += _others(task, algorithm, {g.first.method for g in together})
     columns = ["task", "algorithm", "method", "seeds", *MEASURES.values()]

@@ -30,14 +30,6 @@ def searched(groups: Sequence[Group]) -> list[list[Group]]:
     ]
 
 
-def by_task(groups: Sequence[Group]) -> list[list[Group]]:
-    """Groups of a task and an algorithm together: what a front is of."""
-    together: dict[tuple[str, str], list[Group]] = defaultdict(list)
-    for group in groups:
-        together[group.first.task, group.first.algorithm].append(group)
-    return list(together.values())
-
-
 def front_figure(groups: Sequence[Group]) -> str:
     """The figure that a front of these groups is of: what most of them have, or else the first."""
     return max(MEASURED, key=lambda figure: sum(_is_known(group, figure) for group in groups))

@@ -73,6 +73,14 @@ def group_records(records: Iterable[Record]) -> list[Group]:
     return [named for together in compared.values() for named in _named(together)]
 
 
+def by_task(groups: Iterable[Group]) -> list[list[Group]]:
+    """Groups of a task and an algorithm together, in the order in which they come."""
+    together: dict[tuple[str, str], list[Group]] = defaultdict(list)
+    for group in groups:
+        together[group.first.task, group.first.algorithm].append(group)
+    return list(together.values())
+
+
 def baseline_of(group: Group, groups: Iterable[Group]) -> Group | None:
     """The vanilla runs with the same other settings; ``None`` for themselves or without any.
 

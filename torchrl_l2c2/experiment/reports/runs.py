@@ -212,7 +212,7 @@ class Found:
     notes: list[str]
 
 
-def find_runs(folders: Iterable[str | Path]) -> Found:
+def find_runs(folders: Iterable[str | Path], *, required: bool = False) -> Found:
     """Reads every finished run below folders, and names what is not one.
 
     Of runs with the same settings and the same seed the one that finished last is taken.
@@ -220,12 +220,15 @@ def find_runs(folders: Iterable[str | Path]) -> Found:
     Args:
         folders (iterable of str or Path): searched to their depths.
 
+    Keyword Args:
+        required (bool): whether to refuse folders without a finished run. Default ``False``.
+
     Returns:
         Found: runs in the order of their tables, and notes on folders that are unfinished, never
         started, cannot be read, or repeat another.
 
     Raises:
-        FileNotFoundError: one of the folders is not there, or is none.
+        FileNotFoundError: one of the folders is not there, or is none; or nothing that is required.
     """
     searched = [Path(folder) for folder in folders]
     if absent := [str(folder) for folder in searched if not folder.is_dir()]:
@@ -249,6 +252,10 @@ def find_runs(folders: Iterable[str | Path]) -> Found:
         "the same settings and seed as a newer one, left out": repeated,
     }
     notes = [f"{len(names)} {what}: {', '.join(names)}" for what, names in named.items() if names]
+    if required and not newest:
+        below = ", ".join(repr(str(folder)) for folder in searched)
+        nothing = f"no finished run (evaluation.json) below {below}; name a folder of train.py's."
+        raise FileNotFoundError(" ".join([nothing, *notes]))
     return Found(sorted(newest, key=lambda run: run.record.place), notes)
 
 
@@ -258,13 +265,7 @@ def read_runs(folder: str | Path) -> list[FinishedRun]:
     Raises:
         FileNotFoundError: there is none.
     """
-    found = find_runs([folder])
-    if not found.runs:
-        raise FileNotFoundError(
-            f"no finished run (evaluation.json) below {str(folder)!r}; name a folder of "
-            f"train.py's. {'; '.join(found.notes)}".rstrip()
-        )
-    return found.runs
+    return find_runs([folder], required=True).runs
 
 
 def _places(folders: Iterable[Path]) -> dict[str, list[Path]]:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 
 from torchrl_l2c2.experiment.reports.groups import (
     Group,
+    by_task,
     common_settings,
     differing_lengths,
     differing_versions,
@@ -100,8 +101,8 @@ def _results(title: str, figures: Sequence[str], groups: Sequence[Group]) -> Tab
 def settings_notes(groups: Sequence[Group]) -> list[str]:
     """What the runs' settings are beyond the defaults, and which lengths and versions they have."""
     notes = []
-    for task, algorithm in dict.fromkeys((g.first.task, g.first.algorithm) for g in groups):
-        together = [g for g in groups if (g.first.task, g.first.algorithm) == (task, algorithm)]
+    for together in by_task(groups):
+        task, algorithm = together[0].first.task, together[0].first.algorithm
         shared = common_settings(together)
         if shared:
             which = f"{task}, {algorithm}, other than the defaults in every row"
