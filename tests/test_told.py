@@ -184,7 +184,7 @@ def test_an_experiment_compares_before_anything_is_compiled(monkeypatch):
     def another(self, generator):
         return NeighborTransform(Neighborhood(), generator=generator)
 
-    monkeypatch.setattr(L2C2Config, "transform", another)
+    monkeypatch.setattr(L2C2Config, "neighbors", another)
     (message,) = warned(lambda: make("td3", regularizer=L2C2Config(num_samples=2), compile=True))
     assert "num_samples 1 and 2" in message
 

@@ -220,8 +220,7 @@ class ExperimentConfig:
         # Another seed than the sampler's: with one number for a neighbor both draw as many at a
         # time, and where a transition lies would say which neighbor it gets.
         neighbors = torch.Generator(self.device).manual_seed(self.seed + NEIGHBOR_SEED)
-        transform = self.regularizer.transform(neighbors)
-        if transform is not None:
+        if (transform := self.regularizer.neighbors(neighbors)) is not None:
             buffer.append_transform(transform)
         return buffer
 

@@ -144,27 +144,30 @@ def _make(task: TaskConfig, render: bool) -> Env:
             return gymnasium.make(task.env_id, max_episode_steps=limit)
         try:
             env = gymnasium.make(task.env_id, max_episode_steps=limit, render_mode="rgb_array")
-        except TypeError:  # It knows of no render_mode at all.
-            env = None
-    if env is None or env.render_mode != "rgb_array":
-        raise ValueError(f"{task.env_id} draws no pictures: it has no render_mode 'rgb_array'.")
+            mode, cause = env.render_mode, None
+        except TypeError as error:  # It knows of no render_mode at all.
+            mode, cause = None, error
+    if mode != "rgb_array":
+        raise ValueError(
+            f"{task.env_id} draws no pictures: it has no render_mode 'rgb_array'."
+        ) from cause
     return env
 
 
 @contextlib.contextmanager
 def _explained(task: TaskConfig) -> Iterator[None]:
     try:
-        yield
-    except (gymnasium.error.Error, ImportError) as error:
+        with simulating(f"{task.env_id} could not begin"):
+            yield
+    except SimulatorError as error:
+        cause = error.__cause__
+        if not isinstance(cause, gymnasium.error.Error | ImportError):
+            raise
         raise ValueError(
-            f"task.env_id={task.env_id!r} is not a task that Gymnasium can make here ({error}). "
-            "Use task=swingup|reacher|hopper|ant, or task=gymnasium with a registered id; "
-            "`module:id` imports the module that registers it."
-        ) from error
-    except (Exception, SystemExit) as error:
-        raise SimulatorError(
-            f"{task.env_id} could not begin: {type(error).__name__}: {error}"
-        ) from error
+            f"task.env_id={task.env_id!r} is not a task that Gymnasium can make here ({cause}). "
+            "Use one of this package's (train.py --help names them), or task=gymnasium with a "
+            "registered id; `module:id` imports the module that registers it."
+        ) from cause
 
 
 @contextlib.contextmanager

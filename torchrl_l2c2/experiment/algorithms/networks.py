@@ -51,7 +51,7 @@ def check_actions(
             f"algorithm={algorithm} needs {'continuous' if continuous else 'discrete'} actions, "
             f"this task's are {type(env.action_spec).__name__} of shape "
             f"{tuple(env.action_spec.shape)}: use algorithm="
-            f"{'dqn' if continuous else 'ppo_rpe, sac, td3 or ppo'}."
+            f"{'dqn' if continuous else 'ppo_rpe'}, or another one that takes them."
         )
     if squashed and not _bounded(env.action_spec):
         raise ValueError(

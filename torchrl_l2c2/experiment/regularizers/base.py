@@ -12,8 +12,9 @@ from torchrl_l2c2.experiment.settings import SettingError, settings
 
 if TYPE_CHECKING:
     import torch
-    from torchrl.envs import Transform
     from torchrl.objectives import LossModule
+
+    from torchrl_l2c2.transforms import NeighborTransform
 
 # The gains that read a setting: with the others it would have no effect.
 READ_BY = {
@@ -26,7 +27,7 @@ READ_BY = {
 
 
 class RegularizerConfig:
-    """Makes a regularized loss and, where batches are to hold more for it, a transform.
+    """Makes a regularized loss and, where batches are to hold neighbors for it, what draws them.
 
     Attributes:
         reads_previous: whether its batches are to have the observation before each state.
@@ -51,8 +52,8 @@ class RegularizerConfig:
         except TypeError as error:
             raise SettingError("", f"regularizer={self.name}: {error}") from error
 
-    def transform(self, generator: torch.Generator) -> Transform | None:
-        """What the replay buffer's batches go through; ``None`` where the loss needs nothing."""
+    def neighbors(self, generator: torch.Generator) -> NeighborTransform | None:
+        """What draws the neighbors in the replay buffer's batches; ``None`` where none are read."""
         return None
 
 

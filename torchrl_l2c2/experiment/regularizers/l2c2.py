@@ -135,7 +135,7 @@ class L2C2Config(GainConfig):
             return loss
         return TchebycheffLoss(loss, self.tchebycheff_mu, (self.tchebycheff_ideal or 0.0, 0.0))
 
-    def transform(self, generator: torch.Generator) -> NeighborTransform:
+    def neighbors(self, generator: torch.Generator) -> NeighborTransform:
         from torchrl_l2c2.transforms import NeighborTransform
 
         return NeighborTransform(
