@@ -463,6 +463,23 @@ class TestGroups:
         late, _ = results_tables(group_records([run.record]))
         assert cells(late, "swingup", "ppo_rpe", "vanilla", "0")[:2] == ["-", "5.00"]
 
+    def test_late_policies_are_those_that_training_tested(self, tmp_path):
+        """In its last tenth by frames, which here holds 5 of 20 episodes; not an earlier end's."""
+        config = make_config(task="pendulum", algorithm=PPOConfig(), late_share=0.1)
+        config = replace(config, task=replace(config.task, frames=1000))
+        make_run(tmp_path / "a", config, 5.0, 0.1)
+        path = tmp_path / "a" / "metrics.csv"
+        lines = list(csv.DictReader(path.open()))
+        for number, line in enumerate(lines, 1):
+            line["frames"] = 60 * number if number <= 15 else 900 + 20 * (number - 15)
+            line["test_return"] = {9: 1e9}.get(number, number - 16 if number > 15 else "nan")
+        with open(path, "w", newline="") as file:
+            writer = csv.DictWriter(file, list(lines[0]))
+            writer.writeheader()
+            writer.writerows(lines)
+        (run,) = read_runs(tmp_path)
+        assert run.record.late_mean_return == 2.0
+
     def test_a_seed_that_comes_twice_is_told_and_not_pooled(self, tmp_path):
         """The newer one stands."""
         for name, total, time in (("new", 7.0, 2000), ("old", 900.0, 1000)):

@@ -28,14 +28,13 @@ from torchrl_l2c2.experiment.export import entry_names
 from torchrl_l2c2.experiment.frames import PREVIOUS
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.regularizers.base import GainConfig
+from torchrl_l2c2.experiment.reports.runs import LATE
 from torchrl_l2c2.experiment.saved import read_config
 from torchrl_l2c2.experiment.trained import load_policy
 from torchrl_l2c2.experiment.video import play_pictures
 from torchrl_l2c2.gains import gradient_shares
 from torchrl_l2c2.objectives.evaluation import Evaluation, is_ensemble
 from torchrl_l2c2.objectives.wiring import VALUE_NETWORKS
-
-LATE = 0.1  # of the training, whose mean shares are told
 
 
 def diagnose_run(

@@ -10,6 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.reports.differences import (
     BUDGETS,
     differences,
@@ -26,6 +27,8 @@ from torchrl_l2c2.experiment.saved import (
     read_json,
     read_rows,
 )
+
+LATE = 0.1  # of training, where no late policies were tested
 
 
 @dataclass(frozen=True)
@@ -165,10 +168,17 @@ class FinishedRun:
         return {f"last_{acting}_{k}": math.nan if v is None else v for k, v in found.items()}
 
     def _late(self) -> dict[str, float]:
-        """Of the last tenth of training, those policies that played a test episode."""
-        tested = [not math.isnan(value) for value in self.column("test_return")]
-        start = len(tested) - max(1, round(len(tested) * 0.1))
-        late = [row for row in range(start, len(tested)) if tested[row] or not any(tested[start:])]
+        """Of the late policies, which played test episodes; else of training's last tenth."""
+        config = ExperimentConfig.from_dict(self.config)
+        budget, tests = config.task.budget, self.column("test_return")
+        # A longer run has tests of the shorter one's end, too.
+        late = [
+            row
+            for row, frames in enumerate(self.column("frames"))
+            if budget.is_late(budget.spent(row + 1, int(frames)), config.late_share)
+            and not math.isnan(tests[row])
+        ]
+        late = late or list(range(len(tests)))[-max(1, round(len(tests) * LATE)) :]
 
         def average(name: str) -> float:
             values = self.column(name)
