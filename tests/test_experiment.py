@@ -35,7 +35,7 @@ from torchrl_l2c2.experiment import (
     UniformReplayConfig,
     make_env,
 )
-from torchrl_l2c2.experiment.environments import SimulatorError
+from torchrl_l2c2.experiment.errors import SimulatorError
 from torchrl_l2c2.experiment.evaluate import LateTests, evaluate_policy
 from torchrl_l2c2.experiment.frames import check_finite
 from torchrl_l2c2.experiment.regularizers import LCPConfig

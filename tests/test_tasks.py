@@ -24,7 +24,7 @@ from torchrl_l2c2.experiment import (
     make_env,
 )
 from torchrl_l2c2.experiment.command import run
-from torchrl_l2c2.experiment.environments import SimulatorError
+from torchrl_l2c2.experiment.errors import SimulatorError
 
 INF = float("inf")
 VECTOR = spaces.Box(-INF, INF, (2,), np.float32)

@@ -25,6 +25,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_l2c2.experiment.composition import CONF, read, register, tell_sweep, tell_tuned
 from torchrl_l2c2.experiment.config import ExperimentConfig, OtherRunError
+from torchrl_l2c2.experiment.errors import EXPECTED, show_cause
 from torchrl_l2c2.experiment.progress import log
 from torchrl_l2c2.experiment.settings import SettingError
 from torchrl_l2c2.experiment.signals import (
@@ -38,8 +39,6 @@ from torchrl_l2c2.experiment.sweep import Sweep, begin_sweep, list_jobs
 if TYPE_CHECKING:
     from torchrl_l2c2.experiment.reports import FinishedRun
 
-# What tells by itself what was wrong; anything else is a fault of the program.
-EXPECTED = (ValueError, OSError, RuntimeError, FloatingPointError, ImportError)
 # How long a file server may hold the lock of a machine that was lost.
 LOST_SECONDS = 180.0
 # Of conf/hydra/launcher/: the plugin, and the extra that brings it.
@@ -163,8 +162,7 @@ def _standing(sweep: Sweep) -> str:
 
 def _tell(error: Exception) -> str:
     """Says what went wrong: of a user's own environment with where it did."""
-    if error.__cause__ is not None and type(error).__name__ == "SimulatorError":
-        traceback.print_exception(error.__cause__)
+    show_cause(error)
     told = f"{str(error) or type(error).__name__} {HINTS.get(type(error), '')}".strip()
     print(f"error: {told}", file=sys.stderr)
     return told

@@ -14,7 +14,7 @@ from torchrl_l2c2.experiment.config import (
     ExperimentConfig,
     OtherRunError,
 )
-from torchrl_l2c2.experiment.environments import SimulatorError
+from torchrl_l2c2.experiment.errors import SimulatorError
 from torchrl_l2c2.experiment.saved import differing
 from torchrl_l2c2.experiment.tasks import Budget, TaskConfig
 from torchrl_l2c2.experiment.versions import versions

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from torchrl_l2c2.experiment.diagnosis import (
     write_page,
 )
 from torchrl_l2c2.experiment.environments import TEST_SEED
+from torchrl_l2c2.experiment.errors import told_in_a_line
 from torchrl_l2c2.experiment.files import make_folder_of, write_atomically
 from torchrl_l2c2.experiment.reports.paper import method_name
 
@@ -32,7 +32,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
         parser.error(f"--names: each run needs one of its own, got {chosen.names}")
     if chosen.actions and not chosen.actions.endswith(".svg"):
         parser.error(f"--actions must be an SVG file, named FILE.svg, got {chosen.actions}")
-    try:
+    with told_in_a_line():
         # Before anything is played that could be lost.
         for given in filter(None, (chosen.output, chosen.actions)):
             make_folder_of(given)
@@ -53,8 +53,6 @@ def main(arguments: Iterable[str] | None = None) -> None:
         write_page(path, diagnoses)
         if chosen.actions:
             write_atomically(chosen.actions, draw_together(diagnoses))
-    except (ValueError, OSError, RuntimeError, ArithmeticError, ImportError) as error:
-        sys.exit(f"error: {error}")
     compared = "\n".join(comparison(diagnoses))
     parts = [*map(_told, diagnoses), *([compared] if compared else []), f"page: {path}"]
     print("\n\n".join(parts))

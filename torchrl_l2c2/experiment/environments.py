@@ -16,6 +16,7 @@ from gymnasium.wrappers import RenderCollection
 from torchrl.envs import EnvBase, GymWrapper, TransformedEnv
 
 from torchrl_l2c2.experiment.compilation import CompilerError
+from torchrl_l2c2.experiment.errors import SimulatorError
 from torchrl_l2c2.experiment.spaces import (
     Env,
     observing_image,
@@ -29,10 +30,6 @@ if TYPE_CHECKING:
 
 # Added to the seed of test episodes, so that they are not training episodes again.
 TEST_SEED = 1_000_003
-
-
-class SimulatorError(RuntimeError):
-    """The environment or the policy in it raised an error; the cause is chained."""
 
 
 @contextlib.contextmanager

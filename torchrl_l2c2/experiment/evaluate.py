@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import math
 import statistics
-import sys
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -22,6 +21,7 @@ from tqdm import tqdm
 
 from torchrl_l2c2.experiment.collection import EpisodeCollector, play_episodes
 from torchrl_l2c2.experiment.environments import TEST_SEED, make_env, simulating
+from torchrl_l2c2.experiment.errors import told_in_a_line
 from torchrl_l2c2.experiment.files import make_folder_of, to_json, write_json
 from torchrl_l2c2.experiment.frames import check_finite
 from torchrl_l2c2.experiment.process import ProcessState
@@ -285,7 +285,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
     chosen = parser.parse_args(arguments)
     if chosen.record and chosen.sampled:
         parser.error("--record shows mean actions; leave it or --sampled out")
-    try:
+    with told_in_a_line():
         # Before anything is played that could be lost.
         if chosen.record:
             check_video(chosen.record)
@@ -317,8 +317,6 @@ def main(arguments: Iterable[str] | None = None) -> None:
         if chosen.output:
             played = {"arguments": vars(chosen), "summary": result.summary()}
             write_json(chosen.output, {**played, "episodes": asdict(result)})
-    except (ValueError, OSError, RuntimeError, ArithmeticError, ImportError) as error:
-        sys.exit(f"error: {error}")
 
 
 if __name__ == "__main__":

@@ -32,6 +32,7 @@ from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 from torchrl_l2c2.experiment.algorithms.networks import action_bounds
 from torchrl_l2c2.experiment.collection import play_episodes
 from torchrl_l2c2.experiment.environments import control_rate
+from torchrl_l2c2.experiment.errors import told_in_a_line
 from torchrl_l2c2.experiment.files import make_folder, write_atomically, write_json
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.saved import read_config, read_evaluation
@@ -312,12 +313,10 @@ def main(arguments: Iterable[str] | None = None) -> None:
     chosen = parser.parse_args(None if arguments is None else list(arguments))
     if chosen.episodes < 1:
         parser.error(f"--episodes must be at least 1, got {chosen.episodes}")
-    try:
+    with told_in_a_line():
         exported = export_policy(
             chosen.folder, chosen.output, best=chosen.best, episodes=chosen.episodes
         )
-    except (ValueError, OSError, RuntimeError, ArithmeticError, ImportError) as error:
-        sys.exit(f"error: {error}")
     print(json.dumps(exported.contract, indent=2))
     print(f"policy.onnx, policy.pt2 and contract.json: {exported.folder}", file=sys.stderr)
 

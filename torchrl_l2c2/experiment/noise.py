@@ -7,7 +7,6 @@ runs below folders, and writes a table and pictures.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -21,6 +20,7 @@ from tqdm import tqdm
 
 from torchrl_l2c2.experiment.collection import play_episodes
 from torchrl_l2c2.experiment.environments import TEST_SEED
+from torchrl_l2c2.experiment.errors import told_in_a_line
 from torchrl_l2c2.experiment.evaluate import evaluate_policy
 from torchrl_l2c2.experiment.files import make_folder, write_atomically, write_json
 from torchrl_l2c2.experiment.frames import check_finite
@@ -266,12 +266,10 @@ def main(arguments: Iterable[str] | None = None) -> None:
     add("--episodes", type=int, default=10, help="of each run at each level (default: 10)")
     add("--output", metavar="FOLDER", help="of the files (default: noise/ in the first folder)")
     chosen = parser.parse_args(None if arguments is None else list(arguments))
-    try:
+    with told_in_a_line():
         found = find_runs(chosen.folders, required=True)
         played = play_with_noise(found.runs, chosen.levels, episodes=chosen.episodes, progress=True)
         written = write_noise(chosen.output or Path(chosen.folders[0]) / "noise", played)
-    except (ValueError, OSError, RuntimeError, ArithmeticError, ImportError) as error:
-        sys.exit(f"error: {error}")
     paths = [f"written: {path}" for path in written]
     print("\n\n".join([noise_table(played).markdown(), *found.notes, "\n".join(paths)]))
 

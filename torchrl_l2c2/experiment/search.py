@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from filelock import FileLock
 
+from torchrl_l2c2.experiment.errors import told_in_a_line
 from torchrl_l2c2.experiment.files import make_folder
 from torchrl_l2c2.experiment.lock import FolderInUseError, lock_folder
 from torchrl_l2c2.experiment.reports import find_runs, write_report
@@ -207,7 +208,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
         parser.error(f"--trials must be at least 1, got {chosen.trials}")
     if chosen.sampler_seed < 0:
         parser.error(f"--sampler-seed must be at least 0, got {chosen.sampler_seed}")
-    try:
+    with told_in_a_line():
         search = Search(Path(chosen.output), chosen.settings, seed=chosen.sampler_seed)
         os.environ[MARK] = mark = uuid.uuid4().hex
         start_guard(mark)
@@ -223,8 +224,6 @@ def main(arguments: Iterable[str] | None = None) -> None:
                 scores = (f"{name} {score:.4g}" for name, score in search.tell(number).items())
                 print(f"trial {number + 1}: {', '.join(scores)}", flush=True)
         _report(search.folder)
-    except (ValueError, OSError, RuntimeError, ArithmeticError, ImportError) as error:
-        sys.exit(f"error: {error}")
 
 
 def _parser() -> argparse.ArgumentParser:

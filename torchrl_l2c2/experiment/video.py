@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
-import sys
 from collections.abc import Iterable, Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,6 +18,7 @@ from tensordict import TensorDictBase
 
 from torchrl_l2c2.experiment.collection import play_episodes
 from torchrl_l2c2.experiment.environments import control_rate, make_env
+from torchrl_l2c2.experiment.errors import told_in_a_line
 from torchrl_l2c2.experiment.files import make_folder_of
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.tasks import TaskConfig
@@ -188,7 +188,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
     parser.add_argument("--noise", type=float, help="on observations (default: the task's)")
     parser.add_argument("--best", action="store_true", help="policy_best.pt instead of policy.pt")
     chosen = parser.parse_args(None if arguments is None else list(arguments))
-    try:
+    with told_in_a_line():
         path = record_video(
             chosen.folder,
             chosen.output,
@@ -197,8 +197,6 @@ def main(arguments: Iterable[str] | None = None) -> None:
             noise_scale=chosen.noise,
             best=chosen.best,
         )
-    except (ValueError, OSError, RuntimeError, ArithmeticError, ImportError) as error:
-        sys.exit(f"error: {error}")
     print(path)
 
 

@@ -1,0 +1,36 @@
+"""Errors that say by themselves what was wrong, and how a command ends with one."""
+
+from __future__ import annotations
+
+import sys
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+class SimulatorError(RuntimeError):
+    """The environment or the policy in it raised an error; the cause is chained."""
+
+
+# Anything else is a fault of the program.
+EXPECTED = (ValueError, OSError, RuntimeError, FloatingPointError, OverflowError, ImportError)
+
+
+def show_cause(error: Exception) -> None:
+    """Prints where a user's own environment failed; of other errors nothing."""
+    if isinstance(error, SimulatorError) and error.__cause__ is not None:
+        traceback.print_exception(error.__cause__)
+
+
+@contextmanager
+def told_in_a_line() -> Iterator[None]:
+    """Ends a command with one line where what went wrong says so by itself.
+
+    Raises:
+        SystemExit: with that line.
+    """
+    try:
+        yield
+    except EXPECTED as error:
+        show_cause(error)
+        sys.exit(f"error: {error}")
