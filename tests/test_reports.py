@@ -1134,9 +1134,10 @@ def test_the_fields_pages_are_those_of_their_records(name):
     assert f"records {digest(shown)}<" in page.with_suffix(".svg").read_text()
 
 
-def test_the_rivals_gains_are_those_of_their_records():
-    """python -m torchrl_l2c2.experiment.reports --from results/field_gains.csv"""
-    records = read_records(ROOT / "results" / "field_gains.csv")
+@pytest.mark.parametrize("name", ["field_gains", "one_gain"])
+def test_tables_of_gains_are_those_of_their_records(name):
+    """The rivals', and those of one gain for three tasks."""
+    records = read_records(ROOT / "results" / f"{name}.csv")
     assert choice_table(records).markdown() in (ROOT / "results" / "field_gains.md").read_text()
 
 
