@@ -14,6 +14,7 @@ from tests.test_sweep import alive, episodes, numbers, runs, said, start, wait_u
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig, TaskConfig
 from torchrl_l2c2.experiment.checkpoints import list_checkpoints
 from torchrl_l2c2.experiment.reports import read_runs, sweep_summary
+from torchrl_l2c2.experiment.settings import SettingError
 
 SWEEP = ("-m", "seed=0,1,2,3", "task.episodes=40", "compile=false", "checkpoint_interval=0")
 
@@ -134,6 +135,14 @@ def ray_here(monkeypatch):
     memory = {"object_store_memory": 100_000_000}
     yield ray.init("local", num_cpus=2, include_dashboard=False, log_to_driver=False, **memory)
     ray.shutdown()
+
+
+def test_without_ray_its_extra_is_named(monkeypatch):
+    """Before anything is played."""
+    monkeypatch.setattr("torchrl_l2c2.experiment.workers.find_spec", lambda name: None)
+    config = ExperimentConfig(num_workers=2, workers="ray", compile=False)
+    with pytest.raises(SettingError, match=r"workers must be processes .*'torchrl-l2c2\[ray\]'"):
+        Experiment(config)
 
 
 @needs("ray")

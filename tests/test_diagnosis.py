@@ -315,7 +315,9 @@ class TestMeasured:
         assert found.worst(2) == [30, 70] and 90 not in found.worst(5)
 
     def test_what_cannot_be_diagnosed_is_refused(self):
-        """A batch of environments, two observations, an episode that is hardly one."""
+        """An id, a batch of environments, two observations, an episode that is hardly one."""
+        with pytest.raises(TypeError, match="environment of TorchRL, got 'Walk-v0': .*GymEnv"):
+            diagnose(linear(1.0), "Walk-v0")
         with pytest.raises(ValueError, match="got a batch of \\(2,\\)"):
             diagnose(linear(1.0), SerialEnv(2, lambda: GymWrapper(Walk())))
         two = TensorDictModule(lambda a, b: a, ["observation", "other"], ["action"])
@@ -323,7 +325,7 @@ class TestMeasured:
             diagnose(two, GymWrapper(Walk()))
         with pytest.raises(ValueError, match="3 steps is too short"):
             diagnose(linear(1.0), GymWrapper(Walk()), max_steps=3)
-        with pytest.raises(FloatingPointError, match="action is not finite at frame 0 of a test"):
+        with pytest.raises(FloatingPointError, match="action is not finite at frame 1 of a test"):
             diagnose(linear(float("nan")), GymWrapper(Walk()))
 
     def test_discrete_actions_are_measured_too(self):
@@ -464,7 +466,9 @@ class TestPage:
 
     def test_it_has_no_reference_to_anything_outside(self, tmp_path):
         """No address, no script, no source but what is inside it."""
-        text = write_page(tmp_path / "page.html", [made_up(name="a <b>")]).read_text()
+        one = made_up(name="a <b>")
+        text = write_page(tmp_path / "page.html", [one]).read_text()
+        assert write_page(tmp_path / "one.html", one).read_text() == text
         assert "://" not in text and "<script" not in text and "url(" not in text
         assert "<link" not in text and "@import" not in text and "href" not in text
         sources = re.findall(r"src=.(.{11})", text)

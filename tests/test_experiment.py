@@ -249,7 +249,7 @@ def test_nan_from_the_environment_stops_the_run_with_key_and_frame():
     env = make_env(PENDULUM, seed=0)
     batch = env.rollout(10, make_actor(3, env.action_spec))
     batch["next", "reward"][4] = float("nan")
-    with pytest.raises(FloatingPointError, match=r"'next', 'reward'.*frame 104"):
+    with pytest.raises(FloatingPointError, match=r"'next', 'reward'.*frame 105"):
         check_finite(batch.detach(), first_frame=100)
 
 
@@ -302,7 +302,7 @@ def broken_after(experiment, frames, outcome):
 @pytest.mark.parametrize(
     ("outcome", "error", "message"),
     [
-        (float("nan"), FloatingPointError, r"'reward'\) is not finite at frame 59: \[nan\]"),
+        (float("nan"), FloatingPointError, r"'reward'\) is not finite at frame 60: \[nan\]"),
         (
             RuntimeError("physics gone"),
             SimulatorError,
@@ -438,6 +438,8 @@ def test_every_algorithm_learns_from_its_batches(name, regularizer):
     expected = {f"loss_l2c2_{values}"} | (set() if discrete else {"loss_l2c2_actor"})
     assert added == (expected if regularizer.name == "l2c2" else set())
     assert len(experiment.test().returns) == 2
+    with pytest.raises(ValueError, match="episodes must be at least 1, got 0"):
+        experiment.test(0)
 
 
 @pytest.mark.parametrize("regularizer", [NoRegularizerConfig(), L2C2Config()])

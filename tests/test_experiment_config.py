@@ -298,6 +298,14 @@ def test_settings_survive_a_round_trip():
         ({"compile": 1}, "compile must be a valid boolean, got 1"),
         ({"test_episodes": True}, "test_episodes must be a valid integer, got True"),
         ({"sed": 1}, "sed is not a setting; here there are algorithm"),
+        (
+            {"regularizer": {"name": "l2c2", "lambda_min": 2.0}},
+            r"regularizer\.lambda_max must be above lambda_min .*, here above 2, got 1: raise it",
+        ),
+        (
+            {"regularizer": {"name": "l2c2", "sigma": 4.0, "lambda_min": 0.5}},
+            r"regularizer\.lambda_max must be above .* sigma \* lambda_min, here above 2, got 1",
+        ),
     ],
 )
 def test_wrong_settings_are_refused_with_what_is_allowed(settings, message):

@@ -467,6 +467,15 @@ class TestWhichStatesAreMoved:
         mean = loss.policy_regularizer(batch)["l2c2_distance"].item() - NEAR.epsilon
         assert mean == pytest.approx(0.5, abs=0.05)
 
+    def test_neighbors_of_other_keys_are_refused(self):
+        """A transform that moves more, or less, than was chosen is no oversight to pass over."""
+        loss, batch = self.two_part_loss(moved_keys=["position"])
+        other = NeighborTransform(NEAR, ["position", "velocity"])(batch.clone())
+        with pytest.raises(ValueError, match=r"of \['.*', '.*'\].*\['position'\]: give"):
+            loss.policy_regularizer(other)
+        fitting = NeighborTransform(NEAR, ["position"])(batch)
+        assert loss.policy_regularizer(fitting)["loss_l2c2_actor"] > 0
+
     def test_a_key_that_the_batch_lacks_is_named(self):
         """With what there is."""
         loss, batch = self.two_part_loss(moved_keys=["velocity"])
@@ -745,6 +754,15 @@ class TestPolicyDistances:
         expected = loss.policy_regularizer(batch)["loss_l2c2_actor"]
         compiled = torch.compile(loss.policy_regularizer, fullgraph=True, backend="eager")
         torch.testing.assert_close(compiled(batch)["loss_l2c2_actor"], expected)
+
+    @pytest.mark.parametrize("fraction", [1.0, 0.5])
+    def test_with_its_own_neighbors_it_compiles_for_batches_of_any_size(self, fraction):
+        """With a dynamic size from the second one on."""
+        base = SACLoss(gaussian_actor(), qvalue(), action_spec=BOUNDS)
+        loss = L2C2Loss(base, NEAR, policy_distance="mean", fraction=fraction)
+        compiled = torch.compile(loss.policy_regularizer, fullgraph=True, backend="eager")
+        for size in (4, 8, 12):
+            assert compiled(transitions(size))["loss_l2c2_actor"].isfinite()
 
 
 class TestConstruction:

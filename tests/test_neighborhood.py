@@ -182,13 +182,16 @@ def test_wrong_arguments_of_sample(state, next_state, arguments, error, message)
         Neighborhood().sample(state, next_state, **arguments)
 
 
-def test_sample_compiles_without_a_break():
-    """Sampling traces into one graph and keeps its meaning there."""
+@pytest.mark.parametrize("dynamic", [None, True])
+def test_sample_compiles_without_a_break(dynamic):
+    """Sampling traces into one graph and keeps its meaning there, for batches of any size."""
     near = Neighborhood(2.0, 0.1, 1.0)
-    sample = torch.compile(near.sample, fullgraph=True, backend="aot_eager")
-    state = torch.zeros(16, 3)
-    neighbor, distance = sample(state, state + 1.0, 2)
-    torch.testing.assert_close(distance, neighbor.abs().amax(-1) + near.epsilon)
+    sample = torch.compile(near.sample, fullgraph=True, backend="aot_eager", dynamic=dynamic)
+    for size in (16, 8, 12):
+        state = torch.zeros(size, 3)
+        neighbor, distance = sample(state, state + 1.0, 2)
+        assert neighbor.shape == (size, 2, 3)
+        torch.testing.assert_close(distance, neighbor.abs().amax(-1) + near.epsilon)
 
 
 @pytest.mark.parametrize("batch_dims", [0, 1, 2])

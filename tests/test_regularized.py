@@ -594,6 +594,21 @@ class TestNetworks:
         drawn = loss.policy_regularizer(batch.exclude("neighbor"))
         assert drawn["loss_l2c2_actor"] > 0
 
+    @pytest.mark.parametrize("regularizer", [L2C2Loss, CAPSLoss, CATSLoss])
+    @pytest.mark.parametrize(
+        ("successor", "error", "message"),
+        [
+            (torch.zeros(6, OBSERVATION, dtype=torch.int64), TypeError, r"point.*got torch\.int64"),
+            (torch.zeros(6, 1), ValueError, rf"'observation', \(6, {OBSERVATION}\), got \(6, 1\)"),
+        ],
+    )
+    def test_a_successor_is_of_its_states_kind(self, regularizer, successor, error, message):
+        """By whichever regularizer, with its key, instead of a broadcast or torch's own error."""
+        loss, batch = regularizer(DDPGLoss(deterministic_actor(), qvalue())), transitions(6)
+        batch["next", "observation"] = successor
+        with pytest.raises(error, match=rf"\('next', 'observation'\) must .*{message}"):
+            loss.policy_regularizer(batch)
+
     def test_inputs_that_the_policy_overwrites_are_states(self):
         """A policy may write its normalized observation where it was."""
         torch.manual_seed(0)

@@ -29,7 +29,12 @@ from torchrl_l2c2.experiment import (
     TaskConfig,
     UniformReplayConfig,
 )
-from torchrl_l2c2.experiment.checkpoints import list_checkpoints, load_checkpoint, save_checkpoint
+from torchrl_l2c2.experiment.checkpoints import (
+    CheckpointError,
+    list_checkpoints,
+    load_checkpoint,
+    save_checkpoint,
+)
 from torchrl_l2c2.experiment.config import GROUPS, OtherRunError
 from torchrl_l2c2.experiment.continuation import check_same_settings
 from torchrl_l2c2.experiment.files import write_json
@@ -289,6 +294,16 @@ def of_other_versions(folder, **changed):
     state = load_checkpoint(newest)
     state["versions"] = json.dumps(json.loads(state["versions"]) | changed)
     save_checkpoint(folder, int(newest.stem.split("_")[1]), state, keep=1)
+
+
+@pytest.mark.parametrize("what", ["other settings", "nothing"])
+def test_what_is_refused_from_elsewhere_leaves_no_folder(tmp_path, what):
+    """Neither that of the run, nor a lock in it."""
+    if what == "other settings":
+        Experiment(small(), tmp_path / "a").train(1)
+    with pytest.raises(OtherRunError if what == "other settings" else CheckpointError):
+        Experiment(small(seed=7), tmp_path / "b" / "c", resume=tmp_path / "a")
+    assert not (tmp_path / "b").exists()
 
 
 def test_other_versions_are_refused_unless_they_are_allowed(tmp_path):

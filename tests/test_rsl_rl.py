@@ -334,6 +334,13 @@ def test_groups_with_names_that_batches_need_are_refused(
         make(rsl.L2C2PPO, regularizer_cfg={"neighbor_key": ("nearby", "state")})
 
 
+@pytest.mark.parametrize("algorithm", [rsl.L2C2PPO, rsl.CATSPPO])
+def test_an_option_that_there_is_not_is_named_with_those_that_there_are(algorithm: Any) -> None:
+    """Not by an error of a class that the user has not named."""
+    with pytest.raises(TypeError, match=r"regularizer_cfg has \['gane'\]; .*'ramp_updates'"):
+        make(algorithm, regularizer_cfg={"gane": 1.0})
+
+
 def mirror(env: Any, obs: TensorDict | None, actions: Tensor | None) -> tuple[Any, Any]:
     """Left for right, as rsl_rl's extension asks for it."""
     both_obs = None if obs is None else torch.cat((obs, obs.apply(torch.neg)))

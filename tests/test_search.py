@@ -135,7 +135,7 @@ def test_a_trial_without_late_tests_is_scored_by_its_last_policies(tmp_path):
         pytest.approx(values) for values in ([24.0, 0.062], [32.0, 0.07])
     ]
     (tmp_path / "trial_0002").mkdir()
-    with pytest.raises(RuntimeError, match=r"trial 3 has no results; .* test_episodes of"):
+    with pytest.raises(RuntimeError, match=r"trial_0002 has no results; .* test_episodes of"):
         search.tell(2)
 
 
@@ -225,7 +225,7 @@ def test_a_stopped_search_ends_with_a_front(tmp_path):
     assert process.wait(60) == 128 + signal.SIGTERM, (tmp_path / "said").read_text()
     assert start(tmp_path).wait(500) == 0, (tmp_path / "said").read_text()
     said = (tmp_path / "said").read_text()
-    assert said.count("trial 2 of 4: ") == 2 and "continuing after episode" in said
+    assert said.count("trial_0001, 2 of 4: ") == 2 and "continuing after episode" in said
     study = Search(tmp_path / "search", [*SHORT, *GAINS]).study
     assert [trial.state.name for trial in study.trials] == ["COMPLETE"] * 4
     assert "Pareto front" in (tmp_path / "search" / "report" / "report.html").read_text()

@@ -201,6 +201,9 @@ class Neighborhood:
         _check_states(state, state, batch_dims)
         features = () if self.shared else state.shape[batch_dims:]
         shape = (*state.shape[:batch_dims], num_samples, *features)
+        # The argument generator=None would not compile where the batch size is dynamic.
+        if generator is None:
+            return torch.rand(shape, dtype=state.dtype, device=state.device)
         return torch.rand(shape, generator=generator, dtype=state.dtype, device=state.device)
 
     def place(

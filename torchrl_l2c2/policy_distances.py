@@ -228,8 +228,8 @@ def mean_squared_error(p: Distribution | Tensor, q: Distribution | Tensor) -> Te
         d(p, q) = \frac 1 A \lVert \mu_p - \mu_q \rVert_2^2
 
     over :math:`A` dimensions of the action: :func:`mean_distance` times :math:`2 / A`, so that a
-    gain that fits one robot does not grow stronger with the joints of the next. Its gradient
-    flows into both policies.
+    gain that fits one robot does not grow stronger with the joints of the next. Of a choice among
+    discrete actions, :math:`A` is their number. Its gradient flows into both policies.
 
     Args:
         p: one policy, batch shape ``[*B]``, or its actions, ``[*B, A]``.

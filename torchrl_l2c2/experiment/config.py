@@ -63,7 +63,7 @@ STEERING = {"outputs", "experiment", "preset", "resume", "allow_other_versions"}
 class ExperimentConfig:
     """Everything one run depends on; the defaults are those of ``python train.py``.
 
-    Left at ``None``, ``replay`` and ``optimizer`` are the algorithm's usual ones, and
+    Left out, ``replay`` and ``optimizer`` are the algorithm's usual ones, and
     ``regularizer`` is L2C2 with what was found for the algorithm, or else the paper's; an
     ``L2C2Config()`` that is given begins from the paper's with any.
 

@@ -92,27 +92,44 @@ def tell_past(saved: Mapping[str, Any], now: Mapping[str, Any]) -> None:
 
 
 def find_checkpoint(
-    folder: Path | None, elsewhere: str | Path | None
+    folder: str | Path, config: ExperimentConfig, *, allow_other_versions: bool
 ) -> tuple[Path, dict[str, Any]] | None:
-    """The checkpoint that a run in a folder goes on from, with its path.
-
-    The folder's own comes first: the same command again continues what it began.
+    """The newest checkpoint in a folder that is whole, with its path, if it can be gone on from.
 
     Raises:
-        CheckpointError: there are checkpoints, but none can be read; none is where it was to be.
+        CheckpointError: there are checkpoints, but none can be read.
+        OtherRunError: as :func:`check_continuable`.
+
+    Warns:
+        UserWarning: a newer one is damaged; and as :func:`check_continuable`.
     """
-    found = None if folder is None else load_newest(folder)
-    if found is None and elsewhere is not None:
-        found = load_newest(elsewhere)
-        if found is None:
-            hint = " Name its folder." if Path(elsewhere).is_file() else ""
-            raise CheckpointError(f"resume={str(elsewhere)!r} holds no checkpoint_*.pt.{hint}")
-    if found is None:
+    if (found := load_newest(folder)) is None:
         return None
     path, state, damaged = found
     for message in damaged:
-        warnings.warn(f"{message} The one before it is used.", stacklevel=5)
+        warnings.warn(f"{message} The one before it is used.", stacklevel=4)
+    check_continuable(state, config, allow_other_versions=allow_other_versions)
     return path, state
+
+
+def find_elsewhere(
+    folder: str | Path | None, own: Path | None, config: ExperimentConfig, **options: bool
+) -> tuple[Path, dict[str, Any]] | None:
+    """The checkpoint in another folder that a run begins from, unless it has one of its own.
+
+    The same command again continues what it began. The run's own folder need not exist yet, and
+    does not after a refusal.
+
+    Raises:
+        CheckpointError: none is where it was to be; and as :func:`find_checkpoint`.
+        OtherRunError: as :func:`find_checkpoint`, which has the same options.
+    """
+    if folder is None or (own is not None and list_checkpoints(own)):
+        return None
+    if (found := find_checkpoint(folder, config, **options)) is None:
+        hint = " Name its folder." if Path(folder).is_file() else ""
+        raise CheckpointError(f"resume={str(folder)!r} holds no checkpoint_*.pt.{hint}")
+    return found
 
 
 def check_continuable(

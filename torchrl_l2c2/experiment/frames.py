@@ -130,7 +130,7 @@ def check_finite(
     if found:
         step, key = min(found, key=lambda each: each[0])
         giver = "policy" if key == action else "environment"
-        frame = f"frame {first_frame + step}{' of a test' if test else ''}"
+        frame = f"frame {first_frame + step + 1}{' of a test' if test else ''}"
         left = "" if test else "; nothing is learned from this episode"
         raise FloatingPointError(
             f"{key} is not finite at {frame}: {batch[key][step].flatten().tolist()}. "

@@ -57,28 +57,31 @@ class GainControl:
             learner.at_full_gain = self._at_full_gain
             self._apply()
 
-    def after(self, row: Mapping[str, float]) -> dict[str, float]:
+    def after(self, row: Mapping[str, float], *, ends_round: bool = True) -> dict[str, float]:
         """Sets the gains for what follows an episode; gives what they were and were set from.
 
         Without an update since the last time nothing is set, and no gradient measured. Where one
-        is, a measure is the mean over the episodes since then.
+        is, a measure is the mean over the episodes since then: with rollouts, those of the last.
 
         Args:
             row (Mapping): what is logged of the episode.
+            ends_round (bool): whether it is the last that was played with the same policy; the
+                gains stay as they are till then. Default ``True``.
 
         Returns:
             dict: the gains that were applied, what was measured, and the target; empty where the
             gain is constant.
         """
         logged = {}
-        measured = self._measure(row)
+        due = ends_round and self._learner.updates > self._updates
+        measured = self._measure(row, due)
         for name, gain in self.gains.items():
             suffix = "" if name == "all" else f"_{name}"
             logged[f"gain{suffix}"] = gain.value
             logged[f"gain_measured{suffix}"] = measured[name]
         if self.gains and self._config is not None:
             logged |= self._config.targets
-        if self.gains and self._learner.updates > self._updates:
+        if self.gains and due:
             self._updates, self._seen = self._learner.updates, []
             for name, gain in self.gains.items():
                 gain.step(measured[name])
@@ -121,7 +124,7 @@ class GainControl:
         terms = {"policy": sorted(of_policy), "value": sorted(of_value)}
         return {name: keys for name, keys in terms.items() if keys}
 
-    def _measure(self, row: Mapping[str, float]) -> dict[str, float]:
+    def _measure(self, row: Mapping[str, float], due: bool) -> dict[str, float]:
         if self._config is None or not self.gains:
             return {}
         if self._config.gain == "ramp":
@@ -131,7 +134,7 @@ class GainControl:
             self._seen.append(row[self._config.gain_of])
             numbers = [measured for measured in self._seen if math.isfinite(measured)]
             return {"all": fmean(numbers) if numbers else self._seen[-1]}
-        if self._learner.updates == self._updates:
+        if not due:
             return dict.fromkeys(self.gains, float("nan"))
         shares = gradient_shares(self._learner.agent.loss, self._learner.example())
         # What the loss's own terms do not train, as a predictor beside the policy, has no share.

@@ -260,7 +260,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
         "--levels",
         type=_levels,
         default=list(LEVELS),
-        help="of noise, in standard deviations of each feature (default: "
+        help="of uniform noise: the farthest, in standard deviations of each feature (default: "
         f"{','.join(f'{level:g}' for level in LEVELS)})",
     )
     add("--episodes", type=int, default=10, help="of each run at each level (default: 10)")

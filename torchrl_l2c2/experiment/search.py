@@ -125,7 +125,7 @@ class Search:
         """
         records = [run.record for run in find_runs([self._of(number)]).runs]
         if not records:
-            raise RuntimeError(f"trial {number + 1} has no results; {UNTESTED}.")
+            raise RuntimeError(f"{self.name(number)} has no results; {UNTESTED}.")
         figure = front_figure(group_records(records))
         scores = {q: [record.figure(figure, q) for record in records] for q in SIGNS}
         values = {quantity: statistics.fmean(each) for quantity, each in scores.items()}
@@ -180,8 +180,13 @@ class Search:
         yield True
         give_back()
 
+    @staticmethod
+    def name(number: int) -> str:
+        """What a trial's folder is called, from its number from 0 on."""
+        return f"trial_{number:04d}"
+
     def _of(self, number: int) -> Path:
-        return self.folder / f"trial_{number:04d}"
+        return self.folder / self.name(number)
 
 
 def run_sweep(command: Sequence[str]) -> int:
@@ -214,7 +219,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
         start_guard(mark)
         for number, values in search.trials(chosen.trials):
             told = ", ".join(f"{name}={short(value)}" for name, value in values.items())
-            print(f"trial {number + 1} of {chosen.trials}: {told}", flush=True)
+            print(f"{search.name(number)}, {number + 1} of {chosen.trials}: {told}", flush=True)
             status = run_sweep(search.command(number, values))
             if status == 1:
                 search.tell_failure(number)
@@ -222,7 +227,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
                 sys.exit(status if status > 0 else 128 - status)
             else:
                 scores = (f"{name} {score:.4g}" for name, score in search.tell(number).items())
-                print(f"trial {number + 1}: {', '.join(scores)}", flush=True)
+                print(f"{search.name(number)}: {', '.join(scores)}", flush=True)
         _report(search.folder)
 
 

@@ -72,7 +72,7 @@ class TaskConfig:
         default=None,
         ge=1,
         description="to train for instead of episodes, such as 1e6: training ends with the first "
-        "episode that reaches them",
+        "episode that reaches them, with algorithm.num_envs with the first rollout",
     )
     flatten: bool = Field(
         default=False,

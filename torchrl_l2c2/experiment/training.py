@@ -14,11 +14,11 @@ from torchrl_l2c2.experiment.checkpoints import save_checkpoint
 from torchrl_l2c2.experiment.compilation import compiler_available
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.continuation import (
-    check_continuable,
     check_length,
     check_same_settings,
     checkpoint_named,
     find_checkpoint,
+    find_elsewhere,
 )
 from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
 from torchrl_l2c2.experiment.evaluate import Evaluation, LateTests, evaluate_policy
@@ -114,10 +114,7 @@ class Experiment:
         try:
             self._best_policy = BestPolicy(config, self.agent.policy, self.folder)
             self._gain = GainControl(config, self.learner)
-            # Only now, as what was refused above leaves no folder.
-            if self.folder is not None:
-                self._unlock = lock_folder(make_folder(self.folder), self)
-            self._begin(resume, allow_other_versions)
+            self._begin(resume, allow_other_versions=allow_other_versions)
         except BaseException:
             self.close()
             raise
@@ -246,7 +243,7 @@ class Experiment:
             result = evaluate_policy(
                 self.agent.policy,
                 env,
-                episodes or config.test_episodes,
+                config.test_episodes if episodes is None else episodes,
                 max_steps=config.task.time_limit,
                 sampled=sampled,
                 compile_policy=self._compile,
@@ -291,19 +288,21 @@ class Experiment:
         self._log.close()
         self._unlock()
 
-    def _begin(self, resume: str | Path | None, allow_other_versions: bool) -> None:
+    def _begin(self, elsewhere: str | Path | None, **options: bool) -> None:
+        found = find_elsewhere(elsewhere, self.folder, self.config, **options)
+        if self.folder is not None:
+            # Only now, as what was refused above leaves no folder.
+            self._unlock = lock_folder(make_folder(self.folder), self)
+            found = find_checkpoint(self.folder, self.config, **options) or found
         self._log = MetricsLog(self.folder, logger=self.config.logger.name)
-        self._resume(resume, allow_other_versions)
+        if found is not None:
+            self._go_on(*found)
         if self.folder is not None:
             ended = self._ended(self.config.task.budget)
             begun = bool(self.metrics)
             begin_folder(self.folder, self.config.to_dict(), begun=begun, ended=ended)
 
-    def _resume(self, elsewhere: str | Path | None, allow_other_versions: bool) -> None:
-        if (found := find_checkpoint(self.folder, elsewhere)) is None:
-            return
-        path, state = found
-        check_continuable(state, self.config, allow_other_versions=allow_other_versions)
+    def _go_on(self, path: Path, state: dict[str, Any]) -> None:
         if self.folder is not None and path.parent != self.folder:
             bring_files(path.parent, self.folder)
         self.load_state_dict(state)
@@ -338,7 +337,7 @@ class Experiment:
             **(self._late_tests.play(number) if late else self._late_tests.none()),
             **self.learner.report(episode.last_frame),
         }
-        return {**row, **self._gain.after(row)}
+        return {**row, **self._gain.after(row, ends_round=episode.ends_round)}
 
     def _write(self, row: dict[str, float], bar: Progress) -> None:
         row["frames_per_second"] = bar.frames_per_second(self.player.frames)

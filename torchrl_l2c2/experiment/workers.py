@@ -8,6 +8,7 @@ import signal
 import weakref
 from collections.abc import Callable, Iterator
 from functools import partial
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from torchrl_l2c2.experiment.collection import EpisodeCollector
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.environments import make_env
 from torchrl_l2c2.experiment.rollouts import RolloutCollector
+from torchrl_l2c2.experiment.settings import SettingError
 
 # Between the seeds of a run's simulators: far enough for no run to have another's.
 SEEDS_APART = 15_485_863
@@ -50,6 +52,12 @@ def make_collector(
         frames = 1 if config.algorithm.schedule == "step" else config.task.time_limit
         return EpisodeCollector(env, agent.policy, frames_per_batch=frames, **options)
     ray = config.workers == "ray"
+    if ray and find_spec("ray") is None:
+        raise SettingError(
+            "workers",
+            "must be processes where Ray is not installed, got ray: pip install "
+            "'torchrl-l2c2[ray]'.",
+        )
     kind: type[MultiEpisodeCollector | RayEpisodeCollector]
     kind = RayEpisodeCollector if ray else MultiEpisodeCollector
     return kind(

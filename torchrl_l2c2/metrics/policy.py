@@ -29,7 +29,7 @@ def local_lipschitz(
     :meth:`Neighborhood.sample <torchrl_l2c2.Neighborhood.sample>`. Smaller is smoother. The
     largest quotient bounds the true constant in the neighborhood from below, and more neighbors
     tighten it. Unlike the regularization, which counts distance in units of the transition, this
-    is in the output's unit per unit of the state.
+    is in the output's unit per unit of the state's coordinate that differs most.
 
     Args:
         state (Tensor): states, shape ``[*B, F]``.

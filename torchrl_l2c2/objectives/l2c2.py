@@ -18,6 +18,7 @@ from torchrl_l2c2.neighborhood import Neighborhood
 from torchrl_l2c2.objectives.evaluation import at_rows
 from torchrl_l2c2.objectives.neighbors import (
     Neighbors,
+    check_moved,
     draw_rows,
     l2c2_penalty,
     read_key,
@@ -295,6 +296,7 @@ class L2C2Loss(RegularizedLoss):
             # Of the first transition; a batch may be a single one, with no dimension.
             first = drawn.unsqueeze(-1).flatten(1)[:, :1]
             self._compare(first.flatten().tolist(), len(distance))
+        check_moved(states, self.l2c2_moved_keys)
         return Neighbors(states, distance, rows)
 
     def _draw(self, tensordict: TensorDictBase, rows: Tensor | None) -> TensorDictBase:

@@ -144,6 +144,20 @@ def read_moved_keys(
     return keys
 
 
+def check_moved(neighbors: TensorDictBase, moved_keys: Sequence[NestedKey] | None) -> None:
+    """Refuses neighbors in a batch that differ in other entries than was asked for.
+
+    Raises:
+        ValueError: names both.
+    """
+    moved = list(neighbors.keys(include_nested=True, leaves_only=True))
+    if moved_keys is not None and set(moved) != set(moved_keys):
+        raise ValueError(
+            f"the batch has neighbors of {moved}, and moved_keys names {list(moved_keys)}: give "
+            "the NeighborTransform these in_keys, or leave moved_keys out."
+        )
+
+
 def l2c2_penalty(
     difference: Tensor,  # shape: [K, *B, ...]
     gain: Tensor,  # shape: [K, *B]

@@ -72,7 +72,8 @@ def find_transitions(
         dict: by their keys, states and successors, each ``[*B, *F]``.
 
     Raises:
-        TypeError: a network reads no floating-point state.
+        TypeError: a network reads no floating-point state, or its successor is none.
+        ValueError: a successor has another shape than its state.
         KeyError: no state that a network reads has a successor.
     """
     keys = dict.fromkeys(key for read in states.values() for key in read)
@@ -87,6 +88,8 @@ def find_transitions(
                 f"{network} needs the next observation to be regularized, and the batch has no "
                 f"{list(map(next_key, floating))}: keep what the collector wrote there."
             )
+        for key, (state, successor) in present.items():
+            _check_successor(key, state, successor)
         pairs.update(present)
     return {key: pairs[key] for key in keys if key in pairs}
 
@@ -130,6 +133,19 @@ def next_key(key: NestedKey) -> NestedKey:
     """Where the successor of an entry lies."""
     # Not by unravel_key, which Dynamo leaves out.
     return ("next", *key) if isinstance(key, tuple) else ("next", key)
+
+
+def _check_successor(key: NestedKey, state: Tensor, successor: Tensor) -> None:
+    if not successor.is_floating_point():
+        raise TypeError(
+            f"{next_key(key)} must be floating point, as {key!r} is, got {successor.dtype}: cast "
+            "both alike in the environment, the collector or the replay buffer."
+        )
+    if successor.shape != state.shape:
+        raise ValueError(
+            f"{next_key(key)} must have the shape of {key!r}, {tuple(state.shape)}, got "
+            f"{tuple(successor.shape)}."
+        )
 
 
 def _is_floating_point(value: object) -> bool:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import fields
+from inspect import signature
 from typing import Any, ClassVar
 
 import torch
@@ -199,6 +200,7 @@ class L2C2PPO(RegularizedPPO):
     def regularize(
         self, networks: ActorCriticLoss, **options: Any
     ) -> tuple[RegularizedLoss, NeighborTransform]:
+        _check_options(options, Neighborhood, L2C2Loss)
         given = {field.name for field in fields(Neighborhood)} & options.keys()
         near = Neighborhood(**{name: options.pop(name) for name in given})
         loss = L2C2Loss(networks, near, **options)
@@ -255,4 +257,12 @@ class CATSPPO(RegularizedPPO):
     coefficient = "cats_lambda_temporal"
 
     def regularize(self, networks: ActorCriticLoss, **options: Any) -> tuple[RegularizedLoss, None]:
+        _check_options(options, CATSLoss)
         return CATSLoss(networks, **options), None
+
+
+def _check_options(options: Iterable[str], *takers: Callable[..., Any]) -> None:
+    allowed = {name for taker in takers for name in signature(taker).parameters}
+    allowed = allowed - {"base_loss", "neighborhood"} | {"ramp_updates"}
+    if unknown := sorted(set(options) - allowed):
+        raise TypeError(f"regularizer_cfg has {unknown}; it may have {sorted(allowed)}.")

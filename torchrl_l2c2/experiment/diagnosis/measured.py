@@ -173,6 +173,7 @@ def diagnose(
         Diagnosis: for :func:`~.words.findings` and :func:`~.page.write_page`.
 
     Raises:
+        TypeError: the environment is none of TorchRL's.
         ValueError: the environment is a batch of several, the policy reads more than one of its
             observations, or an episode is shorter than four steps.
         FloatingPointError: an observation, an action or a reward is not finite.
@@ -234,6 +235,11 @@ def diagnose(
 
 
 def _observed(policy: TensorDictModule, env: EnvBase) -> NestedKey:
+    if not isinstance(env, EnvBase):
+        raise TypeError(
+            f"env must be an environment of TorchRL, got {env!r}: torchrl.envs.GymEnv(id) makes "
+            "one, GymWrapper(env) one of Gymnasium's."
+        )
     if env.batch_size:
         raise ValueError(
             f"one environment is diagnosed, got a batch of {tuple(env.batch_size)}: give the one "

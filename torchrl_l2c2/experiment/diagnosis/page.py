@@ -52,12 +52,12 @@ body > .wide:last-child td { white-space: normal; }
 FIRST = {"return": "return", "length": "steps", "action_variation": "action variation (the paper)"}
 
 
-def write_page(path: str | Path, diagnoses: Sequence[Diagnosis]) -> Path:
+def write_page(path: str | Path, diagnoses: Diagnosis | Sequence[Diagnosis]) -> Path:
     """Writes the page of one or several diagnoses, beside one another; it needs no other file.
 
     Args:
         path (str or Path): of the HTML file.
-        diagnoses (sequence of Diagnosis): at least one, with names of their own.
+        diagnoses (Diagnosis or sequence of them): at least one, with names of their own.
 
     Returns:
         Path: of the file.
@@ -66,6 +66,7 @@ def write_page(path: str | Path, diagnoses: Sequence[Diagnosis]) -> Path:
         ValueError: there is no diagnosis.
         OSError: it could not be written.
     """
+    diagnoses = [diagnoses] if isinstance(diagnoses, Diagnosis) else diagnoses
     if not diagnoses:
         raise ValueError("a page needs at least one diagnosis.")
     path = Path(path)

@@ -86,6 +86,12 @@ class L2C2Config(GainConfig):
 
     def __post_init__(self) -> None:
         GainConfig.__post_init__(self)
+        if self.lambda_max <= (least := max(1.0, self.sigma) * self.lambda_min):
+            raise SettingError(
+                "lambda_max",
+                f"must be above lambda_min and above sigma * lambda_min, here above {least:g}, got "
+                f"{self.lambda_max:g}: raise it, or lower lambda_min or sigma.",
+            )
         if self.over_neighbors == "max" and self.num_samples == 1:
             raise SettingError("num_samples", "must be above 1 with over_neighbors=max, got 1.")
         if self.gain_target_value is not None and (self.gain != "gradient" or not self.beta):

@@ -39,7 +39,8 @@ class Record:
         length: how long it was trained, such as ``"400 episodes"``.
         settings: :func:`~.differences.fingerprint` of the others.
         differences: what differs from the defaults, such as ``"algorithm.replay_ratio=10"``.
-        late_mean_return: mean over the last tenth's policies of a test episode with mean actions.
+        late_mean_return: mean over the late policies (those of ``late_share``) of a test episode
+            with mean actions.
         late_sampled_return: mean over the training episodes of the same policies.
         last_mean_return: mean over the last policy's test episodes with mean actions.
         last_mean_sm_asap: of the same, as :func:`~torchrl_l2c2.metrics.spectral_smoothness` has it.

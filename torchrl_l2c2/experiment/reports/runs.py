@@ -168,7 +168,7 @@ class FinishedRun:
         return {f"last_{acting}_{k}": math.nan if v is None else v for k, v in found.items()}
 
     def _late(self) -> dict[str, float]:
-        """Of the late policies, which played test episodes; else of training's last tenth."""
+        """Of the late policies, which played test episodes; of training's last tenth without."""
         config = ExperimentConfig.from_dict(self.config)
         budget, tests = config.task.budget, self.column("test_return")
         # A longer run has tests of the shorter one's end, too.

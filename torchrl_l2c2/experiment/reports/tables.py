@@ -22,9 +22,9 @@ from torchrl_l2c2.experiment.reports.statistics import mean_and_deviation
 
 LEGEND = (
     "Means over seeds, standard deviations over seeds in brackets. "
-    "Late policies are those of the last tenth of training: one test episode of each with its mean "
-    "actions, and the training's own episodes, with sampled ones. The action variation is that of "
-    "the policy's mean in either case; smaller is smoother."
+    "Late policies are those of the last tenth of training, or of its late_share: one test episode "
+    "of each with its mean actions, and the training's own episodes, with sampled ones. The action "
+    "variation is that of the policy's mean in either case; smaller is smoother."
 )
 
 
