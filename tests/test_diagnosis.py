@@ -316,7 +316,7 @@ class TestMeasured:
 
     def test_what_cannot_be_diagnosed_is_refused(self):
         """An id, a batch of environments, two observations, an episode that is hardly one."""
-        with pytest.raises(TypeError, match="environment of TorchRL, got 'Walk-v0': .*GymEnv"):
+        with pytest.raises(TypeError, match=r"environment of TorchRL, got 'Walk-v0': .*GymEnv"):
             diagnose(linear(1.0), "Walk-v0")
         with pytest.raises(ValueError, match="got a batch of \\(2,\\)"):
             diagnose(linear(1.0), SerialEnv(2, lambda: GymWrapper(Walk())))
