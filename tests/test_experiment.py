@@ -277,9 +277,9 @@ def test_nan_in_a_test_episode_gives_no_result():
     task = TaskConfig("faulty", "Faulty-v0", episodes=1, max_steps=5)
     env = make_env(task, seed=0)
     policy = make_actor(2, env.action_spec)
-    with pytest.raises(FloatingPointError, match=r"'next', 'reward'.*frame 2"):
+    with pytest.raises(FloatingPointError, match=r"'next', 'reward'.*frame 3"):
         evaluate_policy(policy, env, 2, max_steps=5)
-    with pytest.raises(FloatingPointError, match=r"'next', 'reward'.*frame 2"):
+    with pytest.raises(FloatingPointError, match=r"'next', 'reward'.*frame 3"):
         LateTests(task, 0, policy, compile_policy=False).play(1)
 
 
