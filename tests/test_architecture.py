@@ -55,6 +55,7 @@ experiment.algorithms.dqn experiment.algorithms.ppo
 experiment.algorithms.__init__
 experiment.config
 experiment.naming experiment.saved
+experiment.folder
 experiment.reports.statistics experiment.reports.paper experiment.reports.differences
 experiment.reports.records experiment.reports.document
 experiment.reports.runs experiment.reports.groups
@@ -81,7 +82,7 @@ experiment.diagnosis.__init__
 experiment.diagnose experiment.noise
 experiment.learner
 experiment.gain
-experiment.continuation experiment.folder experiment.schedules
+experiment.continuation experiment.schedules
 experiment.training
 experiment.composition
 experiment.command

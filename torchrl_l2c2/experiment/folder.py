@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_l2c2.experiment.files import write_atomically, write_json
-from torchrl_l2c2.experiment.reports.runs import tested_run
+from torchrl_l2c2.experiment.saved import is_tested
 from torchrl_l2c2.experiment.versions import code_commit, versions
 
 README = """\
@@ -59,7 +59,7 @@ def begin_folder(folder: Path, settings: dict[str, Any], *, begun: bool, ended: 
         begun (bool): whether it goes on from a checkpoint.
         ended (bool): whether its training is over.
     """
-    if not ended or tested_run(folder, settings) is None:
+    if not ended or not is_tested(folder, settings):
         (folder / "evaluation.json").unlink(missing_ok=True)
     if not ended:
         for name in (*OF_THE_END, *(() if begun else OF_THE_WAY)):

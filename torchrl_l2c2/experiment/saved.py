@@ -14,6 +14,8 @@ from torchrl_l2c2.experiment.config import GROUPS, NEUTRAL_SETTINGS, is_free, is
 
 NOT_THEN = "none, as it is a setting since"
 REMEDY = "it was changed or cut since it was written; restore it."
+# How long a training is; a longer one is of the same kind.
+BUDGETS = ("task.episodes", "task.frames")
 ANEW = " Or delete it: the command that made the run tests its policy again."
 
 
@@ -120,6 +122,21 @@ def differing(saved: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, tup
         for name, (was, is_now) in pairs.items()
         if was != is_now and not (was == NOT_THEN and is_neutral(name, is_now))
     }
+
+
+def is_tested(run: str | Path, settings: Mapping[str, Any]) -> bool:
+    """Whether a folder has the test of a run with these settings.
+
+    Settings that change none of the numbers may differ, but for how long the training is.
+
+    Raises:
+        ValueError: as :func:`read_config`.
+    """
+    if not (Path(run) / "evaluation.json").exists():
+        return False
+    saved = read_config(run)
+    before, after = ([by_name(each).get(name) for name in BUDGETS] for each in (saved, settings))
+    return before == after and not differing(saved, settings)
 
 
 def read_evaluation(run: str | Path) -> dict[str, Any]:

@@ -13,11 +13,9 @@ from torchrl_l2c2.experiment.config import (
     is_free,
     is_neutral,
 )
-from torchrl_l2c2.experiment.saved import by_name
+from torchrl_l2c2.experiment.saved import BUDGETS, by_name
 from torchrl_l2c2.experiment.tasks import TASKS
 
-# How long a run is trained, of which a longer one is another.
-BUDGETS = ("task.episodes", "task.frames")
 # Chosen by name; what else these groups have are settings of what was chosen.
 _COMPARED = ("task", "algorithm", "regularizer")
 

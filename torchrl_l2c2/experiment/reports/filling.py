@@ -8,7 +8,6 @@ from pathlib import Path
 
 from torchrl_l2c2.experiment.files import make_folder_of, write_atomically
 from torchrl_l2c2.experiment.reports.choice import choice_table
-from torchrl_l2c2.experiment.reports.differences import BUDGETS
 from torchrl_l2c2.experiment.reports.faster_targets import faster_targets_table
 from torchrl_l2c2.experiment.reports.field import field_groups, field_table
 from torchrl_l2c2.experiment.reports.figures import draw_plane
@@ -18,6 +17,7 @@ from torchrl_l2c2.experiment.reports.paper import PAPER, TAU, is_of_paper
 from torchrl_l2c2.experiment.reports.paper_table import deployed_table, paper_table
 from torchrl_l2c2.experiment.reports.records import Record
 from torchrl_l2c2.experiment.reports.tables import settings_notes
+from torchrl_l2c2.experiment.saved import BUDGETS
 from torchrl_l2c2.experiment.tasks import TASKS
 
 START, END = "<!-- results: start -->", "<!-- results: end -->"

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_l2c2.experiment.reports.differences import BUDGETS
 from torchrl_l2c2.experiment.reports.paper import method_name
 from torchrl_l2c2.experiment.reports.records import Record
 from torchrl_l2c2.experiment.reports.statistics import Scores
+from torchrl_l2c2.experiment.saved import BUDGETS
 
 # A row's settings by name; ``None`` where the default stands.
 Settings = tuple[tuple[str, str | None], ...]

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_l2c2.experiment.files import make_folder, write_atomically
-from torchrl_l2c2.experiment.reports.differences import BUDGETS, read_differences
+from torchrl_l2c2.experiment.reports.differences import read_differences
 from torchrl_l2c2.experiment.reports.paper import TAU, Published, method_order, paper_of
-from torchrl_l2c2.experiment.saved import read_rows
+from torchrl_l2c2.experiment.saved import BUDGETS, read_rows
 from torchrl_l2c2.experiment.tasks import TASKS
 
 # Which policies act, and how: the last policy's test episodes, or one episode of every policy

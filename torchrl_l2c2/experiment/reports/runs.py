@@ -12,7 +12,6 @@ from typing import Any
 
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.reports.differences import (
-    BUDGETS,
     differences,
     fingerprint,
     write_differences,
@@ -20,8 +19,7 @@ from torchrl_l2c2.experiment.reports.differences import (
 from torchrl_l2c2.experiment.reports.records import QUANTITIES, Record
 from torchrl_l2c2.experiment.saved import (
     REMEDY,
-    by_name,
-    differing,
+    is_tested,
     read_config,
     read_evaluation,
     read_json,
@@ -193,25 +191,15 @@ class FinishedRun:
         }
 
 
-def tested_run(folder: str | Path, settings: dict[str, Any]) -> FinishedRun | None:
-    """The run in a folder whose test is of these settings; ``None`` where there is none.
-
-    Settings that change none of the numbers may differ, but for how long the training is.
-    """
-    folder = Path(folder)
-    if not (folder / "evaluation.json").exists():
-        return None
-    saved = read_config(folder)
-    before, after = ([by_name(each).get(name) for name in BUDGETS] for each in (saved, settings))
-    return None if before != after or differing(saved, settings) else FinishedRun.read(folder)
-
-
 def finished_run(folder: str | Path, settings: dict[str, Any]) -> FinishedRun | None:
-    """The same where the test has as many episodes as the settings ask for, or they want none."""
-    run = tested_run(folder, settings)
-    if run is None or settings["test_episodes"] in (0, run.test_episodes):
-        return run
-    return None
+    """The run in a folder whose test is of these settings, and has as many episodes as they ask.
+
+    ``None`` where there is none; any number of episodes is enough for settings that want none.
+    """
+    if not is_tested(folder, settings):
+        return None
+    run = FinishedRun.read(Path(folder))
+    return run if settings["test_episodes"] in (0, run.test_episodes) else None
 
 
 @dataclass(frozen=True)
