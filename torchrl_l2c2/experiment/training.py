@@ -166,7 +166,9 @@ class Experiment:
         with self._process, bar, stop_on_signals() as signals, checkpoint_named(self.folder):
             while not ended:
                 episode = next(schedule)
-                self._write(self._row(episode, full), bar)
+                row = self._row(episode, full)
+                row |= self._gain.after(row, ends_round=episode.ends_round)
+                self._write(row, bar)
                 anneal(self.config.optimizer, self.agent.optimizer, self._spent(full) / full.total)
                 self._best_policy.after(len(self.metrics))
                 if not episode.ends_round:
@@ -328,7 +330,7 @@ class Experiment:
     def _row(self, episode: Episode, budget: Budget) -> dict[str, float]:
         number = len(self.metrics) + 1
         late = budget.is_late(budget.spent(number, episode.last_frame), self.config.late_share)
-        row = {
+        return {
             "episode": number,
             "frames": episode.last_frame,
             "updates": self.learner.updates,
@@ -337,7 +339,6 @@ class Experiment:
             **(self._late_tests.play(number) if late else self._late_tests.none()),
             **self.learner.report(episode.last_frame),
         }
-        return {**row, **self._gain.after(row, ends_round=episode.ends_round)}
 
     def _write(self, row: dict[str, float], bar: Progress) -> None:
         row["frames_per_second"] = bar.frames_per_second(self.player.frames)
