@@ -149,7 +149,10 @@ def test_a_trial_without_late_tests_is_scored_by_its_last_policies(tmp_path):
             r"'regularizer.beta=.*a logarithmic scale begins above 0, got 0\.",
         ),
         ("outputs=elsewhere", "outputs is the trials' own, below --output"),
-        ("regularizer.bta=interval(0,1)", r"Could not override 'regularizer.bta'"),
+        (
+            "regularizer.bta=interval(0,1)",
+            "regularizer.bta is not a setting; did you mean",
+        ),
         ("regularizer.beta=interval(-2,-1)", r"regularizer.beta must be .* got -1.29289"),
         ("regularizer.num_samples=interval(1,3)", "num_samples must be a valid integer, got 2.41"),
         ("regularizer=choice(l2c2,lipsnet)", "Could not find 'regularizer/lipsnet'"),

@@ -14,7 +14,7 @@ from pydantic import TypeAdapter
 from small import own_nodes
 
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig
-from torchrl_l2c2.experiment.composition import CONF, folder_named, register
+from torchrl_l2c2.experiment.composition import CONF, composing, folder_named, register
 from torchrl_l2c2.experiment.config import GROUPS
 from torchrl_l2c2.experiment.settings import SettingError, describe
 
@@ -82,17 +82,33 @@ def test_a_wrong_setting_gives_its_line(settings_of, line, message):
 
 
 @pytest.mark.parametrize(
-    ("line", "message"),
+    ("line", "told"),
     [
-        ("regularizer=lipsnet", "Could not find 'regularizer/lipsnet'"),
-        ("sed=1", "Could not override 'sed'"),
-        ("regularizer.sgma=1", "Could not override 'regularizer.sgma'"),
+        ("task.epsodes=3", "task.epsodes is not a setting; did you mean task.episodes? --help"),
+        ("sed=1", "sed is not a setting; did you mean seed? --help lists every setting."),
+        ("algorithm.num_envs=4", "algorithm.num_envs is a setting of algorithm=ppo alone."),
+        (
+            "regularizer=lipsnet",
+            "In 'config': Could not find 'regularizer/lipsnet' Available options in ",
+        ),
+        ("seed=${oder}", "Interpolation key 'oder' not found full_key: seed"),
+        ("seed=[1", "no viable alternative at input '[1'"),
     ],
 )
-def test_a_wrong_name_is_hydras_to_refuse(settings_of, line, message):
-    """And its line says which."""
-    with pytest.raises(HydraException, match=message):
+def test_what_cannot_be_composed_ends_in_a_line(settings_of, monkeypatch, line, told):
+    """Of a name that there is not, it says which was meant; never a traceback."""
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    with pytest.raises(SystemExit) as ended, composing():
         settings_of(line)
+    said = str(ended.value)
+    assert said.startswith(f"error: {told}") and "\n" not in said and "search path" not in said
+
+
+def test_the_whole_error_is_shown_where_it_is_asked_for(settings_of, monkeypatch):
+    """As Hydra has it."""
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    with pytest.raises(HydraException, match="Could not override 'sed'"), composing():
+        settings_of("sed=1")
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,14 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_l2c2.experiment.composition import CONF, read, register, tell_sweep, tell_tuned
+from torchrl_l2c2.experiment.composition import (
+    CONF,
+    composing,
+    read,
+    register,
+    tell_sweep,
+    tell_tuned,
+)
 from torchrl_l2c2.experiment.config import ExperimentConfig, OtherRunError
 from torchrl_l2c2.experiment.errors import EXPECTED, show_cause
 from torchrl_l2c2.experiment.progress import log
@@ -81,12 +88,14 @@ def main() -> None:
     signal.signal(signal.SIGTERM, terminate)
     register()
     if not {"-m", "--multirun", "hydra.mode=MULTIRUN"} & set(sys.argv):
-        _main()
+        with composing():
+            _main()
         return
     check_sweep(sys.argv[1:])
     with begin_sweep(sys.argv[1:]) as sweep:
         try:
-            _main()
+            with composing():
+                _main()
         except KeyboardInterrupt:
             sweep.stop(signal.SIGINT)
         finally:

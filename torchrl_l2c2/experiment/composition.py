@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import re
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from difflib import get_close_matches
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
 from hydra.types import RunMode
+from omegaconf.errors import OmegaConfBaseException
 
-from torchrl_l2c2.experiment.config import GROUPS, ExperimentConfig
+from torchrl_l2c2.experiment.config import GROUPS, STEERING, ExperimentConfig
 from torchrl_l2c2.experiment.manual import manual
 from torchrl_l2c2.experiment.naming import run_name
 from torchrl_l2c2.experiment.regularizers import BEGIN_TUNED, TUNED, TUNED_ON
@@ -91,6 +99,54 @@ def check_preset(values: dict[str, Any], name: str | None) -> None:
         f"must have settings of task={task} with algorithm={algorithm}, and {name} has those of "
         f"{known}: choose one of these, or preset=none.",
     )
+
+
+@contextmanager
+def composing() -> Iterator[None]:
+    """Ends with a line where Hydra cannot compose what it was given.
+
+    Hydra would print several, or a traceback, and exit; as it does where ``HYDRA_FULL_ERROR`` is
+    set by the user.
+
+    Raises:
+        SystemExit: with that line.
+    """
+    shown = "HYDRA_FULL_ERROR" in os.environ
+    os.environ.setdefault("HYDRA_FULL_ERROR", "1")
+    try:
+        yield
+    except (HydraException, OmegaConfBaseException) as error:
+        if shown:
+            raise
+        sys.exit(f"error: {refusal(error)}")
+
+
+def refusal(error: Exception) -> str:
+    """What Hydra, or OmegaConf, refuses, in a line; of a name that there is not what was meant."""
+    if found := re.match("Could not override '([^']+)'", str(error)):
+        return unknown_setting(found[1])
+    return " ".join(str(error).partition("\nConfig search path:")[0].split())
+
+
+def unknown_setting(name: str) -> str:
+    """Whose setting a name is, or the one that is most like it.
+
+    Examples:
+        >>> unknown_setting("task.epsodes")
+        'task.epsodes is not a setting; did you mean task.episodes? --help lists every setting.'
+        >>> unknown_setting("algorithm.num_envs")
+        'algorithm.num_envs is a setting of algorithm=ppo alone.'
+    """
+    group, _, setting = name.partition(".")
+    choices = GROUPS.get(group, {}).items()
+    settings = {choice: {f.name for f in dataclasses.fields(of)} for choice, of in choices}
+    if having := [choice for choice, names in settings.items() if setting in names]:
+        return f"{name} is a setting of {group}={' or '.join(having)} alone."
+    known = {*STEERING, *(field.name for field in dataclasses.fields(ExperimentConfig))}
+    known |= {f"{group}.{each}" for names in settings.values() for each in names}
+    near = get_close_matches(name, sorted(known), 1)
+    meant = f"; did you mean {near[0]}?" if near else "."
+    return f"{name} is not a setting{meant} --help lists every setting."
 
 
 def folder_named(setting: str, given: Any) -> str | None:

@@ -12,7 +12,7 @@ from hydra.core.override_parser.types import ChoiceSweep, Glob, IntervalSweep, O
 from hydra.errors import HydraException, OverrideParseException
 from omegaconf import OmegaConf
 
-from torchrl_l2c2.experiment.composition import CONF, register
+from torchrl_l2c2.experiment.composition import CONF, refusal, register
 from torchrl_l2c2.experiment.config import ExperimentConfig
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ def check_settings(overrides: Sequence[str]) -> None:
             try:
                 values: Any = OmegaConf.to_container(compose("config", tried), resolve=True)
             except HydraException as error:
-                raise ValueError(str(error).splitlines()[0]) from error
+                raise ValueError(refusal(error)) from error
             ExperimentConfig.from_dict(values)
 
 
