@@ -89,7 +89,7 @@ def test_a_wrong_setting_gives_its_line(settings_of, line, message):
         ("algorithm.num_envs=4", "algorithm.num_envs is a setting of algorithm=ppo alone."),
         (
             "regularizer=lipsnet",
-            "In 'config': Could not find 'regularizer/lipsnet' Available options in ",
+            "In 'config': Could not find 'regularizer/lipsnet' Available",
         ),
         ("seed=${oder}", "Interpolation key 'oder' not found full_key: seed"),
         ("seed=[1", "no viable alternative at input '[1'"),
