@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_l2c2.experiment.reports.paper import method_name
+from torchrl_l2c2.experiment.reports.paper import method_name, name_with_settings
 from torchrl_l2c2.experiment.reports.records import Record
 from torchrl_l2c2.experiment.reports.statistics import Scores
 from torchrl_l2c2.experiment.saved import BUDGETS
@@ -114,9 +114,11 @@ def over_tasks(groups: Iterable[Group]) -> list[tuple[str, str, list[Group]]]:
     for (algorithm, method), found in methods.items():
         common = set.intersection(*map(set, found))
         for own, alike in found.items():
-            told = tuple(pair for pair in own if pair not in common)
+            name, named = name_with_settings(method, dict(own))
+            told = tuple(pair for pair in own if pair not in common and pair[0] not in named)
             for others, row in _one_of_each(alike).items():
-                rows.append((algorithm, _row_name(method, told + others), row))
+                parts = [name, *_told_settings(told + others)]
+                rows.append((algorithm, ", ".join(parts), row))
     names = Counter((algorithm, name) for algorithm, name, _ in rows)
     return [
         # Methods may differ in no more than what they are called, as l2c2_policy from beta=0.
@@ -137,10 +139,6 @@ def _one_of_each(groups: Sequence[Group]) -> dict[Settings, list[Group]]:
         others = _others(group) | {CODE: group.first.settings}
         rows[tuple((key, others.get(key)) for key in sorted(apart))].append(group)
     return rows
-
-
-def _row_name(method: str, settings: Settings) -> str:
-    return ", ".join([method_name(method), *_told_settings(settings)])
 
 
 def _told_settings(settings: Settings) -> list[str]:
@@ -247,17 +245,21 @@ def _without(record: Record, *prefixes: str) -> dict[str, str]:
 
 def _named(groups: list[Group]) -> list[Group]:
     """Groups of one task and algorithm, each named by what the others have differently."""
-    differing = [_differing(group, groups) for group in groups]
+    methods = [name_with_settings(g.first.method, g.first.other_settings) for g in groups]
+    differing = [
+        {key: value for key, value in _differing(group, groups).items() if key not in told}
+        for group, (_, told) in zip(groups, methods, strict=True)
+    ]
     keys = {key for values in differing for key in values}
     short = {key: _shortest(key, keys) for key in keys}
     several = len({group.first.length for group in groups}) > 1
     names = [
         ", ".join(
-            [method_name(group.first.method)]
+            [method]
             + [f"{short[key]}={value}" for key, value in values.items()]
             + ([group.first.length] if several else [])
         )
-        for group, values in zip(groups, differing, strict=True)
+        for group, (method, _), values in zip(groups, methods, differing, strict=True)
     ]
     # Other defaults, when it was run: only the code of the settings tells.
     return [
