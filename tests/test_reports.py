@@ -1134,6 +1134,20 @@ def test_the_fields_pages_are_those_of_their_records(name):
     assert f"records {digest(shown)}<" in page.with_suffix(".svg").read_text()
 
 
+@pytest.mark.parametrize("name", ["field", "walker2d", "sac_pendulum"])
+def test_what_is_said_of_the_harness_is_of_the_records(name):
+    """Vanilla's and the rivals' rows beside the published ones."""
+    table = field_table(read_records(ROOT / "results" / f"{name}.csv"))
+    rows = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
+    shown = [row for row in rows if row["seeds"] and not row["method"].startswith("L2C2")]
+    columns = (*table.columns[:5], "published: return", "Sm", "published: Sm")
+    page = (ROOT / "docs" / "field.md").read_text()
+    for row in shown:
+        method = row["method"].partition(",")[0]  # There is one gain of each.
+        cells = [row[column] for column in columns]
+        assert f"| {' | '.join([*cells[:2], method, *cells[3:]])} |" in page
+
+
 @pytest.mark.parametrize("name", ["field_gains", "one_gain"])
 def test_tables_of_gains_are_those_of_their_records(name):
     """The rivals', and those of one gain for three tasks."""
