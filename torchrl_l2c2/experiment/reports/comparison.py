@@ -103,10 +103,16 @@ def improvements_over_tasks(
 def statistics_tables(groups: Sequence[Group]) -> list[Table]:
     """Interquartile means and probabilities of improvement, a table for each figure there is."""
     known = [f for f in FIGURES if any(len(group.scores(f, "return")) for group in groups)]
-    return [_statistics(figure, groups) for figure in known]
+    return [statistics_table(figure, groups) for figure in known]
 
 
-def _statistics(figure: str, groups: Sequence[Group]) -> Table:
+def statistics_table(figure: str, groups: Sequence[Group]) -> Table:
+    """Interquartile means, and probabilities of improvement over vanilla, of one figure.
+
+    Args:
+        figure (str): one of ``FIGURES``.
+        groups (sequence of Group): a row each, and one for each method that several tasks have.
+    """
     columns = ["task", "algorithm", "method", "runs"]
     for quantity, better in zip(QUANTITIES.values(), ("larger", "smaller"), strict=True):
         columns += [f"{quantity}: interquartile mean", f"P({better} than vanilla)"]

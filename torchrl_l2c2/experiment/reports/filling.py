@@ -8,6 +8,7 @@ from pathlib import Path
 
 from torchrl_l2c2.experiment.files import make_folder_of, write_atomically
 from torchrl_l2c2.experiment.reports.choice import choice_table
+from torchrl_l2c2.experiment.reports.comparison import statistics_table
 from torchrl_l2c2.experiment.reports.faster_targets import faster_targets_table
 from torchrl_l2c2.experiment.reports.field import field_groups, field_table
 from torchrl_l2c2.experiment.reports.figures import draw_plane
@@ -39,7 +40,8 @@ def paper_text(records: Sequence[Record]) -> str | None:
         return None
     picture = f"![Return against action variation of every method]({PICTURE.as_posix()})"
     faster = faster_targets_table([r for r in records if is_as_usual(r, TAU)])
-    more = [each.markdown() for each in (deployed_table(groups), faster) if each]
+    beside = (deployed_table(groups), statistics_table("late_sampled", groups), faster)
+    more = [each.markdown() for each in beside if each]
     return "\n\n".join([picture, table.markdown(), *settings_notes(groups), *more])
 
 
