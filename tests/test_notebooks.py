@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import runpy
 from pathlib import Path
+from typing import Any
 
 import nbformat
 import pytest
@@ -82,3 +84,14 @@ def test_runs_and_draws(notebook: nbformat.NotebookNode, monkeypatch: pytest.Mon
     """Every cell as it stands, without an error, and pictures come out."""
     run(notebook, monkeypatch, timeout=900)
     assert sum(map(pictures, notebook.cells)) >= 3
+
+
+def test_the_page_of_the_idea_is_that_of_its_notebook() -> None:
+    """Its text, and a picture behind every cell that draws one; what is live is left out."""
+    docs = FOLDER.parent / "docs"
+    made: dict[str, Any] = runpy.run_path(str(docs / "make_idea.py"))
+    notebook = nbformat.read(FOLDER / "idea.ipynb", as_version=4)
+    drawing = {cell.id: 1 for cell in notebook.cells if "subplots(" in cell.source}
+    written = (docs / "idea.md").read_text()
+    assert written == made["page"](notebook, drawing) and "live kernel" not in written
+    assert all((docs / f"idea_{number + 1}.png").exists() for number in range(len(drawing)))
