@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import os
 from typing import Annotated, get_type_hints
 
 import pytest
@@ -101,6 +102,7 @@ def test_what_cannot_be_composed_ends_in_a_line(settings_of, monkeypatch, line, 
     with pytest.raises(SystemExit) as ended, composing():
         settings_of(line)
     said = str(ended.value)
+    assert "HYDRA_FULL_ERROR" not in os.environ
     assert said.startswith(f"error: {told}") and "\n" not in said and "search path" not in said
 
 

@@ -119,6 +119,9 @@ def composing() -> Iterator[None]:
         if shown:
             raise
         sys.exit(f"error: {refusal(error)}")
+    finally:
+        if not shown:
+            os.environ.pop("HYDRA_FULL_ERROR", None)
 
 
 def refusal(error: Exception) -> str:
