@@ -127,7 +127,7 @@ def test_every_comparison_is_made_of_valid_runs(name, regularizer):
 
 # What each sweeps over: the seeds, tasks and methods of a published table.
 PAPERS = "none,caps,l2c2,l2c2_policy"
-RIVALS = "none,caps,l2c2_paper,l2c2,l2c2_ramp,cats"
+RIVALS = "none,caps,l2c2_paper,l2c2_constant,l2c2_ramp,cats"
 SWEEPS = {
     "table3": ("range(0,18)", "swingup,reacher,hopper,ant", PAPERS),
     "table3_tau": ("range(0,18)", "swingup", "l2c2,l2c2_policy"),
@@ -213,7 +213,8 @@ def test_l2c2_begins_from_what_was_found_for_the_algorithm(name, algorithm, caps
     """What is given goes before; a run says what it has; l2c2_paper is the paper's."""
     chosen = [f"algorithm={algorithm}", f"regularizer={name}"]
     config = ExperimentConfig.from_dict(composed(*chosen))
-    found = dataclasses.replace(REGULARIZERS[name], **TUNED[algorithm])
+    own = {**TUNED[algorithm], **BEGIN_TUNED[name]}
+    found = dataclasses.replace(REGULARIZERS[name], **own)
     assert config.regularizer == found != REGULARIZERS[name]
     tell_tuned(config)
     told = capsys.readouterr().out

@@ -40,8 +40,9 @@ def register() -> None:
     for group, choices in GROUPS.items():
         for name, chosen in choices.items():
             store.store(group=group, name=name, node=_node(chosen))
-    for name, (algorithm, tuned) in product(BEGIN_TUNED, TUNED.items()):
-        store.store(group="tuned", name=f"{name}_{algorithm}", node={"regularizer": tuned})
+    for (name, own), (algorithm, tuned) in product(BEGIN_TUNED.items(), TUNED.items()):
+        node = {"regularizer": {**tuned, **own}}
+        store.store(group="tuned", name=f"{name}_{algorithm}", node=node)
     unknown = dict.fromkeys(("env_id", "noise_scale", "max_steps", "solved_at"))
     any_task = {"name": "${task.env_id}", **unknown}
     store.store(

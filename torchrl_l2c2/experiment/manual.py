@@ -62,7 +62,8 @@ def _about(name: str, chosen: Any, first: Any) -> str:
     differing = _together({name: getattr(chosen, name) for name in names})
     doc = (chosen.__doc__ or "").splitlines()[0]
     tuned = TUNED.items() if name in BEGIN_TUNED else ()
-    begins = (f" (With algorithm={a} from {_together(values)}.)" for a, values in tuned)
+    own = BEGIN_TUNED.get(name, {})
+    begins = (f" (With algorithm={a} from {_together({**values, **own})}.)" for a, values in tuned)
     # Where the first begins elsewhere with some algorithms, the paper's does not.
     like = "l2c2_paper" if first.name in BEGIN_TUNED and name not in BEGIN_TUNED else first.name
     return (f"{like} with {differing}" if differing else doc) + "".join(begins)

@@ -29,12 +29,18 @@ __all__ = [
     "SR2LConfig",
 ]
 
-# What begins from settings that were found for the algorithm; l2c2_paper is the paper's with any.
-BEGIN_TUNED = ("l2c2", "l2c2_ramp")
+# What begins from settings that were found for the algorithm, with what each has of its own;
+# l2c2_paper is the paper's with any.
+BEGIN_TUNED: dict[str, dict[str, Any]] = {
+    "l2c2": {},
+    "l2c2_constant": {"gain": "constant"},
+    "l2c2_ramp": {"gain": "ramp"},
+}
 # These settings, by algorithm, of runs in results/; with others there are none.
 TUNED: dict[str, dict[str, Any]] = {
     "ppo": {
-        "policy_distance": "mean",
+        "policy_distance": "mse",
+        "gain": "ramp",
         "shared": True,
         "lambda_min": 1.0,
         "lambda_max": 100.0,
@@ -49,7 +55,7 @@ TUNED: dict[str, dict[str, Any]] = {
     },
     "td3": {"lambda_min": 0.1, "lambda_max": 10.0},
 }
-TUNED_ON = {"ppo": "Pendulum and LunarLander", "sac": "Pendulum", "td3": "Pendulum"}
+TUNED_ON = {"ppo": "Pendulum, LunarLander and Walker2d", "sac": "Pendulum", "td3": "Pendulum"}
 
 REGULARIZERS: dict[str, RegularizerConfig] = {
     "none": NoRegularizerConfig(),
@@ -66,4 +72,5 @@ REGULARIZERS: dict[str, RegularizerConfig] = {
     # For policies of any scale, and where little is to be lost early.
     "l2c2_mean": L2C2Config(name="l2c2_mean", policy_distance="mean"),
     "l2c2_ramp": L2C2Config(name="l2c2_ramp", policy_distance="mean", gain="ramp"),
+    "l2c2_constant": L2C2Config(name="l2c2_constant"),
 }

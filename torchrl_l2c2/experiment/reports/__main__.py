@@ -40,6 +40,8 @@ def main(arguments: Iterable[str] | None = None) -> None:
         parser.error("--length needs the runs' folders: records have the end of training alone")
     if min(chosen.length or [1]) < 1:
         parser.error(f"--length must be at least 1, got {min(chosen.length)}")
+    if chosen.rows and chosen.csv:
+        parser.error("--csv writes all records; leave it or --rows out")
     if chosen.records and chosen.csv:
         parser.error("--csv writes records of folders; --from has them already")
     try:
@@ -81,6 +83,12 @@ def _parser() -> argparse.ArgumentParser:
         "as long as so many frames); of a longer run by its training's own episodes",
     )
     add(
+        "--rows",
+        nargs="+",
+        metavar="NAME",
+        help="only these methods, as tables call them: --rows vanilla CAPS 'L2C2, mse 1, ramp'",
+    )
+    add(
         "--page",
         metavar="FILE",
         help="make the results between this file's marks anew, of all records of --csv or --from",
@@ -90,6 +98,8 @@ def _parser() -> argparse.ArgumentParser:
 
 def _report(chosen: argparse.Namespace) -> None:
     records, runs, notes = _read(chosen)
+    if chosen.rows:
+        records, runs = _narrowed(records, runs, chosen.rows)
     kept = merge(read_records(chosen.csv), records) if chosen.csv else records
     written = []
     # Before the records, as it may be refused.
@@ -107,6 +117,18 @@ def _report(chosen: argparse.Namespace) -> None:
     tables = scores or printed_tables(records)
     # Last: who reads but the first lines of it has the files all the same.
     print("\n\n".join([*(table.markdown() for table in tables), *notes, *written]))
+
+
+def _narrowed(
+    records: Sequence[Record], runs: Sequence[FinishedRun], names: Sequence[str]
+) -> tuple[Sequence[Record], Sequence[FinishedRun]]:
+    """The records, and the runs, of groups with these names."""
+    groups = group_records(records)
+    known = dict.fromkeys(group.name for group in groups)
+    if unknown := [name for name in names if name not in known]:
+        raise ValueError(f"--rows: there is no {unknown[0]!r} here, but {'; '.join(known)}.")
+    kept = [record for group in groups if group.name in names for record in group.records]
+    return kept, [run for run in runs if run.record in kept]
 
 
 def _scored(records: Sequence[Record]) -> list[Reading]:

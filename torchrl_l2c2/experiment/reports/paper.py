@@ -52,6 +52,7 @@ METHODS = {
     "l2c2_policy": ("L2C2, beta=0", "#7570b3"),
     "l2c2_mean": ("L2C2, means", "#2a9d8f"),
     "l2c2_ramp": ("L2C2, means, ramp", "#0b3d66"),
+    "l2c2_constant": ("L2C2, constant", "#1b6ca8"),
     "cats": ("CATS", "#b0416b"),
     "grad_caps": ("Grad-CAPS", "#8a6d1d"),
     "asap": ("ASAP", "#4b6f44"),
