@@ -104,6 +104,8 @@ def lines(folder, late_tests=True):
         {
             # Three episodes of 30 frames end in two rollouts, ten frames before their end.
             "task": TaskConfig("pendulum", "Pendulum-v1", 0.01, 6, 30),
+            # PPO's own has a ramp, which is as long as the training.
+            "regularizer": L2C2Config(policy_distance="mean"),
             "algorithm": PPOConfig(
                 num_envs=1,
                 frames=50,
