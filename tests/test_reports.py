@@ -1198,15 +1198,18 @@ def test_the_pages_of_other_readings_are_those_of_their_records():
         assert paper_table(group_records(shown)).markdown() in page
 
 
-# Rows of the README's first table: whose records, of which length, and which policies.
+# Rows of the README's first table: whose records, of which method, as tables call it, and length,
+# and which policies.
 HEADLINE = {
-    "SAC, Pendulum": ("sac_pendulum", "l2c2_mean", "30000 frames", "last_mean"),
-    "PPO, LunarLander": ("field", "l2c2", "500000 frames", "last_mean"),
-    "PPO, Pendulum": ("field", "l2c2", "500000 frames", "last_mean"),
-    "PPO, Walker2d": ("walker2d", "l2c2_ramp", "1000000 frames", "last_mean"),
-    "PPO-RPE, Reacher, as in the paper": ("runs", "l2c2", "4500 episodes", "last_mean"),
-    "PPO-RPE, Swingup, as in the paper": ("runs", "l2c2", "350 episodes", "last_mean"),
-    "PPO-RPE, Swingup, with a target": ("runs", "l2c2_mean", "300 episodes", "late_sampled"),
+    "SAC, Pendulum": ("sac_pendulum", "L2C2, means 10", "30000 frames", "last_mean"),
+    "PPO, LunarLander": ("field", "L2C2, means 1, ramp", "500000 frames", "last_mean"),
+    "PPO, Pendulum": ("field", "L2C2, mse 1, ramp", "500000 frames", "last_mean"),
+    "PPO, Walker2d": ("walker2d", "L2C2, mse 1, ramp", "1000000 frames", "last_mean"),
+    "PPO-RPE, Reacher, as in the paper": ("runs", "L2C2", "4500 episodes", "last_mean"),
+    "PPO-RPE, Swingup, as in the paper": ("runs", "L2C2", "350 episodes", "last_mean"),
+    "PPO-RPE, Swingup, with a target": (
+        *("runs", "L2C2, means, target 0.045", "300 episodes", "late_sampled"),
+    ),
 }
 MEASURED = {"sm_asap": "Sm", "action_variation": "action variation"}
 
@@ -1217,10 +1220,10 @@ def headline(label):
     task = {"walker2d": "walker2d_v5"}.get(named := label.split(", ")[1].lower(), named)
     read = read_records(ROOT / "results" / f"{name}.csv")
     read = [r for r in read if (r.task, r.length) == (task, length) and TAU not in r.other_settings]
-    plain, ours = (
-        group_records([r for r in read if r.method == kind])[0] for kind in ("none", method)
-    )
-    assert plain.seeds == ours.seeds and plain.reading == ours.reading
+    (ours,) = (group for group in group_records(read) if group.name == method)
+    beside = [r for r in read if r.method == "none" and r.seed in ours.seeds]
+    (plain,) = group_records(beside)
+    assert plain.seeds == ours.seeds == [*range(len(ours.seeds))] and plain.reading == ours.reading
 
     def compared(quantity, digits, *, changes=False):
         means = [plain.scores(figure, quantity).mean(), ours.scores(figure, quantity).mean()]
