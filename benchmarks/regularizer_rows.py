@@ -9,7 +9,7 @@ from benchmarks.setups import Effort
 from benchmarks.timing import Row, alternate
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig, PPOConfig, TaskConfig
 from torchrl_l2c2.experiment.regularizers import REGULARIZERS
-from torchrl_l2c2.experiment.reports.paper import method_name
+from torchrl_l2c2.experiment.reports.names import method_name
 from torchrl_l2c2.experiment.update import ReplayUpdate
 
 # Whole trainings of PPO on Walker2d over those without a regularizer, in CATS (arXiv 2610.07910).

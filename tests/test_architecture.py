@@ -56,7 +56,8 @@ experiment.algorithms.__init__
 experiment.config
 experiment.naming experiment.saved
 experiment.folder
-experiment.reports.statistics experiment.reports.paper experiment.reports.differences
+experiment.reports.statistics experiment.reports.names experiment.reports.paper
+experiment.reports.differences
 experiment.reports.records experiment.reports.document
 experiment.reports.runs experiment.reports.groups
 experiment.reports.score

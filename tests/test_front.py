@@ -10,8 +10,8 @@ from tests.test_reports import make_config, make_run
 from torchrl_l2c2.experiment import L2C2Config
 from torchrl_l2c2.experiment.reports import read_runs, write_report
 from torchrl_l2c2.experiment.reports.front import (
-    front_figure,
     front_table,
+    front_test,
     pareto_front,
     searched,
 )
@@ -92,7 +92,7 @@ def test_without_late_tests_the_front_is_of_the_last_policies(tmp_path):
     forget(tmp_path / "runs", "test_return", "test_action_variation")
     records = [run.record for run in read_runs(tmp_path / "runs")]
     found = group_records(records)
-    assert front_figure(found) == "last_mean"
+    assert front_test(found) == "last_mean"
     page = write_report(tmp_path / "report", records)
     assert "Pareto front, last policy, mean actions" in page.read_text()
     # make_run: the last policy's is 20 more than the total.

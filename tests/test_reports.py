@@ -60,7 +60,7 @@ from torchrl_l2c2.experiment.reports.measures import measures_table
 from torchrl_l2c2.experiment.reports.pairwise import pairwise_tables
 from torchrl_l2c2.experiment.reports.paper import TAU
 from torchrl_l2c2.experiment.reports.paper_table import deployed_table, paper_table
-from torchrl_l2c2.experiment.reports.records import FIGURES, digest, merge
+from torchrl_l2c2.experiment.reports.records import TESTS, digest, merge
 from torchrl_l2c2.experiment.reports.runs import FinishedRun, finished_run
 from torchrl_l2c2.experiment.reports.score import readings
 from torchrl_l2c2.experiment.reports.statistics import (
@@ -838,7 +838,7 @@ class TestStatistics:
     def test_the_tables_of_statistics_by_hand(self, records):
         """Interquartile means of 0 to 4 are those of 1 to 3; 100 more always beats vanilla."""
         tables = statistics_tables(group_records(records))
-        assert [table.title for table in tables] == [f"Statistics: {t}" for t in FIGURES.values()]
+        assert [table.title for table in tables] == [f"Statistics: {t}" for t in TESTS.values()]
         row = cells(tables[1], "swingup", "ppo_rpe", "CAPS", "5")
         assert row[0].startswith("102.0 [") and row[1] == "1.00 [1.00, 1.00]"
         # Of .09 to .094 against .1 to .104 every pair is smoother.
@@ -1019,7 +1019,7 @@ class TestReport:
         assert pictures == [
             "learning_curves_reacher_ppo_rpe",
             "learning_curves_swingup_ppo_rpe",
-            *sorted(f"plane_{figure}" for figure in FIGURES),
+            *sorted(f"plane_{test}" for test in TESTS),
         ]
         assert text.count('src="data:image/svg+xml;base64,') == len(pictures)
         assert not re.search(r'(?:src|href)="(?!data:)', text) and "http" not in text

@@ -24,7 +24,7 @@ from torchrl.envs import (
 
 from torchrl_l2c2.experiment.acting import on_tensors
 from torchrl_l2c2.experiment.environments import simulating
-from torchrl_l2c2.experiment.frames import PREVIOUS, Frame, as_number, stack_frames
+from torchrl_l2c2.experiment.frames import PREVIOUS, Frame, as_reward, stack_frames
 from torchrl_l2c2.transforms import ObservationNoise
 
 # Added to the seed of an environment for its noise: the two are not to draw the same numbers.
@@ -169,7 +169,7 @@ class EpisodeCollector(Collector):
         seen, reward, terminated, truncated, _ = self._gymnasium.step(self._to_action(taken))
         following = self._observe(seen)
         self._observation = None if terminated or truncated else following
-        return Frame(observation, outputs, following, as_number(reward), terminated, truncated)
+        return Frame(observation, outputs, following, as_reward(reward), terminated, truncated)
 
     def _rollout_by_torchrl(self) -> TensorDictBase:
         if self.env.batch_size or not self.stop_at_done:

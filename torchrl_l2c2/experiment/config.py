@@ -215,7 +215,7 @@ class ExperimentConfig:
         import torch
 
         # The last episodes may go past the rollout's frames.
-        longest = getattr(self.algorithm, "frames", 0) + self.num_workers * self.task.time_limit
+        longest = self.algorithm.frames + self.num_workers * self.task.time_limit
         buffer = self.replay.make(torch.Generator().manual_seed(self.seed), longest, self.device)
         # Another seed than the sampler's: with one number for a neighbor both draw as many at a
         # time, and where a transition lies would say which neighbor it gets.
@@ -249,7 +249,7 @@ class ExperimentConfig:
                 "num_workers",
                 f"must be more than 1 with workers={self.workers}, got 1: one process plays here.",
             )
-        if workers > 1 and getattr(self.algorithm, "num_envs", None) is not None:
+        if workers > 1 and self.algorithm.num_envs is not None:
             raise SettingError(
                 "num_workers",
                 f"must be 1 with algorithm.num_envs, whose simulators one process plays, got "

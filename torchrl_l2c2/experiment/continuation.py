@@ -113,7 +113,11 @@ def find_checkpoint(
 
 
 def find_elsewhere(
-    folder: str | Path | None, own: Path | None, config: ExperimentConfig, **options: bool
+    folder: str | Path | None,
+    own: Path | None,
+    config: ExperimentConfig,
+    *,
+    allow_other_versions: bool,
 ) -> tuple[Path, dict[str, Any]] | None:
     """The checkpoint in another folder that a run begins from, unless it has one of its own.
 
@@ -126,7 +130,9 @@ def find_elsewhere(
     """
     if folder is None or (own is not None and list_checkpoints(own)):
         return None
-    if (found := find_checkpoint(folder, config, **options)) is None:
+    if (
+        found := find_checkpoint(folder, config, allow_other_versions=allow_other_versions)
+    ) is None:
         hint = " Name its folder." if Path(folder).is_file() else ""
         raise CheckpointError(f"resume={str(folder)!r} holds no checkpoint_*.pt.{hint}")
     return found
@@ -152,8 +158,8 @@ def check_continuable(
     if played >= asked.total:
         tell_past(saved, config.to_dict())
     followed = {
-        "optimizer.linear=true": getattr(config.optimizer, "linear", False),
-        "regularizer.gain=ramp": getattr(config.regularizer, "gain", "") == "ramp",
+        "optimizer.linear=true": config.optimizer.linear,
+        "regularizer.gain=ramp": config.regularizer.ramped,
     }
     for setting, chosen in followed.items():
         if chosen and asked != before:

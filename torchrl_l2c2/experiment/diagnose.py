@@ -17,7 +17,7 @@ from torchrl_l2c2.experiment.diagnosis import (
 from torchrl_l2c2.experiment.environments import TEST_SEED
 from torchrl_l2c2.experiment.errors import told_in_a_line
 from torchrl_l2c2.experiment.files import make_folder_of, write_atomically
-from torchrl_l2c2.experiment.reports.paper import method_name
+from torchrl_l2c2.experiment.reports.names import method_name
 
 
 def main(arguments: Iterable[str] | None = None) -> None:

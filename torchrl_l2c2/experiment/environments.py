@@ -8,7 +8,7 @@ import importlib
 import os
 import sys
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import torch
@@ -110,6 +110,11 @@ def time_limit(task: TaskConfig) -> int:
     return registered
 
 
+def untransformed(env: EnvBase) -> Any:
+    """The environment below TorchRL's transforms; itself where it has none."""
+    return getattr(env, "base_env", env)
+
+
 def control_rate(env: EnvBase) -> float | None:
     """Actions per second of simulated time; ``None`` where the simulator does not say.
 
@@ -121,7 +126,7 @@ def control_rate(env: EnvBase) -> float | None:
         >>> control_rate(GymEnv("Pendulum-v1"))
         20.0
     """
-    simulator = getattr(env, "base_env", env).unwrapped
+    simulator = untransformed(env).unwrapped
     # MuJoCo's and the classic tasks; Bullet's; the cart pole.
     for owner, name in (
         (simulator, "dt"),

@@ -42,7 +42,7 @@ from torchrl_l2c2.metrics import (
 )
 
 # The field's measures beside the paper's, each of the actions of an episode [T, A].
-MEASURES: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
+ACTION_MEASURES: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
     "action_rate": action_rate,
     "action_fluctuation_ratio": action_fluctuation_ratio,
     "action_jerk": action_jerk,
@@ -180,7 +180,7 @@ def measure(actions: torch.Tensor, spec: TensorSpec) -> dict[str, float]:
     long_enough = len(actions) >= LEAST_STEPS
     found = {
         name: function(actions).item() if long_enough else math.nan
-        for name, function in MEASURES.items()
+        for name, function in ACTION_MEASURES.items()
     }
     if isinstance(spec, Bounded) and spec.dtype.is_floating_point:
         found["saturation"] = saturation(actions, spec.space.low, spec.space.high).item()

@@ -31,7 +31,7 @@ from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
 from torchrl_l2c2.experiment.algorithms.networks import action_bounds
 from torchrl_l2c2.experiment.collection import play_episodes
-from torchrl_l2c2.experiment.environments import control_rate
+from torchrl_l2c2.experiment.environments import control_rate, untransformed
 from torchrl_l2c2.experiment.errors import told_in_a_line
 from torchrl_l2c2.experiment.files import make_folder, write_atomically, write_json
 from torchrl_l2c2.experiment.process import ProcessState
@@ -226,7 +226,7 @@ def _expected(run: Path, best: bool) -> dict[str, Any]:
 
 def _describe_observation(env: EnvBase) -> dict[str, Any]:
     shape = tuple(env.observation_spec["observation"].shape)
-    seen = getattr(env, "base_env", env).unwrapped.observation_space
+    seen = untransformed(env).unwrapped.observation_space
     described: dict[str, Any] = {"shape": ["batch", *shape], "dtype": "float32"}
     if len(shape) == 1:
         described["entries"] = entry_names(seen, shape[0])
@@ -250,7 +250,7 @@ def _describe_image(env: EnvBase) -> dict[str, Any]:
 
 def _wrapper(env: EnvBase, kind: type) -> Any:
     """The outermost wrapper of a kind around the simulator; ``None`` without one."""
-    wrapped = getattr(env, "base_env", env)._env
+    wrapped = untransformed(env)._env
     while isinstance(wrapped, gymnasium.Wrapper):
         if isinstance(wrapped, kind):
             return wrapped

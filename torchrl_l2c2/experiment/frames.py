@@ -60,7 +60,7 @@ class Frame(NamedTuple):
         return math.isfinite(self.reward + sum(float(tensor.sum()) for tensor in tensors))
 
 
-def as_number(reward: Any) -> float:
+def as_reward(reward: Any) -> float:
     """A reward as Gymnasium has it; an array or a tensor of one number is taken as well.
 
     Raises:

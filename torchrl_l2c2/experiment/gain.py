@@ -12,7 +12,7 @@ from typing import Any
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.evaluate import TESTED
 from torchrl_l2c2.experiment.learner import Learner
-from torchrl_l2c2.experiment.player import MEASURES
+from torchrl_l2c2.experiment.player import EPISODE_COLUMNS
 from torchrl_l2c2.experiment.regularizers import GainConfig
 from torchrl_l2c2.experiment.settings import SettingError
 from torchrl_l2c2.gains import (
@@ -146,7 +146,7 @@ class GainControl:
 
     def _check_column(self, name: str, *, tested: bool) -> None:
         """Which columns will have numbers is known before anything is played."""
-        columns = {*MEASURES, *self._learner.report(0), *(TESTED if tested else ())}
+        columns = {*EPISODE_COLUMNS, *self._learner.report(0), *(TESTED if tested else ())}
         if "scale" not in self._learner.agent.policy.out_keys:
             columns.remove("policy_scale")
         if name not in columns:

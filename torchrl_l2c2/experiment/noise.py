@@ -27,7 +27,7 @@ from torchrl_l2c2.experiment.frames import check_finite
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.reports import FinishedRun, find_runs
 from torchrl_l2c2.experiment.reports.comparison import Estimate
-from torchrl_l2c2.experiment.reports.field import MEASURES
+from torchrl_l2c2.experiment.reports.field import FIELD_MEASURES
 from torchrl_l2c2.experiment.reports.figures import finish, styles, subplots
 from torchrl_l2c2.experiment.reports.groups import Group, group_records
 from torchrl_l2c2.experiment.reports.statistics import mean
@@ -125,7 +125,7 @@ def noise_table(played: Sequence[Played]) -> Table:
             *(_cell(group, summaries, level, quantity) for level in levels),
         ]
         for group in groups
-        for quantity, name in MEASURES.items()
+        for quantity, name in FIELD_MEASURES.items()
     ]
     columns = ["task", "algorithm", "method", "seeds", "measure", *(f"{x:g}" for x in levels)]
     return Table("Noise on the observations", columns, rows, [LEGEND])
@@ -140,8 +140,8 @@ def draw_noise(played: Sequence[Played], path: str | Path) -> None:
     """
     groups, summaries = _grouped(played)
     looks, levels = styles(groups), list(played[0].summaries)
-    figure, axes = subplots(len(MEASURES), 1, (3.4 * len(MEASURES) + 0.6, 3.6))
-    for axis, (quantity, name) in zip(axes, MEASURES.items(), strict=True):
+    figure, axes = subplots(len(FIELD_MEASURES), 1, (3.4 * len(FIELD_MEASURES) + 0.6, 3.6))
+    for axis, (quantity, name) in zip(axes, FIELD_MEASURES.items(), strict=True):
         for group in groups:
             found = [_estimate(group, summaries, level, quantity) for level in levels]
             known = [(x, each) for x, each in zip(levels, found, strict=True) if each is not None]

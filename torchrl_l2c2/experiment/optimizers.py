@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from pydantic import Field
 
@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 
 @settings
 class AdaTermConfig:
-    """The paper's optimizer, :class:`~torchrl_l2c2.AdaTerm`."""
+    """The paper's optimizer, :class:`~torchrl_l2c2.AdaTerm`, at one learning rate."""
+
+    linear: ClassVar[bool] = False
 
     name: str = "adaterm"
     lr: float = Field(default=1e-3, ge=0, description="learning rate [paper]")
@@ -70,7 +72,7 @@ def anneal(config: OptimizerConfig, optimizer: Optimizer, done: float) -> None:
     """
     import torch
 
-    if not getattr(config, "linear", False):
+    if not config.linear:
         return
     rate = config.lr * max(0.0, 1.0 - done)
     for group in optimizer.param_groups:

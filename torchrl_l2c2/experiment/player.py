@@ -22,7 +22,7 @@ from torchrl_l2c2.metrics import action_variation
 Played = TypeVar("Played")
 
 # Of every episode, by their names in metrics.csv.
-MEASURES = ("return", "action_variation", "policy_scale", "length")
+EPISODE_COLUMNS = ("return", "action_variation", "policy_scale", "length")
 
 
 @dataclass
@@ -149,5 +149,5 @@ class Player:
             float("nan") if scale is None else scale.mean().item(),
             transitions.numel(),
         )
-        measures = dict(zip(MEASURES, values, strict=True))
+        measures = dict(zip(EPISODE_COLUMNS, values, strict=True))
         return Episode(transitions, last_frame, measures, ends_round)

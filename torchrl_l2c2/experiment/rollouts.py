@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
 from torchrl_l2c2.experiment.acting import on_tensors
 from torchrl_l2c2.experiment.collection import observed, simulator_and_noise
-from torchrl_l2c2.experiment.frames import PREVIOUS, Frame, as_number, stack_frames
+from torchrl_l2c2.experiment.frames import PREVIOUS, Frame, as_reward, stack_frames
 
 
 class Ended(NamedTuple):
@@ -168,7 +168,7 @@ class _Stream:
         self._observation = self._observe(seen)
         if self._keep_previous:
             outputs[PREVIOUS] = self._frames[-1].observation if self._frames else before
-        earned = as_number(reward)
+        earned = as_reward(reward)
         frame = Frame(before, outputs, self._observation, earned, terminated, truncated)
         self._frames.append(frame)
         return frame

@@ -28,7 +28,7 @@ from torchrl_l2c2.experiment.files import make_folder
 from torchrl_l2c2.experiment.lock import FolderInUseError, lock_folder
 from torchrl_l2c2.experiment.reports import find_runs, write_report
 from torchrl_l2c2.experiment.reports.comparison import SIGNS
-from torchrl_l2c2.experiment.reports.front import front_figure, front_table
+from torchrl_l2c2.experiment.reports.front import front_table, front_test
 from torchrl_l2c2.experiment.reports.groups import by_task, group_records
 from torchrl_l2c2.experiment.search_space import check_settings, read_space, short
 from torchrl_l2c2.experiment.sweep import start_guard
@@ -126,8 +126,8 @@ class Search:
         records = [run.record for run in find_runs([self._of(number)]).runs]
         if not records:
             raise RuntimeError(f"{self.name(number)} has no results; {UNTESTED}.")
-        figure = front_figure(group_records(records))
-        scores = {q: [record.figure(figure, q) for record in records] for q in SIGNS}
+        test = front_test(group_records(records))
+        scores = {q: [record.value(test, q) for record in records] for q in SIGNS}
         values = {quantity: statistics.fmean(each) for quantity, each in scores.items()}
         self.study.tell(number, list(values.values()), skip_if_finished=True)
         return values
@@ -256,7 +256,7 @@ def _report(folder: Path) -> None:
         )
     page = write_report(folder / "report", records, found.runs, found.notes)
     fronts = [
-        front_table(groups, front_figure(groups)).markdown()
+        front_table(groups, front_test(groups)).markdown()
         for groups in by_task(group_records(records))
     ]
     print(*fronts, f"report: {page}", sep="\n\n")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -50,7 +51,8 @@ def load_policy(
         FileNotFoundError: the folder is not a run's, or holds no such policy nor a checkpoint.
         CheckpointError: its policy, or all of its checkpoints, are damaged.
         ValueError: its ``config.json`` is damaged.
-        SettingError: a scale of noise below zero, or a seed that NumPy does not take.
+        SettingError: a scale of noise that is negative or not finite, or a seed that NumPy does
+            not take.
 
     Examples:
         >>> import tempfile
@@ -67,6 +69,8 @@ def load_policy(
     folder = Path(folder)
     if seed is not None and not 0 <= seed < 2**32:
         raise SettingError("seed", f"must be at least 0 and below 2 ** 32, got {seed}.")
+    if noise_scale is not None and not 0 <= noise_scale < math.inf:
+        raise SettingError("noise_scale", f"must be at least 0 and finite, got {noise_scale}.")
     if not (folder / "config.json").exists():
         raise FileNotFoundError(f"{str(folder)!r} is not the folder of a run: no config.json.")
     config = ExperimentConfig.from_dict(read_config(folder))

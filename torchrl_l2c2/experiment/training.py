@@ -114,7 +114,7 @@ class Experiment:
         try:
             self._best_policy = BestPolicy(config, self.agent.policy, self.folder)
             self._gain = GainControl(config, self.learner)
-            self._begin(resume, allow_other_versions=allow_other_versions)
+            self._begin(resume, allow_other_versions)
         except BaseException:
             self.close()
             raise
@@ -290,7 +290,8 @@ class Experiment:
         self._log.close()
         self._unlock()
 
-    def _begin(self, elsewhere: str | Path | None, **options: bool) -> None:
+    def _begin(self, elsewhere: str | Path | None, allow_other_versions: bool) -> None:
+        options = {"allow_other_versions": allow_other_versions}
         found = find_elsewhere(elsewhere, self.folder, self.config, **options)
         if self.folder is not None:
             # Only now, as what was refused above leaves no folder.
@@ -318,7 +319,7 @@ class Experiment:
         return {name: part for name, part in parts.items() if part is not None}
 
     def _untrained(self) -> str | None:
-        random_frames = getattr(self.config.algorithm, "random_frames", 0)
+        random_frames = self.config.algorithm.random_frames
         return untrained(self.player.frames, self.learner.updates, random_frames)
 
     def _spent(self, budget: Budget) -> int:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
 from torchrl_l2c2.experiment.collection import play_episodes
-from torchrl_l2c2.experiment.environments import control_rate, make_env
+from torchrl_l2c2.experiment.environments import control_rate, make_env, untransformed
 from torchrl_l2c2.experiment.errors import told_in_a_line
 from torchrl_l2c2.experiment.files import make_folder_of
 from torchrl_l2c2.experiment.process import ProcessState
@@ -123,7 +123,7 @@ def play_pictures(
         policy, env, max_steps = load_policy(
             run, seed=seed, noise_scale=noise_scale, best=best, render=True
         )
-        simulator = getattr(env, "base_env", env)._env
+        simulator = untransformed(env)._env
         with ProcessState(seed or 0):
             played = [
                 (episode, list(simulator.render()), control_rate(env))

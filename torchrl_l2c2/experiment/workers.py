@@ -47,7 +47,7 @@ def make_collector(
         seeds = (config.seed + SEEDS_APART * i for i in range(1, algorithm.num_envs))
         envs = [env, *(make_env(config.task, seed) for seed in seeds)]
         return RolloutCollector(envs, agent.policy, frames_per_batch=algorithm.frames, **options)
-    options["random_frames"] = getattr(config.algorithm, "random_frames", 0)
+    options["random_frames"] = algorithm.random_frames
     if config.num_workers == 1:
         frames = 1 if config.algorithm.schedule == "step" else config.task.time_limit
         return EpisodeCollector(env, agent.policy, frames_per_batch=frames, **options)

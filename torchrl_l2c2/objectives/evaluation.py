@@ -42,7 +42,7 @@ class ForwardPass:
     """What regularizers make once for all their terms."""
 
 
-class Evaluation:
+class EvaluatedNetworks:
     """The networks of a loss that are evaluated, and what a forward pass shares of it.
 
     Methods take the loss itself, so that this object, one of its attributes, does not refer back.

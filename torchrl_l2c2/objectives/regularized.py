@@ -12,7 +12,7 @@ from torchrl.objectives import LossModule
 
 from torchrl_l2c2._checks import check_of_each
 from torchrl_l2c2.objectives.declarations import DeclaredTerms, listed_names
-from torchrl_l2c2.objectives.evaluation import Evaluation, Policy, is_ensemble
+from torchrl_l2c2.objectives.evaluation import EvaluatedNetworks, Policy, is_ensemble
 from torchrl_l2c2.objectives.shared_evaluation import SharedEvaluation
 from torchrl_l2c2.objectives.specialization import SpecializedLoss
 from torchrl_l2c2.objectives.transitions import (
@@ -98,7 +98,7 @@ class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
         self = super().__new__(cls, base_loss)
         check_is_trained_on_transitions(base_loss)
         regularized = isinstance(base_loss, RegularizedLoss)
-        self._evaluation = Evaluation(base_loss._evaluation.wiring if regularized else None)
+        self._evaluation = EvaluatedNetworks(base_loss._evaluation.wiring if regularized else None)
         return self
 
     def set_keys(self, **kwargs: NestedKey | None) -> None:

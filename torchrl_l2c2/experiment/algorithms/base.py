@@ -25,10 +25,17 @@ class AlgorithmConfig:
     Attributes:
         usual_replay: name of the replay buffer that it comes with.
         usual_optimizer: name of the optimizer that it comes with.
+        frames: least that an update learns from; 0 where a replay buffer has them.
+        num_envs: simulators that one policy plays at once; ``None`` where it plays one.
+        random_frames: played with random actions before learning starts.
     """
 
     usual_replay: ClassVar[str] = "uniform"
     usual_optimizer: ClassVar[str] = "adam"
+
+    frames: int = 0
+    num_envs: int | None = None
+    random_frames: int = 0
 
     name: str
     gamma: float
@@ -62,7 +69,6 @@ class OffPolicyConfig(AlgorithmConfig):
 
     replay_ratio: float | None
     updates: int | None
-    random_frames: int = 0
 
     def __post_init__(self) -> None:
         # A usual ratio gives way to a number of updates, a chosen one does not.

@@ -16,7 +16,7 @@ from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase, ExplorationType, GymWrapper, set_exploration_type
 
 from torchrl_l2c2._checks import check_positive_int, check_real
-from torchrl_l2c2.experiment.environments import control_rate
+from torchrl_l2c2.experiment.environments import control_rate, untransformed
 from torchrl_l2c2.experiment.evaluate import LEAST_STEPS, measure
 from torchrl_l2c2.experiment.frames import check_finite
 from torchrl_l2c2.metrics import action_variation, local_lipschitz, noise_sensitivity
@@ -210,7 +210,6 @@ def diagnose(
     near = Neighborhood() if neighborhood is None else neighborhood
     steepness = _steepness(first, key, env.action_key, act, value, near, num_neighbors, generator)
     states, following = first[key], first["next", key]
-    simulator = getattr(env, "base_env", env)
     sensitivity = noise_sensitivity(act, states, noise_scale, generator=generator).item()
     change = actions.diff(dim=0).square().sum(-1).mean().item()
     return Diagnosis(
@@ -229,7 +228,7 @@ def diagnose(
         # Two independent draws differ by twice the variance of one.
         noise_share=4 * sensitivity / change if change else 0.0,
         spread=_spread(policy, states, key, env, low, high, seed),
-        rate=control_rate(env) if isinstance(simulator, GymWrapper) else None,
+        rate=control_rate(env) if isinstance(untransformed(env), GymWrapper) else None,
         entries=[f"{key}[{i}]" for i in range(_flat(states).shape[1])],
     )
 

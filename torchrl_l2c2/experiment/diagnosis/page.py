@@ -25,7 +25,7 @@ from torchrl_l2c2.experiment.diagnosis.words import (
 )
 from torchrl_l2c2.experiment.files import write_atomically
 from torchrl_l2c2.experiment.reports.document import inside, picture, whole_page
-from torchrl_l2c2.experiment.reports.measures import MEASURES
+from torchrl_l2c2.experiment.reports.measures import MEASURE_NAMES
 from torchrl_l2c2.experiment.reports.tables import Table
 
 STYLE = """
@@ -146,7 +146,7 @@ def _card(one: Diagnosis, most: float | None) -> str:
 
 
 def _measures(diagnoses: Sequence[Diagnosis]) -> Table:
-    names = {**FIRST, **MEASURES}
+    names = {**FIRST, **MEASURE_NAMES}
     known = [name for name in names if any(name in one.measures for one in diagnoses)]
     rows = [
         [names[name], *(_number(one.measures.get(name, math.nan)) for one in diagnoses)]

@@ -23,7 +23,7 @@ from torchrl_l2c2.experiment.checkpoints import load_newest
 from torchrl_l2c2.experiment.collection import play_episodes
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.diagnosis.measured import Diagnosis, TermShare, Value, diagnose
-from torchrl_l2c2.experiment.environments import TEST_SEED
+from torchrl_l2c2.experiment.environments import TEST_SEED, untransformed
 from torchrl_l2c2.experiment.export import entry_names
 from torchrl_l2c2.experiment.frames import PREVIOUS
 from torchrl_l2c2.experiment.process import ProcessState
@@ -33,7 +33,7 @@ from torchrl_l2c2.experiment.saved import read_config
 from torchrl_l2c2.experiment.trained import load_policy
 from torchrl_l2c2.experiment.video import play_pictures
 from torchrl_l2c2.gains import gradient_shares
-from torchrl_l2c2.objectives.evaluation import Evaluation, is_ensemble
+from torchrl_l2c2.objectives.evaluation import EvaluatedNetworks, is_ensemble
 from torchrl_l2c2.objectives.wiring import VALUE_NETWORKS
 
 
@@ -81,12 +81,12 @@ def diagnose_run(
             name=name or str(folder),
             episodes=episodes,
             max_steps=max_steps,
-            neighborhood=getattr(config.regularizer, "neighborhood", None),
+            neighborhood=config.regularizer.neighborhood,
             value=None if agent is None else value_function(agent.loss, agent.normalization),
             noise_scale=noise or 0.01,
         )
         shares = _shares(folder, config, agent, env, max_steps)
-    seen = getattr(env, "base_env", env).unwrapped.observation_space
+    seen = untransformed(env).unwrapped.observation_space
     entries = entry_names(seen, found.observations.shape[1])
     env.close()
     pictures = _pictures(folder, seed, noise_scale, best) if with_pictures else []
@@ -108,7 +108,7 @@ def value_function(loss: LossModule, normalization: Normalization | None = None)
     present = [name for name in VALUE_NETWORKS if getattr(loss, name, None) is not None]
     if not present:
         return None
-    network, evaluation = present[0], Evaluation()
+    network, evaluation = present[0], EvaluatedNetworks()
     evaluation.wire(loss, [network])
     dim = int(is_ensemble(loss, network))
 

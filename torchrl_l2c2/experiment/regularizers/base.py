@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     import torch
     from torchrl.objectives import LossModule
 
+    from torchrl_l2c2.neighborhood import Neighborhood
     from torchrl_l2c2.transforms import NeighborTransform
 
 # The gains that read a setting: with the others it would have no effect.
@@ -36,6 +37,16 @@ class RegularizerConfig:
     reads_previous: ClassVar[bool] = False
 
     name: str
+
+    @property
+    def neighborhood(self) -> Neighborhood | None:
+        """Where the states lie that it compares with; ``None`` where that is no neighborhood."""
+        return None
+
+    @property
+    def ramped(self) -> bool:
+        """Whether its gain rises over the length of a training."""
+        return False
 
     def wrap(self, loss: LossModule) -> LossModule:
         """The loss with the regularizer's terms."""
@@ -107,6 +118,11 @@ class GainConfig(RegularizerConfig):
                     f"gain={self.gain}: choose such a gain, or leave {name} at "
                     f"{'null' if usual is None else usual}.",
                 )
+
+    @property
+    def ramped(self) -> bool:
+        """As of all."""
+        return self.gain == "ramp"
 
     @property
     def targets(self) -> dict[str, float]:

@@ -9,8 +9,8 @@ from torchrl_l2c2.experiment.reports.groups import Group, group_records
 from torchrl_l2c2.experiment.reports.page import write_report
 from torchrl_l2c2.experiment.reports.paper import PAPER, Published
 from torchrl_l2c2.experiment.reports.records import (
-    FIGURES,
     QUANTITIES,
+    TESTS,
     Record,
     read_records,
     write_records,
@@ -29,9 +29,9 @@ from torchrl_l2c2.experiment.reports.runs import (
 )
 
 __all__ = [
-    "FIGURES",
     "PAPER",
     "QUANTITIES",
+    "TESTS",
     "FinishedRun",
     "Found",
     "Group",

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_l2c2.experiment.reports.groups import Group, baseline_of, over_tasks
-from torchrl_l2c2.experiment.reports.records import FIGURES, QUANTITIES
+from torchrl_l2c2.experiment.reports.records import QUANTITIES, TESTS
 from torchrl_l2c2.experiment.reports.statistics import (
     Interval,
     Scores,
@@ -51,34 +51,34 @@ class Estimate:
 
 
 def improvement(
-    groups: Sequence[Group], baselines: Sequence[Group], figure: str, quantity: str
+    groups: Sequence[Group], baselines: Sequence[Group], test: str, quantity: str
 ) -> Estimate | None:
     """Probability that a run is better than one of the baseline, over tasks.
 
     Args:
         groups (sequence of Group): one of each task, which counts with all of its runs.
         baselines (sequence of Group): vanilla, or another method, of the same tasks in this order.
-        figure (str): one of ``FIGURES``.
+        test (str): one of ``TESTS``.
         quantity (str): ``"return"``, or a measure of which less is better.
 
     Returns:
         Estimate: ``None`` where a task has no such runs.
     """
     sign = SIGNS.get(quantity, -1.0)
-    matrices = [sign * _matrix(side, figure, quantity) for side in (groups, baselines)]
+    matrices = [sign * _matrix(side, test, quantity) for side in (groups, baselines)]
     if any(np.isnan(matrix).all(0).any() for matrix in matrices):
         return None
     return Estimate.of(probability_of_improvement, *matrices)
 
 
 def improvements_over_tasks(
-    groups: Sequence[Group], figure: str
+    groups: Sequence[Group], test: str
 ) -> list[tuple[str, str, list[Group], list[str]]]:
     """Of methods that several tasks have: probabilities, unlike means, need no common scale.
 
     Args:
         groups (sequence of Group): of several tasks.
-        figure (str): one of ``FIGURES``.
+        test (str): one of ``TESTS``.
 
     Returns:
         list: the algorithm, the method, its group of each task, and of each of ``QUANTITIES`` how
@@ -89,49 +89,49 @@ def improvements_over_tasks(
         group: baseline
         for group in groups
         if (baseline := baseline_of(group, groups)) is not None
-        and all(len(side.scores(figure, "return")) for side in (group, baseline))
+        and all(len(side.scores(test, "return")) for side in (group, baseline))
     }
     found = []
     for algorithm, name, ours in over_tasks(vanilla):
         if len(ours) > 1:
             theirs = [vanilla[group] for group in ours]
-            better = [probability(improvement(ours, theirs, figure, q)) for q in QUANTITIES]
+            better = [probability(improvement(ours, theirs, test, q)) for q in QUANTITIES]
             found.append((algorithm, name, ours, better))
     return found
 
 
 def statistics_tables(groups: Sequence[Group]) -> list[Table]:
-    """Interquartile means and probabilities of improvement, a table for each figure there is."""
-    known = [f for f in FIGURES if any(len(group.scores(f, "return")) for group in groups)]
-    return [statistics_table(figure, groups) for figure in known]
+    """Interquartile means and probabilities of improvement, a table for each test there is."""
+    known = [f for f in TESTS if any(len(group.scores(f, "return")) for group in groups)]
+    return [statistics_table(test, groups) for test in known]
 
 
-def statistics_table(figure: str, groups: Sequence[Group]) -> Table:
-    """Interquartile means, and probabilities of improvement over vanilla, of one figure.
+def statistics_table(test: str, groups: Sequence[Group]) -> Table:
+    """Interquartile means, and probabilities of improvement over vanilla, of one test.
 
     Args:
-        figure (str): one of ``FIGURES``.
+        test (str): one of ``TESTS``.
         groups (sequence of Group): a row each, and one for each method that several tasks have.
     """
     columns = ["task", "algorithm", "method", "runs"]
     for quantity, better in zip(QUANTITIES.values(), ("larger", "smaller"), strict=True):
         columns += [f"{quantity}: interquartile mean", f"P({better} than vanilla)"]
-    rows = [_statistics_row(figure, group, baseline_of(group, groups)) for group in groups]
-    rows += _across_tasks(figure, groups)
+    rows = [_statistics_row(test, group, baseline_of(group, groups)) for group in groups]
+    rows += _across_tasks(test, groups)
     notes = [
         "95% intervals of the stratified bootstrap in brackets (Agarwal et al. 2021). "
         "P: how probable it is that a run is better than one of vanilla with the same other "
         "settings, ties halved."
     ]
-    return Table(f"Statistics: {FIGURES[figure]}", columns, rows, notes)
+    return Table(f"Statistics: {TESTS[test]}", columns, rows, notes)
 
 
-def _statistics_row(figure: str, group: Group, baseline: Group | None) -> list[str]:
-    runs = str(len(group.scores(figure, "return")))
+def _statistics_row(test: str, group: Group, baseline: Group | None) -> list[str]:
+    runs = str(len(group.scores(test, "return")))
     cells = [group.first.task, group.first.algorithm, group.name, runs]
     for quantity in QUANTITIES:
-        center = Estimate.of(interquartile_mean, group.scores(figure, quantity))
-        better = improvement([group], [baseline], figure, quantity) if baseline else None
+        center = Estimate.of(interquartile_mean, group.scores(test, quantity))
+        better = improvement([group], [baseline], test, quantity) if baseline else None
         if center is None:
             cells += ["-", ""]
         else:
@@ -140,10 +140,10 @@ def _statistics_row(figure: str, group: Group, baseline: Group | None) -> list[s
     return cells
 
 
-def _across_tasks(figure: str, groups: Sequence[Group]) -> list[list[str]]:
+def _across_tasks(test: str, groups: Sequence[Group]) -> list[list[str]]:
     rows = []
-    for algorithm, name, ours, better in improvements_over_tasks(groups, figure):
-        runs = number_range(sorted({len(group.scores(figure, "return")) for group in ours}))
+    for algorithm, name, ours, better in improvements_over_tasks(groups, test):
+        runs = number_range(sorted({len(group.scores(test, "return")) for group in ours}))
         rows.append([f"{len(ours)} tasks", algorithm, name, runs, "", better[0], "", better[1]])
     return rows
 
@@ -155,19 +155,19 @@ def summary(groups: Sequence[Group]) -> list[dict[str, Any]]:
 
 def _summary(group: Group, baseline: Group | None) -> dict[str, Any]:
     statistics: dict[str, Any] = {}
-    for figure in FIGURES:
-        for quantity in (*QUANTITIES, *(["sm_asap"] if figure == "last_mean" else [])):
-            scores = group.scores(figure, quantity)
+    for test in TESTS:
+        for quantity in (*QUANTITIES, *(["sm_asap"] if test == "last_mean" else [])):
+            scores = group.scores(test, quantity)
             if not len(scores):
                 continue
             center, deviation = mean_and_deviation(scores)
-            better = improvement([group], [baseline], figure, quantity) if baseline else None
-            statistics[f"{figure}_{quantity}"] = {
+            better = improvement([group], [baseline], test, quantity) if baseline else None
+            statistics[f"{test}_{quantity}"] = {
                 "mean": center.item(),
                 "standard_deviation": deviation.item() if len(scores) > 1 else None,
                 "interquartile_mean": _plain(Estimate.of(interquartile_mean, scores)),
                 "probability_of_improvement": _plain(better),
-                "by_seed": {str(s): v for s, v in group.by_seed(figure, quantity).items()},
+                "by_seed": {str(s): v for s, v in group.by_seed(test, quantity).items()},
             }
     first = group.first
     return {
@@ -188,9 +188,9 @@ def _plain(estimate: Estimate | None) -> dict[str, Any] | None:
     return None if estimate is None else {"value": estimate.value, "interval": estimate.interval}
 
 
-def _matrix(groups: Sequence[Group], figure: str, quantity: str) -> Scores:
-    """``[runs, tasks]``: runs that have the figure, in the order of seeds; NaN below the fewer."""
-    found = [sorted(group.by_seed(figure, quantity).items()) for group in groups]
+def _matrix(groups: Sequence[Group], test: str, quantity: str) -> Scores:
+    """``[runs, tasks]``: runs that have the test, in the order of seeds; NaN below the fewer."""
+    found = [sorted(group.by_seed(test, quantity).items()) for group in groups]
     columns = [[value for _, value in each] for each in found]
     return np.array(list(zip_longest(*columns, fillvalue=np.nan))).reshape(-1, len(groups))
 

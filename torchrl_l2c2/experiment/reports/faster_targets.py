@@ -52,7 +52,7 @@ def _row(group: Group, groups: Sequence[Group]) -> list[str]:
     better = improvement([group], [without], FIRST, "return") if without else None
     return [
         *(group.first.task, group.name, number_range(group.seeds)),
-        *(pooled(group, figure, "return") for figure in (FIRST, SECOND)),
+        *(pooled(group, test, "return") for test in (FIRST, SECOND)),
         _published(group.first),
         probability(better),
     ]

@@ -53,7 +53,7 @@ NAMES = {
     "asap": "ASAP",
     "lipsnet++": "LipsNet++",
 }
-MEASURES = {"return": "return", "sm_asap": "Sm", "action_variation": "action variation"}
+FIELD_MEASURES = {"return": "return", "sm_asap": "Sm", "action_variation": "action variation"}
 # How probable a method's run is better by each than one of vanilla.
 BETTER = {"return": "P(larger return)", "sm_asap": "P(smaller Sm)"}
 LEGEND = (
@@ -84,7 +84,7 @@ def field_table(records: Sequence[Record]) -> Table | None:
         task, algorithm = together[0].first.task, together[0].first.algorithm
         rows += [_row(group, baseline_of(group, groups)) for group in together]
         rows += _others(task, algorithm, {g.first.method for g in together})
-    columns = ["task", "algorithm", "method", "seeds", *MEASURES.values()]
+    columns = ["task", "algorithm", "method", "seeds", *FIELD_MEASURES.values()]
     columns += [*BETTER.values(), "published: return", "published: Sm"]
     return Table("Beside the published table", columns, rows, [LEGEND])
 
@@ -108,7 +108,7 @@ def field_groups(records: Sequence[Record]) -> list[Group]:
 def _row(group: Group, vanilla: Group | None) -> list[str]:
     first = group.first
     cells = [first.task, first.algorithm, group.name, number_range(group.seeds)]
-    for quantity in MEASURES:
+    for quantity in FIELD_MEASURES:
         center = Estimate.of(mean, group.scores("last_mean", quantity))
         if center is None:
             cells.append("-")

@@ -12,11 +12,11 @@ import numpy as np
 
 from torchrl_l2c2.experiment.files import write_atomically
 from torchrl_l2c2.experiment.reports.comparison import Estimate
-from torchrl_l2c2.experiment.reports.field import MEASURES, published_of
+from torchrl_l2c2.experiment.reports.field import FIELD_MEASURES, published_of
 from torchrl_l2c2.experiment.reports.front import means, pareto_front
 from torchrl_l2c2.experiment.reports.groups import Group, comparable, group_records
-from torchrl_l2c2.experiment.reports.paper import METHODS
-from torchrl_l2c2.experiment.reports.records import FIGURES, digest
+from torchrl_l2c2.experiment.reports.names import METHODS
+from torchrl_l2c2.experiment.reports.records import TESTS, digest
 from torchrl_l2c2.experiment.reports.runs import FinishedRun
 from torchrl_l2c2.experiment.reports.statistics import Scores, curve_band, mean
 
@@ -61,7 +61,7 @@ def draw_learning_curves(runs: Sequence[FinishedRun], path: str | Path) -> None:
 
 
 def draw_plane(
-    groups: Sequence[Group], figure: str, path: str | Path, measure: str = "action_variation"
+    groups: Sequence[Group], test: str, path: str | Path, measure: str = "action_variation"
 ) -> None:
     """Draws return against smoothness: up and to the left is better and smoother.
 
@@ -71,7 +71,7 @@ def draw_plane(
     Args:
         groups (sequence of Group): a panel is drawn for each task and algorithm, and for groups of
             one that differ in more than the regularizer, as :func:`~.groups.comparable` has it.
-        figure (str): one of ``FIGURES``, such as ``"late_mean"``.
+        test (str): one of ``TESTS``, such as ``"late_mean"``.
         path (str or Path): of the file; its ending, ``.png`` or ``.svg``, decides what it is.
         measure (str): ``"action_variation"``, as the paper has it, or ``"sm_asap"``, as the
             published table of the field's tasks does.
@@ -92,38 +92,38 @@ def draw_plane(
             axis.sharex(first)
             axis.sharey(first)
         for group in together:
-            hollow |= _draw_point(axis, group, figure, measure, looks[group.name])
+            hollow |= _draw_point(axis, group, test, measure, looks[group.name])
         title = f"{of.task}, {of.algorithm}"
         axis.set_title(f"{title}\n{settings}" if settings else title, fontsize=10)
-        axis.set_xlabel(MEASURES[measure])
+        axis.set_xlabel(FIELD_MEASURES[measure])
         axis.set_ylabel("return")
     for axis in axes[len(panels) :]:
         axis.set_visible(False)
-    title = FIGURES[figure]
+    title = TESTS[test]
     if hollow:
         title += "; hollow: " + ("the paper" if measure == "action_variation" else "published")
     drawn_of = digest(record for group in groups for record in group.records)
     finish(picture, axes, title, path, description=f"records {drawn_of}")
 
 
-def draw_front(groups: Sequence[Group], figure: str, path: str | Path) -> None:
+def draw_front(groups: Sequence[Group], test: str, path: str | Path) -> None:
     """Draws every setting as a dot, and those of the Pareto front with their numbers and a line.
 
     Along the line, whatever is gained in return is paid for in smoothness.
 
     Args:
         groups (sequence of Group): of one task and algorithm.
-        figure (str): one of ``FIGURES``.
+        test (str): one of ``TESTS``.
         path (str or Path): of the file; its ending, ``.png`` or ``.svg``, decides what it is.
     """
     picture, axes = subplots(1, 1, (5.4, 4.0))
     looks = styles(groups)
-    front = pareto_front(groups, figure)
+    front = pareto_front(groups, test)
     for group in groups:
-        if place := means(group, figure):
+        if place := means(group, test):
             color = looks[group.name]["color"]
             axes[0].plot(*place[::-1], "o", color=color, alpha=1.0 if group in front else 0.3)
-    steps = [means(group, figure)[::-1] for group in front]
+    steps = [means(group, test)[::-1] for group in front]
     axes[0].step(*zip(*steps, strict=True), where="post", color="#444444", linewidth=1)
     for number, step in enumerate(steps, 1):
         offset = {"xytext": (4, -10), "textcoords": "offset points"}
@@ -131,7 +131,7 @@ def draw_front(groups: Sequence[Group], figure: str, path: str | Path) -> None:
     axes[0].set_xlabel("action variation")
     axes[0].set_ylabel("return")
     first = groups[0].first
-    title = f"{first.task}, {first.algorithm}: {len(groups)} settings, {FIGURES[figure]}"
+    title = f"{first.task}, {first.algorithm}: {len(groups)} settings, {TESTS[test]}"
     finish(picture, axes, title, path)
 
 
@@ -165,10 +165,10 @@ def _moving_average(values: Scores, window: int) -> Scores:
     return averages
 
 
-def _draw_point(axis: Any, group: Group, figure: str, measure: str, style: dict[str, str]) -> bool:
+def _draw_point(axis: Any, group: Group, test: str, measure: str, style: dict[str, str]) -> bool:
     """Draws a group; whether something was published of it, which is drawn, too."""
     color = style["color"]
-    estimates = [Estimate.of(mean, group.scores(figure, name)) for name in (measure, "return")]
+    estimates = [Estimate.of(mean, group.scores(test, name)) for name in (measure, "return")]
     if None not in estimates:
         (x, x_bars), (y, y_bars) = ((e.value, _bars(e)) for e in estimates if e is not None)
         shape = {"fmt": style["marker"], "markersize": 6, "elinewidth": 1.6, "capsize": 3}

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from torchrl_l2c2.experiment.reports.comparison import SIGNS
 from torchrl_l2c2.experiment.reports.groups import Group
-from torchrl_l2c2.experiment.reports.records import FIGURES, QUANTITIES
+from torchrl_l2c2.experiment.reports.records import QUANTITIES, TESTS
 from torchrl_l2c2.experiment.reports.tables import Table, number_range, pooled
 
 # Fewer settings of one method are a comparison, which tables of results show.
@@ -26,26 +26,26 @@ def searched(groups: Sequence[Group]) -> list[list[Group]]:
         found
         for found in together.values()
         if max(Counter(group.first.method for group in found).values()) >= LEAST
-        and pareto_front(found, front_figure(found))
+        and pareto_front(found, front_test(found))
     ]
 
 
-def front_figure(groups: Sequence[Group]) -> str:
-    """The figure that a front of these groups is of: what most of them have, or else the first."""
-    return max(MEASURED, key=lambda figure: sum(_is_known(group, figure) for group in groups))
+def front_test(groups: Sequence[Group]) -> str:
+    """The test that a front of these groups is of: what most of them have, or else the first."""
+    return max(MEASURED, key=lambda test: sum(_is_known(group, test) for group in groups))
 
 
-def means(group: Group, figure: str) -> tuple[float, ...]:
+def means(group: Group, test: str) -> tuple[float, ...]:
     """Return and action variation, means over seeds; fewer numbers where one is not known."""
-    scores = [group.scores(figure, quantity) for quantity in SIGNS]
+    scores = [group.scores(test, quantity) for quantity in SIGNS]
     return tuple(float(each.mean()) for each in scores if len(each))
 
 
-def _is_known(group: Group, figure: str) -> bool:
-    return len(means(group, figure)) == len(SIGNS)
+def _is_known(group: Group, test: str) -> bool:
+    return len(means(group, test)) == len(SIGNS)
 
 
-def pareto_front(groups: Sequence[Group], figure: str) -> list[Group]:
+def pareto_front(groups: Sequence[Group], test: str) -> list[Group]:
     """Those with which no other one can compete in both, from the smoothest on.
 
     A group is left out if another one is at least as good in return and in action variation, and
@@ -53,9 +53,9 @@ def pareto_front(groups: Sequence[Group], figure: str) -> list[Group]:
 
     Args:
         groups (sequence of Group): of one task and algorithm.
-        figure (str): one of ``FIGURES``.
+        test (str): one of ``TESTS``.
     """
-    known = [(group, means(group, figure)) for group in groups if _is_known(group, figure)]
+    known = [(group, means(group, test)) for group in groups if _is_known(group, test)]
     # The smoothest first, and of equally smooth ones that with the largest return.
     ordered = sorted((m[1], -m[0], i) for i, (_, m) in enumerate(known))
     front: list[int] = []
@@ -67,20 +67,20 @@ def pareto_front(groups: Sequence[Group], figure: str) -> list[Group]:
     return [known[place][0] for place in front]
 
 
-def front_table(groups: Sequence[Group], figure: str) -> Table:
+def front_table(groups: Sequence[Group], test: str) -> Table:
     """The front, numbered as in its picture; means over seeds, standard deviations in brackets."""
-    first, front = groups[0].first, pareto_front(groups, figure)
+    first, front = groups[0].first, pareto_front(groups, test)
     rows = [
         [
             *(str(place), group.name, number_range(group.seeds)),
-            *(pooled(group, figure, quantity) for quantity in QUANTITIES),
+            *(pooled(group, test, quantity) for quantity in QUANTITIES),
         ]
         for place, group in enumerate(front, 1)
     ]
-    measured = sum(_is_known(group, figure) for group in groups)
+    measured = sum(_is_known(group, test) for group in groups)
     note = (
         f"{len(front)} of {measured} settings; every other one returns no more and is no "
         "smoother than one of these. The best of many has been lucky, too: run it on new seeds."
     )
-    title = f"{first.task}, {first.algorithm}: Pareto front, {FIGURES[figure]}"
+    title = f"{first.task}, {first.algorithm}: Pareto front, {TESTS[test]}"
     return Table(title, ["", "settings", "seeds", *QUANTITIES.values()], rows, [note])

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_l2c2.experiment.reports.paper import method_name, name_with_settings
+from torchrl_l2c2.experiment.reports.names import method_name, name_with_settings
 from torchrl_l2c2.experiment.reports.records import Record
 from torchrl_l2c2.experiment.reports.statistics import Scores
 from torchrl_l2c2.experiment.saved import BUDGETS
@@ -50,14 +50,14 @@ class Group:
         """Every setting but the regularizer's: what is compared with it has the same."""
         return (self.first.task, self.first.algorithm, *sorted(_others(self).items()))
 
-    def by_seed(self, figure: str, quantity: str) -> dict[int, float]:
-        """One of the eight figures of every run that has it."""
-        values = {record.seed: record.figure(figure, quantity) for record in self.records}
+    def by_seed(self, test: str, quantity: str) -> dict[int, float]:
+        """A quantity in one of the tests, of every run that has it."""
+        values = {record.seed: record.value(test, quantity) for record in self.records}
         return {seed: value for seed, value in values.items() if not math.isnan(value)}
 
-    def scores(self, figure: str, quantity: str) -> Scores:
+    def scores(self, test: str, quantity: str) -> Scores:
         """The same as a matrix ``[runs, 1]``."""
-        return np.array(list(self.by_seed(figure, quantity).values())).reshape(-1, 1)
+        return np.array(list(self.by_seed(test, quantity).values())).reshape(-1, 1)
 
 
 def group_records(records: Iterable[Record]) -> list[Group]:

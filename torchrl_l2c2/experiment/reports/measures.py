@@ -12,7 +12,7 @@ from torchrl_l2c2.experiment.reports.runs import FinishedRun
 from torchrl_l2c2.experiment.reports.tables import Table, number_range
 
 # As evaluation.json names them (experiment/evaluate.py): how they are told.
-MEASURES = {
+MEASURE_NAMES = {
     "action_rate": "action rate",
     "action_fluctuation_ratio": "AFR",
     "action_jerk": "jerk",
@@ -35,7 +35,7 @@ def measures_table(runs: Sequence[FinishedRun]) -> Table | None:
     """A row for every group of runs; ``None`` where no run has any of the measures."""
     summaries = {run.record.identity: run.evaluation.get("summary", {}) for run in runs}
     known = [
-        name for name in MEASURES if any(f"{name}_mean" in each for each in summaries.values())
+        name for name in MEASURE_NAMES if any(f"{name}_mean" in each for each in summaries.values())
     ]
     if not known:
         return None
@@ -45,7 +45,7 @@ def measures_table(runs: Sequence[FinishedRun]) -> Table | None:
         cells = [_pooled([each.get(f"{name}_mean") for each in own]) for name in known]
         first = group.first
         rows.append([first.task, first.algorithm, group.name, number_range(group.seeds), *cells])
-    columns = ["task", "algorithm", "method", "seeds", *(MEASURES[name] for name in known)]
+    columns = ["task", "algorithm", "method", "seeds", *(MEASURE_NAMES[name] for name in known)]
     return Table("Other measures of smoothness", columns, rows, [LEGEND])
 
 

@@ -14,12 +14,12 @@ from torchrl_l2c2.experiment.reports.document import picture, whole_page
 from torchrl_l2c2.experiment.reports.faster_targets import faster_targets_table
 from torchrl_l2c2.experiment.reports.field import field_groups, field_table
 from torchrl_l2c2.experiment.reports.figures import draw_front, draw_learning_curves, draw_plane
-from torchrl_l2c2.experiment.reports.front import front_figure, front_table, searched
+from torchrl_l2c2.experiment.reports.front import front_table, front_test, searched
 from torchrl_l2c2.experiment.reports.groups import Group, group_records
 from torchrl_l2c2.experiment.reports.measures import measures_table
 from torchrl_l2c2.experiment.reports.pairwise import pairwise_tables
 from torchrl_l2c2.experiment.reports.paper_table import deployed_table, paper_table
-from torchrl_l2c2.experiment.reports.records import FIGURES, Record
+from torchrl_l2c2.experiment.reports.records import TESTS, Record
 from torchrl_l2c2.experiment.reports.runs import FinishedRun
 from torchrl_l2c2.experiment.reports.score import readings
 from torchrl_l2c2.experiment.reports.tables import Table, results_tables, runs_table, score_table
@@ -43,7 +43,7 @@ def _others(records: Sequence[Record], runs: Sequence[FinishedRun]) -> list[Tabl
     )
     return [
         *statistics_tables(groups),
-        *(front_table(found, front_figure(found)) for found in searched(groups)),
+        *(front_table(found, front_test(found)) for found in searched(groups)),
         *([score_table(scored)] if scored else []),
         *(table for table in more if table is not None),
         *pairwise_tables(records),
@@ -101,17 +101,17 @@ def _draw(folder: Path, records: Sequence[Record], runs: Sequence[FinishedRun]) 
         together = [run for run in runs if (run.task, run.algorithm) == (task, algorithm)]
         paths.append(folder / f"learning_curves_{task.replace('/', '_')}_{algorithm}.svg")
         draw_learning_curves(together, paths[-1])
-    for figure in FIGURES:
-        groups = [g for g in group_records(records) if len(g.scores(figure, "return"))]
+    for test in TESTS:
+        groups = [g for g in group_records(records) if len(g.scores(test, "return"))]
         if groups:
-            paths.append(folder / f"plane_{figure}.svg")
-            draw_plane(groups, figure, paths[-1])
+            paths.append(folder / f"plane_{test}.svg")
+            draw_plane(groups, test, paths[-1])
     if of_field := field_groups(records):
         paths.append(folder / "plane_field.svg")
         draw_plane(of_field, "last_mean", paths[-1], "sm_asap")
     for number, found in enumerate(searched(group_records(records)), 1):
         paths.append(folder / f"front_{number}_{found[0].first.task.replace('/', '_')}.svg")
-        draw_front(found, front_figure(found), paths[-1])
+        draw_front(found, front_test(found), paths[-1])
     return paths
 
 

@@ -15,13 +15,14 @@ from typing import Any
 
 from torchrl_l2c2.experiment.files import make_folder, write_atomically
 from torchrl_l2c2.experiment.reports.differences import read_differences
-from torchrl_l2c2.experiment.reports.paper import TAU, Published, method_order, paper_of
+from torchrl_l2c2.experiment.reports.names import method_order
+from torchrl_l2c2.experiment.reports.paper import TAU, Published, paper_of
 from torchrl_l2c2.experiment.saved import BUDGETS, read_rows
 from torchrl_l2c2.experiment.tasks import TASKS
 
 # Which policies act, and how: the last policy's test episodes, or one episode of every policy
 # late in training; with mean actions, or with samples as in training.
-FIGURES = {
+TESTS = {
     "late_mean": "late policies, mean actions",
     "late_sampled": "late policies, sampled actions",
     "last_mean": "last policy, mean actions",
@@ -95,12 +96,12 @@ class Record:
         method = (*method_order(self.method), len(own), own, self.settings)
         return (task, self.task, self.algorithm, *reading, *method, self.seed)
 
-    def figure(self, figure: str, quantity: str) -> float:
-        """By the names of ``FIGURES`` and ``QUANTITIES``; ``last_mean`` has ``sm_asap`` too.
+    def value(self, test: str, quantity: str) -> float:
+        """By the names of ``TESTS`` and ``QUANTITIES``; ``last_mean`` has ``sm_asap`` too.
 
-        ``policy_scale`` is of the late policies, whatever the figure.
+        ``policy_scale`` is of the late policies, whatever the test.
         """
-        known = quantity if quantity == "policy_scale" else f"{figure}_{quantity}"
+        known = quantity if quantity == "policy_scale" else f"{test}_{quantity}"
         value: float = getattr(self, known)
         return value
 

@@ -23,15 +23,15 @@ class Reading:
     vanilla: Group
     caps: Group
 
-    def cells(self, figure: str) -> dict[tuple[str, str], float]:
+    def cells(self, test: str) -> dict[tuple[str, str], float]:
         """By method and quantity, how many of the paper's standard deviations lie between.
 
         Args:
-            figure (str): one of ``records.FIGURES``.
+            test (str): one of ``records.TESTS``.
 
         Returns:
             dict: ``|mean over seeds - the paper's mean| / the paper's standard deviation``, at
-            most 5; NaN where the runs do not have the figure.
+            most 5; NaN where the runs do not have the test.
         """
         cells = {}
         for group in (self.vanilla, self.caps):
@@ -39,15 +39,15 @@ class Reading:
                 published = group.first.paper
                 assert published is not None
                 center, deviation = published.cell(quantity)
-                values = group.scores(figure, quantity)
+                values = group.scores(test, quantity)
                 distance = abs(values.mean() - center) / deviation if len(values) else math.nan
                 # A NaN first stays one.
                 cells[group.first.method, quantity] = float(min(distance, CAP))
         return cells
 
-    def score(self, figure: str) -> float:
+    def score(self, test: str) -> float:
         """Mean of the four cells, from 0 to 5; smaller is nearer to the paper."""
-        return statistics.fmean(self.cells(figure).values())
+        return statistics.fmean(self.cells(test).values())
 
     @property
     def updates(self) -> float:

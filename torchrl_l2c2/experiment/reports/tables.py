@@ -15,8 +15,8 @@ from torchrl_l2c2.experiment.reports.groups import (
     differing_lengths,
     differing_versions,
 )
-from torchrl_l2c2.experiment.reports.paper import method_name
-from torchrl_l2c2.experiment.reports.records import FIGURES, QUANTITIES, Record
+from torchrl_l2c2.experiment.reports.names import method_name
+from torchrl_l2c2.experiment.reports.records import QUANTITIES, TESTS, Record
 from torchrl_l2c2.experiment.reports.score import COMPARED, Reading
 from torchrl_l2c2.experiment.reports.statistics import mean_and_deviation
 
@@ -82,18 +82,16 @@ def results_tables(groups: Sequence[Group]) -> list[Table]:
     return known
 
 
-def _results(title: str, figures: Sequence[str], groups: Sequence[Group]) -> Table:
+def _results(title: str, tests: Sequence[str], groups: Sequence[Group]) -> Table:
     columns = ["task", "algorithm", "method", "seeds"]
-    columns += [
-        f"{QUANTITIES[q]}, {FIGURES[f].split(', ')[1]}" for q in QUANTITIES for f in figures
-    ]
+    columns += [f"{QUANTITIES[q]}, {TESTS[f].split(', ')[1]}" for q in QUANTITIES for f in tests]
     rows = [
         [
             *(group.first.task, group.first.algorithm, group.name, number_range(group.seeds)),
-            *(pooled(group, figure, quantity) for quantity in QUANTITIES for figure in figures),
+            *(pooled(group, test, quantity) for quantity in QUANTITIES for test in tests),
         ]
         for group in groups
-        if any(len(group.scores(figure, "return")) for figure in figures)
+        if any(len(group.scores(test, "return")) for test in tests)
     ]
     return Table(title, columns, rows)
 
@@ -123,15 +121,15 @@ def _settings_note(which: str, settings: Mapping[str, str]) -> str:
 
 
 def runs_table(records: Sequence[Record]) -> Table:
-    """Every run by itself, with all of its figures."""
+    """Every run by itself, with all of its tests."""
     columns = ["task", "algorithm", "method", "seed", "settings", "length", "frames", "updates"]
-    columns += [f"{QUANTITIES[q]}: {name}" for q in QUANTITIES for name in FIGURES.values()]
+    columns += [f"{QUANTITIES[q]}: {name}" for q in QUANTITIES for name in TESTS.values()]
     columns += ["policy scale"]
     rows = [
         [
             *(r.task, r.algorithm, r.method, str(r.seed), r.settings, r.length),
             *(str(r.frames), str(r.updates)),
-            *(number(r.figure(f, q), q) for q in QUANTITIES for f in FIGURES),
+            *(number(r.value(f, q), q) for q in QUANTITIES for f in TESTS),
             number(r.policy_scale, "policy_scale"),
         ]
         for r in records
@@ -149,15 +147,15 @@ def score_table(readings: Sequence[Reading]) -> Table:
     for reading in readings:
         first = reading.vanilla.first
         seeds = list(dict.fromkeys(number_range(g.seeds) for g in (reading.vanilla, reading.caps)))
-        for figure in ("late_mean", "late_sampled"):
-            cells = reading.cells(figure)
+        for test in ("late_mean", "late_sampled"):
+            cells = reading.cells(test)
             if all(map(math.isnan, cells.values())):
                 continue
             rows.append(
                 [
                     *(first.task, first.differences or "the defaults", "; ".join(seeds)),
-                    *(f"{reading.updates:.0f}", FIGURES[figure].split(", ")[1]),
-                    or_dash(reading.score(figure), ".2f"),
+                    *(f"{reading.updates:.0f}", TESTS[test].split(", ")[1]),
+                    or_dash(reading.score(test), ".2f"),
                     *(or_dash(cells[m, q], ".2f") for m in COMPARED for q in QUANTITIES),
                 ]
             )
@@ -199,9 +197,9 @@ def number_range(values: Sequence[int]) -> str:
     )
 
 
-def pooled(group: Group, figure: str, quantity: str) -> str:
+def pooled(group: Group, test: str, quantity: str) -> str:
     """The mean of a group, with the standard deviation over its seeds in brackets."""
-    scores = group.scores(figure, quantity)
+    scores = group.scores(test, quantity)
     if not len(scores):
         return "-"
     center, deviation = mean_and_deviation(scores)
