@@ -194,7 +194,7 @@ def test_numbers_that_are_not_finite_end_every_command_in_one_line(folder, monke
 
 def test_evaluate_refuses_what_cannot_be(folder, tmp_path):
     """In one line."""
-    with pytest.raises(SystemExit, match="noise_scale must be at least 0 and finite, got -1.0"):
+    with pytest.raises(SystemExit, match="noise_scale must be at least 0 and finite, got -1"):
         evaluated(folder, "--noise", "-1")
     with pytest.raises(SystemExit, match="is not the folder of a run"):
         main([str(tmp_path)])
