@@ -1134,6 +1134,45 @@ def test_the_fields_pages_are_those_of_their_records(name):
     assert f"records {digest(shown)}<" in page.with_suffix(".svg").read_text()
 
 
+# PPO's one setting of L2C2 and what it is compared with, by their names in tables.
+OURS, RIVALS = "L2C2, mse 1, ramp", ("vanilla", "CAPS", "CATS")
+
+
+def three_tasks():
+    """The records of PPO's one setting, and of its rivals, on the tasks it was chosen for."""
+    named = ("field", "walker2d")
+    records = [r for name in named for r in read_records(ROOT / "results" / f"{name}.csv")]
+    groups = [group for group in group_records(records) if group.name in (OURS, *RIVALS)]
+    return [record for group in groups for record in group.records]
+
+
+def against_rivals():
+    """A row for every task and rival: both means, and how probable it is that a run is better."""
+    columns = "task | rival | seeds | return: L2C2 | rival | P(returns more) | Sm: L2C2 | rival"
+    columns += " | P(smoother) | action variation: L2C2 | rival | P(smoother)"
+    rows = [columns, " | ".join(["---"] * 12)]
+    groups = field_groups(three_tasks())
+    for ours in groups:
+        for name in RIVALS if ours.name == OURS else ():
+            (theirs,) = (g for g in groups if (g.first.task, g.name) == (ours.first.task, name))
+            seeds = [number_range(group.seeds) for group in (ours, theirs)]
+            cells = [ours.first.task, name, " and ".join(dict.fromkeys(seeds))]
+            for quantity, digits in (("return", 0), ("sm_asap", 3), ("action_variation", 3)):
+                means = [g.scores("last_mean", quantity).mean() for g in (ours, theirs)]
+                better = improvement([ours], [theirs], "last_mean", quantity)
+                cells += [*(f"{mean:.{digits}f}" for mean in means), better.text("{:.2f}".format)]
+            rows.append(" | ".join(cells))
+    return "\n".join(f"| {row} |" for row in rows)
+
+
+def test_the_page_of_three_tasks_is_that_of_their_records():
+    """As its last command writes it, with what L2C2 is against each rival."""
+    page = ROOT / "results" / "three_tasks.md"
+    text = page.read_text()
+    assert fill(text, field_text(three_tasks(), "three_tasks.svg")) == text
+    assert f"\n{against_rivals()}\n" in text
+
+
 @pytest.mark.parametrize("name", ["field", "walker2d", "sac_pendulum"])
 def test_what_is_said_of_the_harness_is_of_the_records(name):
     """Vanilla's and the rivals' rows beside the published ones."""
@@ -1202,7 +1241,7 @@ def test_the_pages_of_other_readings_are_those_of_their_records():
 # and which policies.
 HEADLINE = {
     "SAC, Pendulum": ("sac_pendulum", "L2C2, means 10", "30000 frames", "last_mean"),
-    "PPO, LunarLander": ("field", "L2C2, means 1, ramp", "500000 frames", "last_mean"),
+    "PPO, LunarLander": ("field", "L2C2, mse 1, ramp", "500000 frames", "last_mean"),
     "PPO, Pendulum": ("field", "L2C2, mse 1, ramp", "500000 frames", "last_mean"),
     "PPO, Walker2d": ("walker2d", "L2C2, mse 1, ramp", "1000000 frames", "last_mean"),
     "PPO-RPE, Reacher, as in the paper": ("runs", "L2C2", "4500 episodes", "last_mean"),
@@ -1216,7 +1255,7 @@ MEASURED = {"sm_asap": "Sm", "action_variation": "action variation"}
 
 def headline(label):
     """Rows of vanilla and of L2C2 on the same seeds: means, and how probable an improvement is."""
-    name, method, length, figure = HEADLINE[label]
+    name, method, length, test = HEADLINE[label]
     task = {"walker2d": "walker2d_v5"}.get(named := label.split(", ")[1].lower(), named)
     read = read_records(ROOT / "results" / f"{name}.csv")
     read = [r for r in read if (r.task, r.length) == (task, length) and TAU not in r.other_settings]
@@ -1226,10 +1265,10 @@ def headline(label):
     assert plain.seeds == ours.seeds == [*range(len(ours.seeds))] and plain.reading == ours.reading
 
     def compared(quantity, digits, *, changes=False):
-        means = [plain.scores(figure, quantity).mean(), ours.scores(figure, quantity).mean()]
+        means = [plain.scores(test, quantity).mean(), ours.scores(test, quantity).mean()]
         cells = [f"{value:.{digits}f}" for value in means]
         cells += [f"{means[1] / means[0] - 1:+.0%}"] if changes else []
-        return [*cells, improvement([ours], [plain], figure, quantity).text("{:.2f}".format)]
+        return [*cells, improvement([ours], [plain], test, quantity).text("{:.2f}".format)]
 
     rows, of_return = [], compared("return", 0)
     start = [label, number_range(plain.seeds)]
