@@ -11,6 +11,7 @@ import argparse
 import heapq
 import logging
 import math
+import statistics
 import time
 from collections.abc import Mapping, Sequence
 from itertools import product
@@ -106,9 +107,8 @@ def main() -> None:
     seconds: dict[tuple[str, str], float] = {}
     for task, method in dict.fromkeys(runs):
         known = recorded(records, task, method)
-        # Of runs that shared their core with others the fastest shared least.
-        seconds[task, method] = min(known) if known else paced(task, method)
-        source = f"the fastest of {len(known)} runs" if known else "pace, at most"
+        seconds[task, method] = statistics.median(known) if known else paced(task, method)
+        source = f"the median of {len(known)} runs" if known else "pace, at most"
         lines.append(f"| {task} | {method} | {seconds[task, method] / 60:.0f} | {source} |")
     print(report([seconds[each] for each in runs], lines, where))
 
