@@ -26,7 +26,7 @@ from torchrl_l2c2.experiment import Experiment, ExperimentConfig
 from torchrl_l2c2.experiment.composition import CONF
 from torchrl_l2c2.experiment.regularizers import REGULARIZERS
 from torchrl_l2c2.experiment.reports import Record, read_records
-from torchrl_l2c2.experiment.reports.filling import is_as_usual
+from torchrl_l2c2.experiment.reports.page import is_as_usual
 from torchrl_l2c2.experiment.tasks import TASKS
 
 RECORDS = Path(__file__).parents[1] / "results" / "runs.csv"

@@ -67,7 +67,7 @@ experiment.reports.front experiment.reports.field experiment.reports.paper_table
 experiment.reports.faster_targets
 experiment.reports.figures
 experiment.reports.choice experiment.reports.pairwise
-experiment.reports.filling experiment.reports.page experiment.reports.results
+experiment.reports.page experiment.reports.report experiment.reports.results
 experiment.reports.__init__
 experiment.reports.__main__
 experiment.trained

@@ -113,7 +113,7 @@ def test_a_report_that_cannot_be_drawn_leaves_none(tmp_path, monkeypatch):
     def fail(*_):
         raise ValueError("no picture")
 
-    monkeypatch.setattr("torchrl_l2c2.experiment.reports.page.draw_front", fail)
+    monkeypatch.setattr("torchrl_l2c2.experiment.reports.report.draw_front", fail)
     with pytest.raises(ValueError, match="no picture"):
         write_report(tmp_path / "report", [record for group in many for record in group.records])
     assert not (tmp_path / "report").exists()

@@ -42,14 +42,6 @@ from torchrl_l2c2.experiment.reports.comparison import improvement, statistics_t
 from torchrl_l2c2.experiment.reports.differences import differences, fingerprint
 from torchrl_l2c2.experiment.reports.faster_targets import faster_targets_table
 from torchrl_l2c2.experiment.reports.field import BETTER, field_groups, field_table
-from torchrl_l2c2.experiment.reports.filling import (
-    END,
-    START,
-    field_text,
-    fill,
-    paper_text,
-    shown_groups,
-)
 from torchrl_l2c2.experiment.reports.groups import (
     baseline_of,
     comparable,
@@ -57,6 +49,14 @@ from torchrl_l2c2.experiment.reports.groups import (
     over_tasks,
 )
 from torchrl_l2c2.experiment.reports.measures import measures_table
+from torchrl_l2c2.experiment.reports.page import (
+    END,
+    START,
+    field_text,
+    fill,
+    paper_text,
+    shown_groups,
+)
 from torchrl_l2c2.experiment.reports.pairwise import pairwise_tables
 from torchrl_l2c2.experiment.reports.paper import TAU
 from torchrl_l2c2.experiment.reports.paper_table import deployed_table, paper_table

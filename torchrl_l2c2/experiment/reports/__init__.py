@@ -6,7 +6,6 @@ their tables and writes a report; ``--help`` says what else it does.
 
 from torchrl_l2c2.experiment.reports.figures import draw_learning_curves, draw_plane
 from torchrl_l2c2.experiment.reports.groups import Group, group_records
-from torchrl_l2c2.experiment.reports.page import write_report
 from torchrl_l2c2.experiment.reports.paper import PAPER, Published
 from torchrl_l2c2.experiment.reports.records import (
     QUANTITIES,
@@ -15,6 +14,7 @@ from torchrl_l2c2.experiment.reports.records import (
     read_records,
     write_records,
 )
+from torchrl_l2c2.experiment.reports.report import write_report
 from torchrl_l2c2.experiment.reports.results import (
     compare_with_paper,
     sweep_summary,

@@ -8,10 +8,10 @@ from collections.abc import Iterable, Sequence
 from itertools import chain
 from pathlib import Path
 
-from torchrl_l2c2.experiment.reports.filling import fill_page
 from torchrl_l2c2.experiment.reports.groups import group_records
-from torchrl_l2c2.experiment.reports.page import write_report
+from torchrl_l2c2.experiment.reports.page import fill_page
 from torchrl_l2c2.experiment.reports.records import Record, merge, read_records, write_records
+from torchrl_l2c2.experiment.reports.report import write_report
 from torchrl_l2c2.experiment.reports.results import printed_tables
 from torchrl_l2c2.experiment.reports.runs import FinishedRun, Found, find_runs
 from torchrl_l2c2.experiment.reports.score import Reading, readings

@@ -76,15 +76,15 @@ def choice_table(records: Sequence[Record]) -> Table | None:
 
 
 def _beside(group: Group, vanilla: Group) -> Beside | None:
-    figures = [
+    values = [
         side.by_seed("last_mean", quantity)
         for quantity in ("return", "sm_asap")
         for side in (group, vanilla)
     ]
-    seeds = sorted(set.intersection(*map(set, figures)))
+    seeds = sorted(set.intersection(*map(set, values)))
     if not seeds:
         return None
-    total, their_total, sm, their_sm = (np.mean([f[seed] for seed in seeds]) for f in figures)
+    total, their_total, sm, their_sm = (np.mean([f[seed] for seed in seeds]) for f in values)
     # Not beside nothing: that has no parts.
     gained = float((total - their_total) / abs(their_total)) if their_total else math.nan
     ours, theirs = (

@@ -1,139 +1,120 @@
-"""A report: tables, pictures and numbers of many runs in one folder, and one page of all of it."""
+"""The part of a page that is made from records: tables and a picture between two marks."""
 
 from __future__ import annotations
 
-import html
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
-from torchrl_l2c2.experiment.files import make_folder, write_atomically, write_json
+from torchrl_l2c2.experiment.files import make_folder_of, write_atomically
 from torchrl_l2c2.experiment.reports.choice import choice_table
-from torchrl_l2c2.experiment.reports.comparison import statistics_tables, summary
-from torchrl_l2c2.experiment.reports.document import picture, whole_page
+from torchrl_l2c2.experiment.reports.comparison import statistics_table
 from torchrl_l2c2.experiment.reports.faster_targets import faster_targets_table
 from torchrl_l2c2.experiment.reports.field import field_groups, field_table
-from torchrl_l2c2.experiment.reports.figures import draw_front, draw_learning_curves, draw_plane
-from torchrl_l2c2.experiment.reports.front import front_table, front_test, searched
+from torchrl_l2c2.experiment.reports.figures import draw_plane
 from torchrl_l2c2.experiment.reports.groups import Group, group_records
-from torchrl_l2c2.experiment.reports.measures import measures_table
 from torchrl_l2c2.experiment.reports.pairwise import pairwise_tables
+from torchrl_l2c2.experiment.reports.paper import PAPER, TAU, is_of_paper
 from torchrl_l2c2.experiment.reports.paper_table import deployed_table, paper_table
-from torchrl_l2c2.experiment.reports.records import TESTS, Record
-from torchrl_l2c2.experiment.reports.runs import FinishedRun
-from torchrl_l2c2.experiment.reports.score import readings
-from torchrl_l2c2.experiment.reports.tables import Table, results_tables, runs_table, score_table
+from torchrl_l2c2.experiment.reports.records import Record
+from torchrl_l2c2.experiment.reports.tables import settings_notes
+from torchrl_l2c2.experiment.saved import BUDGETS
+from torchrl_l2c2.experiment.tasks import TASKS
+
+START, END = "<!-- results: start -->", "<!-- results: end -->"
+PICTURE = Path("docs") / "results.svg"
 
 
-def _results(groups: Sequence[Group]) -> list[Table]:
-    """What stands before the pictures."""
-    of_paper = (paper_table(groups), deployed_table(groups))
-    return [*(table for table in of_paper if table is not None), *results_tables(groups)]
+def paper_text(records: Sequence[Record]) -> str | None:
+    """The paper's table with its picture, :data:`PICTURE`, and what it has beside it.
 
-
-def _others(records: Sequence[Record], runs: Sequence[FinishedRun]) -> list[Table]:
-    """What stands behind them: every other table that can be made, every run by itself at last."""
-    groups = group_records(records)
-    scored = readings(groups)
-    more = (
-        faster_targets_table(records),
-        field_table(records),
-        choice_table(records),
-        measures_table(runs),
-    )
-    return [
-        *statistics_tables(groups),
-        *(front_table(found, front_test(found)) for found in searched(groups)),
-        *([score_table(scored)] if scored else []),
-        *(table for table in more if table is not None),
-        *pairwise_tables(records),
-        runs_table(records),
-    ]
-
-
-def write_report(
-    folder: str | Path,
-    records: Sequence[Record],
-    runs: Sequence[FinishedRun] = (),
-    notes: Sequence[str] = (),
-) -> Path:
-    """Writes ``report.md``, ``report.html``, ``report.json`` and the pictures as SVG files.
-
-    All of it is made before any is written: what cannot be told or drawn leaves no half report.
-
-    Args:
-        folder (str or Path): made where it is not there.
-        records (sequence of Record): what the tables are of, at least one.
-        runs (sequence of FinishedRun): the same runs' folders, for their learning curves; without
-            them there are none.
-        notes (sequence of str): on what was left out.
+    Where a task has runs of its default length and settings, others are not told: they compare
+    lengths and readings of the paper. Regularizers' settings may be others.
 
     Returns:
-        Path: of the page; it has its pictures in it and needs no other file.
+        str or None: nothing without a record of the paper's tasks with its algorithm.
     """
-    groups = group_records(records)
-    results, others = _results(groups), _others(records, runs)
-    numbers = {"groups": summary(groups), "notes": list(notes)}
-    with TemporaryDirectory() as drawn:
-        paths = _draw(Path(drawn), records, runs)
-        pictures = {path.name: path.read_bytes() for path in paths}
-    text = "\n\n".join(
-        [
-            "# Runs",
-            *notes,
-            *(table.markdown() for table in (*results, *others)),
-            *(f"![{_told(name)}]({name})" for name in pictures),
-        ]
-    )
-    page = _page(results, others, pictures, notes)
-    folder = make_folder(folder)
-    for name, content in pictures.items():
-        write_atomically(folder / name, content)
-    write_atomically(folder / "report.md", f"{text}\n".encode())
-    write_json(folder / "report.json", numbers)
-    write_atomically(folder / "report.html", page.encode())
-    return folder / "report.html"
+    groups = shown_groups(records)
+    table = paper_table(groups)
+    if table is None:
+        return None
+    picture = f"![Return against action variation of every method]({PICTURE.as_posix()})"
+    faster = faster_targets_table([r for r in records if is_as_usual(r, TAU)])
+    beside = (deployed_table(groups), statistics_table("late_sampled", groups), faster)
+    more = [each.markdown() for each in beside if each]
+    return "\n\n".join([picture, table.markdown(), *settings_notes(groups), *more])
 
 
-def _draw(folder: Path, records: Sequence[Record], runs: Sequence[FinishedRun]) -> list[Path]:
-    paths = []
-    for task, algorithm in dict.fromkeys((run.task, run.algorithm) for run in runs):
-        together = [run for run in runs if (run.task, run.algorithm) == (task, algorithm)]
-        paths.append(folder / f"learning_curves_{task.replace('/', '_')}_{algorithm}.svg")
-        draw_learning_curves(together, paths[-1])
-    for test in TESTS:
-        groups = [g for g in group_records(records) if len(g.scores(test, "return"))]
-        if groups:
-            paths.append(folder / f"plane_{test}.svg")
-            draw_plane(groups, test, paths[-1])
-    if of_field := field_groups(records):
-        paths.append(folder / "plane_field.svg")
-        draw_plane(of_field, "last_mean", paths[-1], "sm_asap")
-    for number, found in enumerate(searched(group_records(records)), 1):
-        paths.append(folder / f"front_{number}_{found[0].first.task.replace('/', '_')}.svg")
-        draw_front(found, front_test(found), paths[-1])
-    return paths
+def field_text(records: Sequence[Record], picture: str) -> str | None:
+    """The field's table with a picture of that name, and the methods beside one another.
+
+    Returns:
+        str or None: nothing without a record of a task that has a published row.
+    """
+    table = field_table(records)
+    if table is None:
+        return None
+    drawn = f"![Return against Sm of every method, beside what was published]({picture})"
+    tables = [table, *filter(None, [choice_table(records)]), *pairwise_tables(records)]
+    return "\n\n".join([drawn, *(each.markdown() for each in tables)])
 
 
-def _page(
-    results: Sequence[Table],
-    others: Sequence[Table],
-    pictures: Mapping[str, bytes],
-    notes: Sequence[str],
-) -> str:
-    drawn = "\n".join(
-        f"<p>{picture(_told(name), content)}</p>" for name, content in pictures.items()
-    )
-    parts = [
-        "<h1>Runs</h1>",
-        *(f"<p>{html.escape(note)}</p>" for note in notes),
-        *(table.html() for table in results),
-        f"<h2>Pictures</h2>\n{drawn}",
-        *(table.html() for table in others),
-    ]
-    return whole_page("Runs", parts)
+def fill(text: str, results: str) -> str:
+    """A page's text with these results between its marks.
+
+    Raises:
+        ValueError: the marks are not there, once each and in order.
+    """
+    pattern = re.compile(f"{re.escape(START)}.*?{re.escape(END)}", re.S)
+    if (text.count(START), text.count(END), len(pattern.findall(text))) != (1, 1, 1):
+        raise ValueError(f"the text must have {START} and behind it {END}, once each.")
+    made = f"{START}\n{results}\n{END}"
+    return pattern.sub(lambda _: made, text)
 
 
-def _told(name: str) -> str:
-    """What a picture shows, by its file."""
-    return Path(name).stem.replace("_", " ")
+def fill_page(path: str | Path, records: Sequence[Record]) -> None:
+    """Makes a page's results anew, and their picture.
+
+    The paper's table where there are records of its tasks, with its picture in the ``docs`` folder
+    beside the page; else the field's, with a picture of the page's own name beside it.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: as :func:`fill`, or the records give neither table; nothing is written then.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no file {str(path)!r} with {START} and {END} to fill.")
+    picture = path.with_suffix(".svg")
+    of_paper, of_field = paper_text(records), field_text(records, picture.name)
+    results = of_paper or of_field
+    if results is None:
+        tasks = ", ".join(dict.fromkeys(task for task, _ in PAPER))
+        raise ValueError(
+            f"none of {len(records)} records is of the paper's {tasks} with ppo_rpe, or of a task "
+            "of the field's table, of which a page's results are: name a file that has some, by "
+            "--from or --csv."
+        )
+    text = fill(path.read_text(), results)
+    if of_paper:
+        picture = path.parent / PICTURE
+        make_folder_of(picture)
+        draw_plane(shown_groups(records), "late_sampled", picture)
+    else:
+        draw_plane(field_groups(records), "last_mean", picture, "sm_asap")
+    write_atomically(path, text.encode())
+
+
+def shown_groups(records: Sequence[Record]) -> list[Group]:
+    """What the table and the picture are of."""
+    records = [r for r in records if is_of_paper(r.task, r.algorithm)]
+    as_usual = {r.task for r in records if is_as_usual(r)}
+    return group_records(r for r in records if is_as_usual(r) or r.task not in as_usual)
+
+
+def is_as_usual(record: Record, *but: str) -> bool:
+    """Whether it has its task's default length and settings, but for some that are named."""
+    task = TASKS.get(record.task)
+    others = {k for k in record.other_settings if not k.startswith("regularizer.")}
+    others -= {*BUDGETS, *but}
+    return task is not None and record.length == f"{task.episodes} episodes" and not others

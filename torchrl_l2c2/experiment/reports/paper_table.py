@@ -78,10 +78,10 @@ def _of_paper(groups: Sequence[Group]) -> list[Group]:
     return [g for g in groups if is_of_paper(g.first.task, g.first.algorithm)]
 
 
-def _over_tasks(groups: Sequence[Group], figure: str) -> list[tuple[str, str, list[str]]]:
+def _over_tasks(groups: Sequence[Group], test: str) -> list[tuple[str, str, list[str]]]:
     return [
         (f"{len(ours)} tasks", name, better)
-        for _, name, ours, better in improvements_over_tasks(groups, figure)
+        for _, name, ours, better in improvements_over_tasks(groups, test)
     ]
 
 
@@ -90,7 +90,7 @@ def _deployed_row(group: Group, vanilla: Group | None) -> list[str]:
     cells = [group.first.task, group.name, number_range(group.seeds)]
     for quantity in QUANTITIES:
         better = improvement([group], [vanilla], late, quantity) if vanilla else None
-        both = (pooled(group, figure, quantity) for figure in (late, last))
+        both = (pooled(group, test, quantity) for test in (late, last))
         cells += [*both, probability(better)]
     return cells
 
