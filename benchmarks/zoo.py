@@ -1,8 +1,8 @@
 """PPO of a preset, by Stable-Baselines3: ``python -m benchmarks.zoo hopper_v5 --seeds 0 1``.
 
-The same task, settings and test as of ``train.py preset=rl_zoo algorithm=ppo regularizer=none``,
-learned by the library that the settings are of: where the published numbers are not reached here,
-this tells whether they are there.
+The same task, settings and test as of ``train.py preset=rl_zoo algorithm=ppo regularizer=none``
+(or another ``--preset``), learned by the library that the settings are of: where the published
+numbers are not reached here, this tells whether they are there.
 """
 
 from __future__ import annotations
@@ -21,27 +21,30 @@ from omegaconf import OmegaConf
 from benchmarks.timing import machine
 from torchrl_l2c2 import action_variation
 from torchrl_l2c2.experiment import ExperimentConfig
-from torchrl_l2c2.experiment.composition import CONF, register
+from torchrl_l2c2.experiment.composition import CONF, check_preset, register
 from torchrl_l2c2.experiment.environments import TEST_SEED
+from torchrl_l2c2.experiment.settings import SettingError
 from torchrl_l2c2.experiment.tasks import FIELD_TASKS
 from torchrl_l2c2.metrics import spectral_smoothness
 
 PEER = Path(__file__).with_name("zoo_peer.py")
 
 
-def arguments(task: str) -> dict[str, Any]:
+def arguments(task: str, preset: str = "rl_zoo") -> dict[str, Any]:
     """What Stable-Baselines3's PPO is made with, from the preset's own settings.
 
     Args:
         task (str): one of the preset's.
+        preset (str): of ``conf/preset``.
 
     Returns:
         dict: for ``benchmarks/zoo_peer.py``, without the seed.
     """
     register()
-    chosen = ["preset=rl_zoo", f"task={task}", "algorithm=ppo", "regularizer=none"]
+    chosen = [f"preset={preset}", f"task={task}", "algorithm=ppo", "regularizer=none"]
     with initialize_config_dir(str(CONF), version_base="1.3"):
         values: Any = OmegaConf.to_container(compose("config", chosen), resolve=True)
+    check_preset(values, preset)
     config = ExperimentConfig.from_dict(values)
     ppo: Any = config.algorithm
     adam: Any = config.optimizer
@@ -88,13 +91,18 @@ def main() -> None:
     """Prints a row for every seed as it ends; what it learns goes to standard error."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.zoo", description=__doc__)
     parser.add_argument("task", choices=list(FIELD_TASKS))
+    parser.add_argument("--preset", choices=["rl_zoo", "baselines"], default="rl_zoo")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--frames", type=int, help="default: the preset's")
     parser.add_argument("--peer-python", default=sys.executable, help="has Stable-Baselines3")
     chosen = parser.parse_args()
-    given = arguments(chosen.task)
+    try:
+        given = arguments(chosen.task, chosen.preset)
+    except SettingError as error:
+        parser.error(str(error))
     given["frames"] = chosen.frames or given["frames"]
-    print(f"Stable-Baselines3's PPO on {given['env_id']}, commit {machine()['commit']}\n")
+    what = f"Stable-Baselines3's PPO on {given['env_id']}, preset={chosen.preset}"
+    print(f"{what}, commit {machine()['commit']}\n")
     print("| seed | frames | return | Sm | action variation |\n| --- | --- | --- | --- | --- |")
     for seed in chosen.seeds:
         seeds = {"seed": seed, "test_seed": TEST_SEED + seed}

@@ -124,3 +124,7 @@ def test_a_preset_goes_to_stable_baselines_as_the_zoo_has_it():
     pendulum = arguments("pendulum")
     assert (pendulum["num_envs"], pendulum["ppo"]["n_steps"]) == (4, 1024)
     assert not any(pendulum["normalize"].values())
+    # Its own defaults, normalized, and a rate that falls.
+    baselines = arguments("hopper_v5", "baselines")
+    assert (baselines["ppo"]["n_steps"], baselines["ppo"]["vf_coef"]) == (2048, 0.5)
+    assert baselines["linear"] and not hopper["linear"]

@@ -201,10 +201,25 @@ def test_a_preset_is_of_a_task_and_an_algorithm(task, algorithm):
     assert other.algorithm.gamma == 0.5
 
 
-def test_a_preset_without_settings_of_a_task_is_refused():
+def test_baselines_settings_of_hopper_are_those_of_stable_baselines_normalized():
+    """PPO's defaults there, which are those of Baselines, with a learning rate that falls."""
+    chosen = ["preset=baselines", "task=hopper_v5", "algorithm=ppo"]
+    config = ExperimentConfig.from_dict(composed(*chosen))
+    expected = PPO_ZOO | MUJOCO | {"frames": 2048, "epochs": 10, "gamma": 0.99, "gae_lambda": 0.95}
+    assert {name: getattr(config.algorithm, name) for name in expected} == expected
+    assert (config.task.frames, config.replay.batch_size) == (1_000_000, 64)
+    adam = config.optimizer
+    assert (adam.lr, adam.eps, adam.linear) == (3e-4, 1e-5, True)
+    zoo = ExperimentConfig.from_dict(composed("preset=rl_zoo", *chosen[1:]))
+    tests = ("test_episodes", "late_share", "checkpoint_interval")
+    assert [getattr(config, name) for name in tests] == [getattr(zoo, name) for name in tests]
+
+
+@pytest.mark.parametrize("preset", ["rl_zoo", "baselines"])
+def test_a_preset_without_settings_of_a_task_is_refused(preset):
     """And not left at the defaults."""
     with pytest.raises(SettingError, match="preset must have settings of task=swingup with algo"):
-        check_preset(composed("preset=rl_zoo", "algorithm=ppo"), "rl_zoo")
+        check_preset(composed(f"preset={preset}", "algorithm=ppo"), preset)
 
 
 @pytest.mark.parametrize("algorithm", TUNED)
