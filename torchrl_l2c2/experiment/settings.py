@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from functools import cache
 from typing import Annotated, Any, TypeVar, dataclass_transform, get_type_hints
 
 import pydantic.dataclasses
@@ -89,6 +90,7 @@ def _plain(value: Any) -> Any:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
+@cache
 def describe(group: type) -> dict[str, tuple[str, str]]:
     """The range or choices and the meaning of every setting of a group, as they were declared."""
     types = get_type_hints(group)
