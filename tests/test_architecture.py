@@ -66,7 +66,7 @@ experiment.reports.comparison experiment.reports.measures
 experiment.reports.front experiment.reports.field experiment.reports.paper_table
 experiment.reports.faster_targets
 experiment.reports.figures
-experiment.reports.choice experiment.reports.pairwise
+experiment.reports.choice experiment.reports.pairwise experiment.reports.against
 experiment.reports.page experiment.reports.report experiment.reports.results
 experiment.reports.__init__
 experiment.reports.__main__

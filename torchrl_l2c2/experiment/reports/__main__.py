@@ -42,6 +42,8 @@ def main(arguments: Iterable[str] | None = None) -> None:
         parser.error(f"--length must be at least 1, got {min(chosen.length)}")
     if chosen.rows and chosen.csv:
         parser.error("--csv writes all records; leave it or --rows out")
+    if chosen.against and chosen.score:
+        parser.error("--score prints scores alone; leave it or --against out")
     if chosen.records and chosen.csv:
         parser.error("--csv writes records of folders; --from has them already")
     try:
@@ -89,6 +91,11 @@ def _parser() -> argparse.ArgumentParser:
         help="only these methods, as tables call them: --rows vanilla CAPS 'L2C2, mse 1, ramp'",
     )
     add(
+        "--against",
+        metavar="NAME",
+        help="a table of this method against each other one, on each of the field's tasks",
+    )
+    add(
         "--page",
         metavar="FILE",
         help="make the results between this file's marks anew, of all records of --csv or --from",
@@ -104,7 +111,7 @@ def _report(chosen: argparse.Namespace) -> None:
     written = []
     # Before the records, as it may be refused.
     if chosen.page:
-        fill_page(chosen.page, kept)
+        fill_page(chosen.page, kept, chosen.against)
         written.append(f"results: {chosen.page}")
     if chosen.csv:
         write_records(chosen.csv, kept)
@@ -112,9 +119,10 @@ def _report(chosen: argparse.Namespace) -> None:
     alone = not (chosen.records or chosen.csv or chosen.score or chosen.page)
     if chosen.output or alone:
         folder = Path(chosen.output or Path(chosen.folders[0]) / "report")
-        written.append(f"report: {write_report(folder, records, runs, notes)}")
+        report = write_report(folder, records, runs, notes, chosen.against)
+        written.append(f"report: {report}")
     scores = [score_table(_scored(records))] if chosen.score else None
-    tables = scores or printed_tables(records)
+    tables = scores or printed_tables(records, chosen.against)
     # Last: who reads but the first lines of it has the files all the same.
     print("\n\n".join([*(table.markdown() for table in tables), *notes, *written]))
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from torchrl_l2c2.experiment.files import make_folder, write_atomically, write_json
+from torchrl_l2c2.experiment.reports.against import against_table
 from torchrl_l2c2.experiment.reports.choice import choice_table
 from torchrl_l2c2.experiment.reports.comparison import statistics_tables, summary
 from torchrl_l2c2.experiment.reports.document import picture, whole_page
@@ -31,7 +32,9 @@ def _results(groups: Sequence[Group]) -> list[Table]:
     return [*(table for table in of_paper if table is not None), *results_tables(groups)]
 
 
-def _others(records: Sequence[Record], runs: Sequence[FinishedRun]) -> list[Table]:
+def _others(
+    records: Sequence[Record], runs: Sequence[FinishedRun], against: str | None
+) -> list[Table]:
     """What stands behind them: every other table that can be made, every run by itself at last."""
     groups = group_records(records)
     scored = readings(groups)
@@ -46,6 +49,7 @@ def _others(records: Sequence[Record], runs: Sequence[FinishedRun]) -> list[Tabl
         *(front_table(found, front_test(found)) for found in searched(groups)),
         *([score_table(scored)] if scored else []),
         *(table for table in more if table is not None),
+        *([] if against is None else [against_table(records, against)]),
         *pairwise_tables(records),
         runs_table(records),
     ]
@@ -56,6 +60,7 @@ def write_report(
     records: Sequence[Record],
     runs: Sequence[FinishedRun] = (),
     notes: Sequence[str] = (),
+    against: str | None = None,
 ) -> Path:
     """Writes ``report.md``, ``report.html``, ``report.json`` and the pictures as SVG files.
 
@@ -67,12 +72,16 @@ def write_report(
         runs (sequence of FinishedRun): the same runs' folders, for their learning curves; without
             them there are none.
         notes (sequence of str): on what was left out.
+        against (str, optional): a method that has a table against each other one.
 
     Returns:
         Path: of the page; it has its pictures in it and needs no other file.
+
+    Raises:
+        ValueError: there is nothing to compare that method with.
     """
     groups = group_records(records)
-    results, others = _results(groups), _others(records, runs)
+    results, others = _results(groups), _others(records, runs, against)
     numbers = {"groups": summary(groups), "notes": list(notes)}
     with TemporaryDirectory() as drawn:
         paths = _draw(Path(drawn), records, runs)
