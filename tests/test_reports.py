@@ -1207,6 +1207,25 @@ def test_walkings_gains_are_those_of_their_records():
     assert len(records) >= 24
 
 
+def reacher_by_seed():
+    """A row a seed: return and action variation of the late policies with sampled actions."""
+    records = read_records(ROOT / "results" / "runs.csv")
+    groups = shown_groups([record for record in records if record.task == "reacher"])
+    groups = [group for group in groups if group.first.method != "caps"]
+    rows = [["seed", *(group.name for group in groups)], ["---"] * (1 + len(groups))]
+    for together in zip(*(group.records for group in groups), strict=True):
+        cells = (
+            f"{r.late_sampled_return:.1f} / {r.late_sampled_action_variation:.3f}" for r in together
+        )
+        rows.append([str(together[0].seed), *cells])
+    return "\n".join(f"  | {' | '.join(row)} |" for row in rows)
+
+
+def test_what_reachers_seeds_did_is_of_the_records():
+    """Every seed's return and action variation, as the protocol's page tells them."""
+    assert reacher_by_seed() in (ROOT / "docs" / "protocol.md").read_text()
+
+
 def test_the_pages_of_other_readings_are_those_of_their_records():
     """The table before the loss was summed over the batch; Reacher's of the other length."""
     records = read_records(ROOT / "results" / "runs.csv")

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from functools import cache
 from typing import Annotated, Any, TypeVar, dataclass_transform, get_type_hints
 
 import pydantic.dataclasses
@@ -90,15 +89,20 @@ def _plain(value: Any) -> Any:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
-@cache
+# Of every group that was asked for: the command's help and its nodes ask many times.
+_described: dict[type, dict[str, tuple[str, str]]] = {}
+
+
 def describe(group: type) -> dict[str, tuple[str, str]]:
     """The range or choices and the meaning of every setting of a group, as they were declared."""
-    types = get_type_hints(group)
-    return {
-        field.name: (_allowed(types[field.name], field.default), meaning)
-        for field in dataclasses.fields(group)
-        if (meaning := getattr(field.default, "description", None))
-    }
+    if group not in _described:
+        types = get_type_hints(group)
+        _described[group] = {
+            field.name: (_allowed(types[field.name], field.default), meaning)
+            for field in dataclasses.fields(group)
+            if (meaning := getattr(field.default, "description", None))
+        }
+    return _described[group]
 
 
 _LIMITS = {
