@@ -66,8 +66,11 @@ def test_what_has_nothing_beside_it_is_refused_with_what_there_is(records, tmp_p
     """An unknown name, a method alone; scores have no such table."""
     file = tmp_path / "records.csv"
     write_records(file, records)
+    page = tmp_path / "page.md"
+    page.write_text(marks := "<!-- results: start -->\n<!-- results: end -->\n")
     with pytest.raises(SystemExit, match=r"error: --against .* got 'L2'; here there are vanilla; "):
-        main(["--from", str(file), "--against", "L2"])
+        main(["--from", str(file), "--against", "L2", "--page", str(page)])
+    assert page.read_text() == marks
     with pytest.raises(ValueError, match="here there are CATS"):
         against_table([record for record in records if record.method == "cats"], "CATS")
     with pytest.raises(SystemExit):

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from itertools import chain
 from pathlib import Path
 
+from torchrl_l2c2.experiment.reports.against import against_table
 from torchrl_l2c2.experiment.reports.groups import group_records
 from torchrl_l2c2.experiment.reports.page import fill_page
 from torchrl_l2c2.experiment.reports.records import Record, merge, read_records, write_records
@@ -108,10 +109,12 @@ def _report(chosen: argparse.Namespace) -> None:
     if chosen.rows:
         records, runs = _narrowed(records, runs, chosen.rows)
     kept = merge(read_records(chosen.csv), records) if chosen.csv else records
+    # Of all records that are kept, and before anything is written, as it may be refused.
+    against = [against_table(kept, chosen.against)] if chosen.against else []
     written = []
     # Before the records, as it may be refused.
     if chosen.page:
-        fill_page(chosen.page, kept, chosen.against)
+        fill_page(chosen.page, kept, against)
         written.append(f"results: {chosen.page}")
     if chosen.csv:
         write_records(chosen.csv, kept)
@@ -119,10 +122,9 @@ def _report(chosen: argparse.Namespace) -> None:
     alone = not (chosen.records or chosen.csv or chosen.score or chosen.page)
     if chosen.output or alone:
         folder = Path(chosen.output or Path(chosen.folders[0]) / "report")
-        report = write_report(folder, records, runs, notes, chosen.against)
-        written.append(f"report: {report}")
+        written.append(f"report: {write_report(folder, records, runs, notes, against)}")
     scores = [score_table(_scored(records))] if chosen.score else None
-    tables = scores or printed_tables(records, chosen.against)
+    tables = scores or [*printed_tables(records), *against]
     # Last: who reads but the first lines of it has the files all the same.
     print("\n\n".join([*(table.markdown() for table in tables), *notes, *written]))
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 
-from torchrl_l2c2.experiment.reports.comparison import Estimate, improvement, probability
+from torchrl_l2c2.experiment.reports.comparison import improvement, probability
 from torchrl_l2c2.experiment.reports.field import FIELD_MEASURES, field_groups
 from torchrl_l2c2.experiment.reports.groups import Group
 from torchrl_l2c2.experiment.reports.records import Record
-from torchrl_l2c2.experiment.reports.statistics import mean
 from torchrl_l2c2.experiment.reports.tables import Table, number, number_range
 
 LEGEND = (
@@ -60,7 +58,5 @@ def _row(ours: Group, theirs: Group) -> list[str]:
 
 
 def _mean(group: Group, quantity: str) -> str:
-    center = Estimate.of(mean, group.scores("last_mean", quantity))
-    if center is None:
-        return "-"
-    return partial(number, quantity=quantity, beside=center.value)(center.value)
+    scores = group.scores("last_mean", quantity)
+    return number(float(scores.mean()), quantity) if len(scores) else "-"

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from torchrl_l2c2.experiment.files import make_folder_of, write_atomically
-from torchrl_l2c2.experiment.reports.against import against_table
 from torchrl_l2c2.experiment.reports.choice import choice_table
 from torchrl_l2c2.experiment.reports.comparison import statistics_table
 from torchrl_l2c2.experiment.reports.faster_targets import faster_targets_table
@@ -18,7 +17,7 @@ from torchrl_l2c2.experiment.reports.pairwise import pairwise_tables
 from torchrl_l2c2.experiment.reports.paper import PAPER, TAU, is_of_paper
 from torchrl_l2c2.experiment.reports.paper_table import deployed_table, paper_table
 from torchrl_l2c2.experiment.reports.records import Record
-from torchrl_l2c2.experiment.reports.tables import settings_notes
+from torchrl_l2c2.experiment.reports.tables import Table, settings_notes
 from torchrl_l2c2.experiment.saved import BUDGETS
 from torchrl_l2c2.experiment.tasks import TASKS
 
@@ -46,24 +45,18 @@ def paper_text(records: Sequence[Record]) -> str | None:
     return "\n\n".join([picture, table.markdown(), *settings_notes(groups), *more])
 
 
-def field_text(records: Sequence[Record], picture: str, against: str | None = None) -> str | None:
+def field_text(records: Sequence[Record], picture: str) -> str | None:
     """The field's table with a picture of that name, and the methods beside one another.
-
-    With ``against``, first of all, the table of that method against each other one.
 
     Returns:
         str or None: nothing without a record of a task that has a published row.
-
-    Raises:
-        ValueError: there is nothing to compare that method with.
     """
     table = field_table(records)
     if table is None:
         return None
     drawn = f"![Return against Sm of every method, beside what was published]({picture})"
-    first = [] if against is None else [against_table(records, against).markdown()]
     tables = [table, *filter(None, [choice_table(records)]), *pairwise_tables(records)]
-    return "\n\n".join([*first, drawn, *(each.markdown() for each in tables)])
+    return "\n\n".join([drawn, *(each.markdown() for each in tables)])
 
 
 def fill(text: str, results: str) -> str:
@@ -79,23 +72,26 @@ def fill(text: str, results: str) -> str:
     return pattern.sub(lambda _: made, text)
 
 
-def fill_page(path: str | Path, records: Sequence[Record], against: str | None = None) -> None:
+def fill_page(path: str | Path, records: Sequence[Record], first: Sequence[Table] = ()) -> None:
     """Makes a page's results anew, and their picture.
 
     The paper's table where there are records of its tasks, with its picture in the ``docs`` folder
-    beside the page; else the field's, with a picture of the page's own name beside it, and the
-    table of the method that is named against each other one.
+    beside the page; else the field's, with a picture of the page's own name beside it.
+
+    Args:
+        path (str or Path): of the page.
+        records (sequence of Record): what it is of.
+        first (sequence of Table): what stands before them.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: as :func:`fill` and :func:`field_text`, or the records give neither table;
-            nothing is written then.
+        ValueError: as :func:`fill`, or the records give neither table; nothing is written then.
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {str(path)!r} with {START} and {END} to fill.")
     picture = path.with_suffix(".svg")
-    of_paper, of_field = paper_text(records), field_text(records, picture.name, against)
+    of_paper, of_field = paper_text(records), field_text(records, picture.name)
     results = of_paper or of_field
     if results is None:
         tasks = ", ".join(dict.fromkeys(task for task, _ in PAPER))
@@ -104,6 +100,7 @@ def fill_page(path: str | Path, records: Sequence[Record], against: str | None =
             "of the field's table, of which a page's results are: name a file that has some, by "
             "--from or --csv."
         )
+    results = "\n\n".join([*(table.markdown() for table in first), results])
     text = fill(path.read_text(), results)
     if of_paper:
         picture = path.parent / PICTURE

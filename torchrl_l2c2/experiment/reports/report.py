@@ -8,7 +8,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from torchrl_l2c2.experiment.files import make_folder, write_atomically, write_json
-from torchrl_l2c2.experiment.reports.against import against_table
 from torchrl_l2c2.experiment.reports.choice import choice_table
 from torchrl_l2c2.experiment.reports.comparison import statistics_tables, summary
 from torchrl_l2c2.experiment.reports.document import picture, whole_page
@@ -32,9 +31,7 @@ def _results(groups: Sequence[Group]) -> list[Table]:
     return [*(table for table in of_paper if table is not None), *results_tables(groups)]
 
 
-def _others(
-    records: Sequence[Record], runs: Sequence[FinishedRun], against: str | None
-) -> list[Table]:
+def _others(records: Sequence[Record], runs: Sequence[FinishedRun]) -> list[Table]:
     """What stands behind them: every other table that can be made, every run by itself at last."""
     groups = group_records(records)
     scored = readings(groups)
@@ -49,7 +46,6 @@ def _others(
         *(front_table(found, front_test(found)) for found in searched(groups)),
         *([score_table(scored)] if scored else []),
         *(table for table in more if table is not None),
-        *([] if against is None else [against_table(records, against)]),
         *pairwise_tables(records),
         runs_table(records),
     ]
@@ -60,7 +56,7 @@ def write_report(
     records: Sequence[Record],
     runs: Sequence[FinishedRun] = (),
     notes: Sequence[str] = (),
-    against: str | None = None,
+    first: Sequence[Table] = (),
 ) -> Path:
     """Writes ``report.md``, ``report.html``, ``report.json`` and the pictures as SVG files.
 
@@ -72,16 +68,13 @@ def write_report(
         runs (sequence of FinishedRun): the same runs' folders, for their learning curves; without
             them there are none.
         notes (sequence of str): on what was left out.
-        against (str, optional): a method that has a table against each other one.
+        first (sequence of Table): what stands before the other tables.
 
     Returns:
         Path: of the page; it has its pictures in it and needs no other file.
-
-    Raises:
-        ValueError: there is nothing to compare that method with.
     """
     groups = group_records(records)
-    results, others = _results(groups), _others(records, runs, against)
+    results, others = [*first, *_results(groups)], _others(records, runs)
     numbers = {"groups": summary(groups), "notes": list(notes)}
     with TemporaryDirectory() as drawn:
         paths = _draw(Path(drawn), records, runs)

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchrl_l2c2.experiment.files import write_json
-from torchrl_l2c2.experiment.reports.against import against_table
 from torchrl_l2c2.experiment.reports.choice import choice_table
 from torchrl_l2c2.experiment.reports.faster_targets import faster_targets_table
 from torchrl_l2c2.experiment.reports.field import field_table
@@ -63,11 +62,8 @@ def compare_with_paper(run: FinishedRun) -> str:
     return "\n".join(lines)
 
 
-def printed_tables(records: Sequence[Record], against: str | None = None) -> list[Table]:
-    """What is told of runs without a report: results, and beside them what was published.
-
-    And one method against each other one, if it is named.
-    """
+def printed_tables(records: Sequence[Record]) -> list[Table]:
+    """What is told of runs without a report: results, and beside them what was published."""
     groups = group_records(records)
     beside = (
         paper_table(groups),
@@ -76,8 +72,7 @@ def printed_tables(records: Sequence[Record], against: str | None = None) -> lis
         choice_table(records),
     )
     told = [table for table in beside if table is not None]
-    last = [] if against is None else [against_table(records, against)]
-    return [*results_tables(groups), *told, *pairwise_tables(records), *last]
+    return [*results_tables(groups), *told, *pairwise_tables(records)]
 
 
 def sweep_summary(folders: Sequence[str | Path]) -> str:
