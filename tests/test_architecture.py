@@ -64,7 +64,7 @@ experiment.reports.score
 experiment.reports.tables
 experiment.reports.comparison experiment.reports.measures
 experiment.reports.front experiment.reports.field experiment.reports.paper_table
-experiment.reports.faster_targets
+experiment.reports.faster_targets experiment.reports.gain_targets
 experiment.reports.figures
 experiment.reports.choice experiment.reports.pairwise experiment.reports.against
 experiment.reports.page experiment.reports.report experiment.reports.results

@@ -43,6 +43,7 @@ from torchrl_l2c2.experiment.reports.comparison import improvement, statistics_t
 from torchrl_l2c2.experiment.reports.differences import differences, fingerprint
 from torchrl_l2c2.experiment.reports.faster_targets import faster_targets_table
 from torchrl_l2c2.experiment.reports.field import BETTER, field_groups, field_table
+from torchrl_l2c2.experiment.reports.gain_targets import gain_targets_table
 from torchrl_l2c2.experiment.reports.groups import (
     baseline_of,
     comparable,
@@ -1239,44 +1240,15 @@ def test_the_pages_of_other_readings_are_those_of_their_records():
         assert paper_table(group_records(shown)).markdown() in page
 
 
-def targets_of_ppo():
-    """Every run that was asked for an action variation, and vanilla of its seed."""
-    asked = [r for r in read_records(ROOT / "results" / "targets.csv") if r.algorithm == "ppo"]
-    plain = [
-        r for name in ("walker2d", "field") for r in read_records(f"{ROOT}/results/{name}.csv")
-    ]
-    columns = ["task", "asked", "`gain_rate`", "action variation, last tenth", "return, last tenth"]
-    columns += ["policy scale", "test with mean actions: action variation", "return"]
-    rows = [columns, ["---"] * len(columns)]
-    for task in ("walker2d_v5", "lunarlander"):
-        (vanilla,) = (r for r in plain if (r.task, r.method, r.seed) == (task, "none", 0))
-        of_task = [(r.other_settings, r) for r in asked if r.task == task]
-        of_task.sort(key=lambda each: -float(each[0]["regularizer.gain_target"]))
-        for own, run in [*of_task, ({}, vanilla)]:
-            rate = own.get("regularizer.gain_rate", "0.1") if own else "vanilla"
-            cells = [task, own.get("regularizer.gain_target", ""), rate]
-            cells += [f"{run.late_sampled_action_variation:.3f}", f"{run.late_sampled_return:.0f}"]
-            cells += [f"{run.policy_scale:.2f}", f"{run.last_mean_action_variation:.3f}"]
-            rows.append([*cells, f"{run.last_mean_return:.0f}"])
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
-
-
 def test_the_targets_are_those_of_their_records():
-    """PPO's whole table; of Swingup's and SAC's all but the gains, which no record has."""
+    """As the command at the top of the page prints them."""
     page = (ROOT / "results" / "targets.md").read_text()
-    assert f"\n{targets_of_ppo()}\n" in page
-    records = [r for r in read_records(ROOT / "results" / "targets.csv") if r.algorithm != "ppo"]
-    for run in records:
-        late, test = run.late_sampled_action_variation, run.late_mean_action_variation
-        returns = run.late_sampled_return, run.late_mean_return
-        if run.algorithm == "sac":
-            test, returns = run.last_mean_action_variation, (returns[0], run.last_mean_return)
-        target = float(run.other_settings["regularizer.gain_target"])
-        before = rf"\| {target:.3f}[^|]*\| {late:.3f} \| {returns[0]:.0f} \| [\d.]+ \| "
-        assert re.search(
-            rf"{before}{run.policy_scale:.2f} \| {test:.3f} \| {returns[1]:.0f} \|", page
-        )
-    assert len(records) >= 9
+    files = re.search("--from (.*)", page)[1].split()
+    records = merge([], [record for file in files for record in read_records(ROOT / file)])
+    table = gain_targets_table(records)
+    assert table.markdown() in page
+    asked = [row for row in table.rows if row[4]]
+    assert len(asked) >= 16
 
 
 # Rows of the README's first table: whose records, of which method, as tables call it, and length,

@@ -15,6 +15,7 @@ from torchrl_l2c2.experiment.reports.faster_targets import faster_targets_table
 from torchrl_l2c2.experiment.reports.field import field_groups, field_table
 from torchrl_l2c2.experiment.reports.figures import draw_front, draw_learning_curves, draw_plane
 from torchrl_l2c2.experiment.reports.front import front_table, front_test, searched
+from torchrl_l2c2.experiment.reports.gain_targets import gain_targets_table
 from torchrl_l2c2.experiment.reports.groups import Group, group_records
 from torchrl_l2c2.experiment.reports.measures import measures_table
 from torchrl_l2c2.experiment.reports.pairwise import pairwise_tables
@@ -37,6 +38,7 @@ def _others(records: Sequence[Record], runs: Sequence[FinishedRun]) -> list[Tabl
     scored = readings(groups)
     more = (
         faster_targets_table(records),
+        gain_targets_table(records),
         field_table(records),
         choice_table(records),
         measures_table(runs),

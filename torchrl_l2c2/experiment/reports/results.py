@@ -11,6 +11,7 @@ from torchrl_l2c2.experiment.reports.choice import choice_table
 from torchrl_l2c2.experiment.reports.faster_targets import faster_targets_table
 from torchrl_l2c2.experiment.reports.field import field_table
 from torchrl_l2c2.experiment.reports.figures import draw_learning_curves
+from torchrl_l2c2.experiment.reports.gain_targets import gain_targets_table
 from torchrl_l2c2.experiment.reports.groups import group_records
 from torchrl_l2c2.experiment.reports.pairwise import pairwise_tables
 from torchrl_l2c2.experiment.reports.paper_table import paper_table
@@ -68,6 +69,7 @@ def printed_tables(records: Sequence[Record]) -> list[Table]:
     beside = (
         paper_table(groups),
         faster_targets_table(records),
+        gain_targets_table(records),
         field_table(records),
         choice_table(records),
     )

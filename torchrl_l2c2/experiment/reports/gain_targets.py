@@ -1,0 +1,74 @@
+"""Gains that follow a target: what was asked for, what came of it, and what it cost."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from torchrl_l2c2.experiment.reports.groups import Group, baseline_of, by_task, group_records
+from torchrl_l2c2.experiment.reports.records import QUANTITIES, Record
+from torchrl_l2c2.experiment.reports.tables import Table, number, number_range, or_dash, pooled
+
+# A target is followed in training's own episodes, and is to hold of a policy that is deployed.
+FOLLOWED, DEPLOYED = "late_sampled", "last_mean"
+LEGEND = (
+    "Means over seeds, standard deviations over seeds in brackets. Followed: of training's own "
+    "episodes, with sampled actions, in its last tenth or late_share, by which the gain was set; "
+    "off by: the mean's distance from what was asked for, in parts of that. Then the test of the "
+    "last policy with its mean actions. Below the runs that were asked for something those of "
+    "vanilla with the same other settings."
+)
+
+
+def gain_targets_table(records: Sequence[Record]) -> Table | None:
+    """A row for every action variation that a gain was to keep, and one for vanilla beside them.
+
+    Args:
+        records (sequence of Record): of any tasks; of runs whose gain is set otherwise, or by
+            another measure (``regularizer.gain_of``), vanilla's alone are shown.
+
+    Returns:
+        Table: ``None`` where no gain followed an action variation.
+    """
+    groups = group_records(records)
+    following = [group for group in groups if _asked(group.first) is not None]
+    beside = (baseline_of(group, groups) for group in following)
+    shown = dict.fromkeys(group for group in (*following, *beside) if group is not None)
+    if not shown:
+        return None
+    # Named anew, by what sets these apart from one another; vanilla's below the others.
+    named = group_records(record for group in shown for record in group.records)
+    rows = [
+        _row(group)
+        for together in by_task(named)
+        for group in sorted(together, key=lambda group: group.first.method == "none")
+    ]
+    columns = ["task", "algorithm", "method", "seeds", "asked for", "followed", "off by", "return"]
+    columns += ["policy scale", "last policy: action variation", "return"]
+    return Table("Action variations that were asked for", columns, rows, [LEGEND])
+
+
+def _asked(record: Record) -> float | None:
+    own = record.other_settings
+    if own.get("regularizer.gain") != "target" or "regularizer.gain_of" in own:
+        return None
+    return float(own["regularizer.gain_target"])
+
+
+def _row(group: Group) -> list[str]:
+    return [
+        *(group.first.task, group.first.algorithm, group.name, number_range(group.seeds)),
+        *_followed(group),
+        *(pooled(group, FOLLOWED, quantity) for quantity in ("return", "policy_scale")),
+        *(pooled(group, DEPLOYED, quantity) for quantity in reversed(QUANTITIES)),
+    ]
+
+
+def _followed(group: Group) -> list[str]:
+    asked, scores = _asked(group.first), group.scores(FOLLOWED, "action_variation")
+    reached = pooled(group, FOLLOWED, "action_variation")
+    if asked is None:
+        return ["", reached, ""]
+    off = float(scores.mean()) / asked - 1 if len(scores) else math.nan
+    # A sum with zero has no sign of its own: no "-0%".
+    return [number(asked, "action_variation"), reached, or_dash(round(off, 2) + 0.0, "+.0%")]
