@@ -18,6 +18,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from torchrl_l2c2 import L2C2Loss, Neighborhood, action_variation, make_actor, make_critic
+from torchrl_l2c2.gains import RampGain
 
 FRAMES = 2000
 FRAMES_PER_BATCH = 1000
@@ -35,7 +36,8 @@ def main(frames: int, plain: bool = False) -> None:
     near = Neighborhood(lambda_min=1.0, lambda_max=100.0, shared=True)
     base = ClipPPOLoss(actor, critic, entropy_coeff=0.0, normalize_advantage=True)
     # On policy the loss draws the neighbors: the batch is not replayed.
-    loss = base if plain else L2C2Loss(base, near, beta=0.0, policy_distance="mean")
+    loss = base if plain else L2C2Loss(base, near, beta=0.0, policy_distance="mse")
+    ramp = RampGain()  # from 0 to 1 over the training
     advantage = GAE(gamma=0.9, lmbda=0.95, value_network=critic)
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
     minibatches = TensorDictReplayBuffer(
@@ -45,7 +47,9 @@ def main(frames: int, plain: bool = False) -> None:
     )
     collector = Collector(env, actor, frames_per_batch=FRAMES_PER_BATCH, total_frames=frames)
 
-    for collected in collector:
+    for number, collected in enumerate(collector):
+        if not plain:
+            loss.l2c2_coeff = ramp.step(number * FRAMES_PER_BATCH / frames)
         collected["next", "reward"] *= REWARD_SCALE
         for _ in range(EPOCHS):
             with torch.no_grad():

@@ -1282,7 +1282,7 @@ def headline(label):
 
     def compared(quantity, digits, *, changes=False):
         means = [plain.scores(test, quantity).mean(), ours.scores(test, quantity).mean()]
-        cells = [f"{value:.{digits}f}" for value in means]
+        cells = [f"{value:.{digits if abs(value) >= 100 or digits else 1}f}" for value in means]
         cells += [f"{means[1] / means[0] - 1:+.0%}"] if changes else []
         return [*cells, improvement([ours], [plain], test, quantity).text("{:.2f}".format)]
 

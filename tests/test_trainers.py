@@ -318,12 +318,15 @@ def documented() -> dict[str, Any]:
 
 
 def test_documentation_runs():
-    """The page's Python trains, and its hook has annealed the gain to 0."""
+    """The page's Python trains, and its hook has raised the gain from 0 to 1."""
     names = documented()
     history = names["trainer"]._log_dict
     assert len(history["loss_l2c2_actor"]) == 2
     assert "loss_l2c2_qvalue" not in history  # beta is 0: the policy alone is regularized
-    assert names["loss"].l2c2_coeff == 0.0
+    assert names["loss"].l2c2_coeff == 1.0
+    # Of the first batch, which the gain of 0 leaves alone, and of the second, at 64 of 100 frames.
+    first, second = history["loss_l2c2_actor"]
+    assert first == 0.0 < second
 
 
 def test_td3_trainer_with_the_documented_stepper():

@@ -55,7 +55,12 @@ TUNED: dict[str, dict[str, Any]] = {
     },
     "td3": {"lambda_min": 0.1, "lambda_max": 10.0},
 }
-TUNED_ON = {"ppo": "Pendulum, LunarLander and Walker2d", "sac": "Pendulum", "td3": "Pendulum"}
+TUNED_ON = {
+    "ppo": "Pendulum, LunarLander and Walker2d",
+    "sac": "Pendulum",
+    # Its loss has the rewards' size, beside which a gain weighs.
+    "td3": "Pendulum with algorithm.reward_scale=null",
+}
 
 REGULARIZERS: dict[str, RegularizerConfig] = {
     "none": NoRegularizerConfig(),
