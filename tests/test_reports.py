@@ -1157,6 +1157,18 @@ def test_the_page_of_one_setting_is_that_of_its_records():
     assert fill(text, f"{first}\n\n{field_text(records, 'one_setting.svg')}") == text
 
 
+def test_what_is_said_of_the_rivals_is_of_the_records():
+    """How probable a smoother run, and one that returns more, is over the four tasks."""
+    pages = [(ROOT / name).read_text() for name in ("README.md", "results/one_setting.md")]
+    returns, smoother = pairwise_tables(one_setting())
+    for table in (smoother, returns):
+        (ours,) = (dict(zip(table.columns, row, strict=True)) for row in table.rows if OURS in row)
+        for page in pages:
+            said = " ".join(page.partition("a run with L2C2 has a smaller Sm")[2].split())
+            start = said.partition(". ")[0]
+            assert ours["CATS"] in start and ours["CAPS"] in start
+
+
 @pytest.mark.parametrize("name", ["field", "walker2d", "hopper", "sac_pendulum"])
 def test_what_is_said_of_the_harness_is_of_the_records(name):
     """Vanilla's and the rivals' rows beside the published ones."""
