@@ -619,7 +619,6 @@ def test_a_wrong_setting_ends_with_one_clear_line(tmp_path, overrides, message):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"algorithm": PPORPEConfig(kappa=9.0)}, "kappa must be in"),
         (
             {"task": TaskConfig("cartpole", "CartPole-v1")},
             "ppo_rpe needs continuous actions, this task's are OneHot",

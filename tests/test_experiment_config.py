@@ -4,6 +4,8 @@ import dataclasses
 import inspect
 import subprocess
 import sys
+from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -12,6 +14,7 @@ from omegaconf import OmegaConf
 from small import own_nodes
 
 import torchrl_l2c2
+from torchrl_l2c2 import PPORPELoss, make_actor, make_critic
 from torchrl_l2c2.experiment import (
     AdamConfig,
     CAPSConfig,
@@ -334,11 +337,17 @@ def test_wrong_settings_are_refused_with_what_is_allowed(settings, message):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
+        (
+            {"regularizer": L2C2Config(name="mine")},
+            r"regularizer.name must be one of \['l2c2', .* with L2C2Config, got 'mine'",
+        ),
+        ({"regularizer": L2C2Config(name="caps")}, r"regularizer.name must .*, got 'caps'"),
+        ({"algorithm": SACConfig(name="td3")}, r"one of \['sac'\] with SACConfig, got 'td3'"),
         ({"workers": "ray"}, "num_workers must be more than 1 with workers=ray, got 1"),
         ({"num_workers": 0}, "num_workers must be greater than or equal to 1, got 0"),
         (
             {"num_workers": 2, "algorithm": SACConfig()},
-            "num_workers must be 1 with algorithm.schedule=step",
+            "num_workers must be 1 with algorithm.schedule=step.* algorithm.replay_ratio=256, one",
         ),
         (
             {"num_workers": 2, "algorithm": PPOConfig(num_envs=2)},
@@ -355,3 +364,14 @@ def test_settings_that_do_not_go_together_are_refused(settings, message):
     """With what would be allowed."""
     with pytest.raises(SettingError, match=message):
         ExperimentConfig(**settings)
+
+
+@pytest.mark.parametrize("beta", [0.05, 0.3, 0.5, 0.7, 0.95])
+def test_kappa_is_refused_where_the_loss_would_refuse_it(beta):
+    """Just below its bound both take it, at it neither does."""
+    widest = 2 * (1 - beta) / max(beta, 1 - beta)
+    networks = make_actor(3, 1), make_critic(3)
+    for kappa, taken in ((0.999 * widest, True), (1.001 * widest, False)):
+        for make in (PPORPEConfig, partial(PPORPELoss, *networks)):
+            with nullcontext() if taken else pytest.raises(ValueError, match="kappa must be"):
+                make(kappa=kappa, beta=beta)

@@ -218,6 +218,17 @@ class TestInARun:
         assert rows[0]["loss_l2c2_actor"] == 0.0 < rows[-1]["loss_l2c2_actor"]
         assert run.agent.loss.l2c2_coeff == 1.0
 
+    def test_a_longer_training_has_a_longer_ramp_and_its_own_rates(self):
+        """Of twelve episodes instead of six; one that had ended begins at a rate above 0."""
+        settings = {"optimizer": AdamConfig(linear=True)}
+        run = Experiment(small(L2C2Config(**KINDS["ramp"]), **settings))
+        rows = run.train(12)
+        assert [row["gain"] for row in rows] == pytest.approx([k / 12 for k in range(12)])
+        before = [parameter.clone() for parameter in run.agent.loss.parameters()]
+        run.train(13)
+        after = run.agent.loss.parameters()
+        assert not all(torch.equal(a, b) for a, b in zip(after, before, strict=True))
+
     def test_a_target_is_approached_from_above(self):
         """An action variation far above it lets the gain rise by its rate in every episode."""
         settings = {"gain": "target", "gain_target": 1e-9, "gain_rate": 0.5}

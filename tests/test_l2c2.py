@@ -735,7 +735,7 @@ class TestPolicyDistances:
     def test_a_loss_without_a_policy_compares_none(self, given):
         """What would be read nowhere is refused."""
         base = DQNLoss(action_values(), action_space="one-hot")
-        with pytest.raises(TypeError, match="DQNLoss has no policy: leave policy_distance"):
+        with pytest.raises(TypeError, match="DQNLoss has no policy to compare: leave policy_dist"):
             L2C2Loss(base, **given)
 
     def test_of_deterministic_policies_nothing_is_drawn(self):

@@ -38,6 +38,10 @@ SWINGUP = GROUPS["task"]["swingup"]
         ),
         ({"replay": UniformReplayConfig()}, "swingup/ppo_rpe/l2c2/replay-uniform/seed_0"),
         ({"task": TaskConfig("A:B/C v1", "A:B/C v1")}, "A-B-C-v1/ppo_rpe/l2c2/seed_0"),
+        (
+            {"task": TaskConfig("mine", "A-v1")},
+            "mine/ppo_rpe/l2c2/env_id-A-v1/seed_0",
+        ),
         ({"task": replace(SWINGUP, max_steps=9)}, "swingup/ppo_rpe/l2c2/max_steps-9/seed_0"),
     ],
 )

@@ -4,6 +4,7 @@ import copy
 import json
 import logging
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -76,6 +77,12 @@ def same(found, expected, **tolerance):
         torch.testing.assert_close(
             found[key], value, msg=lambda m, key=key: f"{key}: {m}", **tolerance
         )
+
+
+def test_priorities_are_on_the_cpu_wherever_the_batches_are():
+    """TorchRL would put its trees where the storage is."""
+    sampler = PrioritizedReplayConfig(capacity=50, batch_size=8).make(0, 1).sampler
+    assert sampler._tree_device_from_storage(SimpleNamespace(device="cuda:0")).type == "cpu"
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -201,6 +201,15 @@ def test_a_sweep_of_nothing_says_so(sweep, told):
         assert begun.standing(2, {}) == "run 2"
 
 
+def test_a_sweep_that_is_refused_ends_and_leaves_nothing(tmp_path):
+    """Whatever ends it, its folder is gone, by which its jobs elsewhere would know."""
+    with pytest.raises(SystemExit), begin_sweep(["-m", "seed=0,1"]) as begun:
+        begun.share(tmp_path)
+        assert [*tmp_path.iterdir()]
+        sys.exit("error")
+    assert not [*tmp_path.iterdir()]
+
+
 def test_a_sweep_says_how_much_of_it_is_left():
     """By each task's mean of what is finished, and the tasks' mean for one of which none is."""
     with begin_sweep(["-m", "seed=0,1,2", "~logger"]) as begun:

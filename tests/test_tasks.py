@@ -330,6 +330,15 @@ def test_actions_that_are_no_vector_are_refused(monkeypatch, action):
         make_env(task(), 0)
 
 
+def test_noise_is_not_what_a_policy_draws_with_the_same_seed(monkeypatch):
+    """A run's seed is that of torch's global generator, and of its task."""
+    still(monkeypatch, seen=np.zeros(2, np.float32))
+    noise = make_env(task(noise_scale=1.0), 7).rollout(10)["observation"]
+    torch.manual_seed(7)
+    drawn = torch.cat([torch.randn(1) for _ in range(100)])
+    assert noise.std() > 0.5 and not torch.isin(noise, drawn).any()
+
+
 def test_an_episode_is_as_long_as_the_task_is_registered():
     """Pendulum's 200 steps; the paper's tasks have their own; a setting goes before."""
     assert TaskConfig("pendulum", "Pendulum-v1").time_limit == 200

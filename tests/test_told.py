@@ -15,6 +15,7 @@ from torchrl.objectives import DDPGLoss
 from torchrl_l2c2 import L2C2Loss, Neighborhood, NeighborTransform
 from torchrl_l2c2.experiment import (
     AdamConfig,
+    ASAPConfig,
     CAPSConfig,
     Experiment,
     ExperimentConfig,
@@ -214,6 +215,25 @@ def test_gradient_shares_are_the_quotients_of_the_norms():
 KEEP = {"retain_graph": True}
 
 
+def test_frozen_parameters_have_no_part_in_a_share():
+    """As with an encoder that is not trained; of a network that is wholly frozen the share is 0."""
+    loss, batch = L2C2Loss(ddpg(), beta=0.1), NeighborTransform(Neighborhood())(ddpg_batch())
+    policy, *others = loss.actor_network_params.values(True, True)
+    before = gradient_shares(loss, batch)
+    for parameter in others:
+        parameter.requires_grad_(False)
+    terms = loss(batch.copy())
+    norms = [
+        torch.autograd.grad(terms[key], policy, **KEEP)[0].norm()
+        for key in ("loss_l2c2_actor", "loss_actor")
+    ]
+    share = (norms[0] / norms[1]).item()
+    expected = {"loss_l2c2_actor": share, "loss_l2c2_value": before["loss_l2c2_value"]}
+    assert gradient_shares(loss, batch) == pytest.approx(expected, rel=1e-5)
+    policy.requires_grad_(False)
+    assert gradient_shares(loss, batch)["loss_l2c2_actor"] == 0.0
+
+
 def many_updates(name, regularizer):
     algorithm = replace(ALGORITHMS[name], **({"epochs": 15} if name == "ppo" else {}))
     task = replace(PENDULUM, episodes=3)
@@ -233,6 +253,13 @@ def test_a_faint_regularizer_is_told_once_with_what_to_change(name):
     assert message.startswith("after 100 updates") and "loss_caps_spatial" in message
     assert "raise the gains of the regularizer" in message
     assert not warned(many_updates(name, strong).train)
+
+
+def test_a_predictor_beside_the_policy_hides_no_faint_regularizer():
+    """ASAP's, which the loss's own terms do not train: its share is infinite."""
+    faint = ASAPConfig(lambda_spatial=1e-12, lambda_grad=1e-12)
+    (message,) = warned(many_updates("sac", faint).train)
+    assert "loss_asap_spatial" in message and "loss_asap_temporal" not in message
 
 
 @pytest.mark.parametrize("name", ["ppo_rpe", "sac", "ppo"])

@@ -10,6 +10,7 @@ also between calls of a compiled loss::
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from copy import deepcopy
 from numbers import Real
 from typing import Any
@@ -262,7 +263,7 @@ def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]
 
     Returns:
         dict: at least 0 for every added ``loss_*`` key; infinite where the loss's own gradient is
-        zero.
+        zero and the term's is not, 0 of a term that trains nothing, as with frozen networks.
 
     Raises:
         ValueError: a term is not a single number.
@@ -298,19 +299,21 @@ def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]
             "gradient_shares needs terms that are single numbers, one for the whole batch: make "
             "the loss with reduction='mean'."
         )
-    parameters = list(twin.parameters())
+    parameters = [parameter for parameter in twin.parameters() if parameter.requires_grad]
 
     def gradients(value: Tensor) -> tuple[Tensor | None, ...]:
+        if not value.requires_grad:  # What it would train is frozen.
+            return (None,) * len(parameters)
         return torch.autograd.grad(value, parameters, allow_unused=True, retain_graph=True)
 
     own = gradients(sum(terms[key] for key in terms.keys() if is_loss(key) and key not in added))
     shares = {}
     for key in added:
         pairs = [(g, o) for g, o in zip(gradients(terms[key]), own, strict=True) if g is not None]
-        norms = [_norm(side) for side in zip(*pairs, strict=True)]
-        shares[key] = norms[0] / norms[1] if norms[1] else float("inf")
+        norm, own_norm = (_norm(pair[side] for pair in pairs) for side in (0, 1))
+        shares[key] = norm / own_norm if own_norm else math.inf if norm else 0.0
     return shares
 
 
-def _norm(gradients: tuple[Tensor | None, ...]) -> float:
+def _norm(gradients: Iterable[Tensor | None]) -> float:
     return sum(float(g.square().sum()) for g in gradients if g is not None) ** 0.5

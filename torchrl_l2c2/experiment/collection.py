@@ -23,12 +23,9 @@ from torchrl.envs import (
 )
 
 from torchrl_l2c2.experiment.acting import on_tensors
-from torchrl_l2c2.experiment.environments import simulating
+from torchrl_l2c2.experiment.environments import NOISE_SEED, simulating
 from torchrl_l2c2.experiment.frames import PREVIOUS, Frame, as_reward, stack_frames
 from torchrl_l2c2.transforms import ObservationNoise
-
-# Added to the seed of an environment for its noise: the two are not to draw the same numbers.
-NOISE_SEED = 7_919
 
 
 class EpisodeCollector(Collector):

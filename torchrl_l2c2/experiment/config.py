@@ -157,6 +157,7 @@ class ExperimentConfig:
             object.__setattr__(self, "replay", REPLAYS[self.algorithm.usual_replay])
         if self.optimizer is None:
             object.__setattr__(self, "optimizer", OPTIMIZERS[self.algorithm.usual_optimizer])
+        self._check_names()
         self._check_device()
         self._check_replay()
         self._check_rounds()
@@ -216,13 +217,24 @@ class ExperimentConfig:
 
         # The last episodes may go past the rollout's frames.
         longest = self.algorithm.frames + self.num_workers * self.task.time_limit
-        buffer = self.replay.make(torch.Generator().manual_seed(self.seed), longest, self.device)
+        buffer = self.replay.make(self.seed, longest, self.device)
         # Another seed than the sampler's: with one number for a neighbor both draw as many at a
         # time, and where a transition lies would say which neighbor it gets.
         neighbors = torch.Generator(self.device).manual_seed(self.seed + NEIGHBOR_SEED)
         if (transform := self.regularizer.neighbors(neighbors)) is not None:
             buffer.append_transform(transform)
         return buffer
+
+    def _check_names(self) -> None:
+        """A group is found again by its name, as a run's folder has it; tasks may have any."""
+        for group in GROUPS.keys() - {"task"}:
+            chosen, choices = getattr(self, group), GROUPS[group]
+            if type(choices.get(chosen.name)) is not type(chosen):
+                own = [name for name, each in choices.items() if type(each) is type(chosen)]
+                raise SettingError(
+                    f"{group}.name",
+                    f"must be one of {own} with {type(chosen).__name__}, got {chosen.name!r}.",
+                )
 
     def _check_device(self) -> None:
         # Not a pattern of the field, which pydantic would show as it is written.
@@ -259,7 +271,8 @@ class ExperimentConfig:
             raise SettingError(
                 "num_workers",
                 f"must be 1 with algorithm.schedule=step, which updates after every frame, got "
-                f"{workers}: use algorithm.schedule=episode, or one worker.",
+                f"{workers}: use one worker, or algorithm.schedule=episode algorithm.updates=null "
+                f"algorithm.replay_ratio={self.replay.batch_size}, one update a frame on average.",
             )
 
 

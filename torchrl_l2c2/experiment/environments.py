@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 
 # Added to the seed of test episodes, so that they are not training episodes again.
 TEST_SEED = 1_000_003
+# Added to the seed of an environment for its noise: it is not to draw what the simulator, or the
+# policy with its samples, draws.
+NOISE_SEED = 7_919
 
 
 @contextlib.contextmanager
@@ -85,7 +88,7 @@ def make_env(task: TaskConfig, seed: int, *, render: bool = False) -> EnvBase:
     env.set_seed(seed)
     if not task.noise_scale:
         return env
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(seed + NOISE_SEED)
     return TransformedEnv(env, ObservationNoise(task.noise_scale, generator=generator))
 
 

@@ -15,6 +15,7 @@ from torchrl_l2c2.experiment.learner import Learner
 from torchrl_l2c2.experiment.player import EPISODE_COLUMNS
 from torchrl_l2c2.experiment.regularizers import GainConfig
 from torchrl_l2c2.experiment.settings import SettingError
+from torchrl_l2c2.experiment.tasks import Budget
 from torchrl_l2c2.gains import (
     ConstantGain,
     GradientGain,
@@ -28,8 +29,8 @@ class GainControl:
     """Sets the regularizer's gains between the updates of two episodes, and reports them.
 
     Args:
-        config (ExperimentConfig): whose regularizer says how, and whose task says how long training
-            is; a constant gain is none of this class's business.
+        config (ExperimentConfig): whose regularizer says how; a constant gain is none of this
+            class's business.
         learner (Learner): whose loss has the gains.
 
     Raises:
@@ -41,7 +42,7 @@ class GainControl:
 
     def __init__(self, config: ExperimentConfig, learner: Learner) -> None:
         regularizer = config.regularizer
-        self._learner, self._updates, self._budget = learner, 0, config.task.budget
+        self._learner, self._updates = learner, 0
         self._config = regularizer if isinstance(regularizer, GainConfig) else None
         self._tells_measured = True
         # Of the episodes since the gain was set: of a rollout several end, and any one is noisy.
@@ -57,7 +58,9 @@ class GainControl:
             learner.at_full_gain = self._at_full_gain
             self._apply()
 
-    def after(self, row: Mapping[str, float], *, ends_round: bool = True) -> dict[str, float]:
+    def after(
+        self, row: Mapping[str, float], training: Budget, *, ends_round: bool = True
+    ) -> dict[str, float]:
         """Sets the gains for what follows an episode; gives what they were and were set from.
 
         Without an update since the last time nothing is set, and no gradient measured. Where one
@@ -65,6 +68,9 @@ class GainControl:
 
         Args:
             row (Mapping): what is logged of the episode.
+            training (Budget): all of it, over which a ramp rises.
+
+        Keyword Args:
             ends_round (bool): whether it is the last that was played with the same policy; the
                 gains stay as they are till then. Default ``True``.
 
@@ -74,7 +80,7 @@ class GainControl:
         """
         logged = {}
         due = ends_round and self._learner.updates > self._updates
-        measured = self._measure(row, due)
+        measured = self._measure(row, training, due)
         for name, gain in self.gains.items():
             suffix = "" if name == "all" else f"_{name}"
             logged[f"gain{suffix}"] = gain.value
@@ -124,12 +130,12 @@ class GainControl:
         terms = {"policy": sorted(of_policy), "value": sorted(of_value)}
         return {name: keys for name, keys in terms.items() if keys}
 
-    def _measure(self, row: Mapping[str, float], due: bool) -> dict[str, float]:
+    def _measure(self, row: Mapping[str, float], training: Budget, due: bool) -> dict[str, float]:
         if self._config is None or not self.gains:
             return {}
         if self._config.gain == "ramp":
-            spent = self._budget.spent(int(row["episode"]), int(row["frames"]))
-            return {"all": min(1.0, spent / self._budget.total)}  # A last round may go beyond it.
+            spent = training.spent(int(row["episode"]), int(row["frames"]))
+            return {"all": min(1.0, spent / training.total)}  # A last round may go beyond it.
         if self._config.gain == "target":
             self._seen.append(row[self._config.gain_of])
             numbers = [measured for measured in self._seen if math.isfinite(measured)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
 from collections.abc import Callable
@@ -157,6 +158,8 @@ class Learner:
     def _tell_faint_regularizer(self) -> None:
         with self.at_full_gain():
             shares = gradient_shares(self.agent.loss, self.update.example())
+        # What the loss's own terms do not train, as a predictor beside the policy, has no share.
+        shares = {key: share for key, share in shares.items() if math.isfinite(share)}
         if shares and max(shares.values()) < TOLD_BELOW:
             each = ", ".join(f"{key}: {share:.1g}" for key, share in shares.items())
             warnings.warn(

@@ -77,9 +77,9 @@ def _unusual(config: ExperimentConfig) -> Iterator[tuple[str, str, Any]]:
 
 
 def _usual(group: str, chosen: Any) -> Any:
-    """What ``group=name`` chooses; for a task of one's own, its id with nothing else set."""
+    """What ``group=name`` chooses; for a task of one's own, the id that it is called by alone."""
     if group == "task" and chosen.name not in GROUPS[group]:
-        return TaskConfig(chosen.name, chosen.env_id)
+        return TaskConfig(chosen.name, chosen.name)
     return GROUPS[group][chosen.name]
 
 

@@ -10,7 +10,6 @@ from pydantic import Field
 from torchrl_l2c2.experiment.settings import SettingError, settings
 
 if TYPE_CHECKING:
-    import torch
     from torchrl.data import TensorDictReplayBuffer
 
 
@@ -40,10 +39,9 @@ class PrioritizedReplayConfig:
     def __post_init__(self) -> None:
         _check_fits(self.capacity, self.batch_size)
 
-    def make(
-        self, generator: torch.Generator, longest_rollout: int, device: str = "cpu"
-    ) -> TensorDictReplayBuffer:
+    def make(self, seed: int, longest_rollout: int, device: str = "cpu") -> TensorDictReplayBuffer:
         """The buffer; how long a rollout may be does not matter to it."""
+        import torch
         from torchrl.data import LazyTensorStorage, TensorDictPrioritizedReplayBuffer
 
         return TensorDictPrioritizedReplayBuffer(
@@ -51,8 +49,10 @@ class PrioritizedReplayConfig:
             beta=self.beta,
             priority_key="td_error",
             storage=LazyTensorStorage(self.capacity, device=device),
+            # Where draw_by_priority is; of a storage on a GPU they would lie there, too.
+            sampler_device="cpu",
             batch_size=self.batch_size,
-            generator=generator,
+            generator=torch.Generator().manual_seed(seed),
         )
 
 
@@ -67,16 +67,15 @@ class UniformReplayConfig:
     def __post_init__(self) -> None:
         _check_fits(self.capacity, self.batch_size)
 
-    def make(
-        self, generator: torch.Generator, longest_rollout: int, device: str = "cpu"
-    ) -> TensorDictReplayBuffer:
+    def make(self, seed: int, longest_rollout: int, device: str = "cpu") -> TensorDictReplayBuffer:
         """The buffer; how long a rollout may be does not matter to it."""
+        import torch
         from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
         return TensorDictReplayBuffer(
             storage=LazyTensorStorage(self.capacity, device=device),
             batch_size=self.batch_size,
-            generator=generator,
+            generator=torch.Generator(device).manual_seed(seed),
         )
 
 
@@ -87,10 +86,9 @@ class RolloutReplayConfig:
     name: str = "rollout"
     batch_size: int = Field(default=64, ge=1, description="transitions per update")
 
-    def make(
-        self, generator: torch.Generator, longest_rollout: int, device: str = "cpu"
-    ) -> TensorDictReplayBuffer:
+    def make(self, seed: int, longest_rollout: int, device: str = "cpu") -> TensorDictReplayBuffer:
         """The buffer, with room for the longest rollout."""
+        import torch
         from torchrl.data import (
             LazyTensorStorage,
             SamplerWithoutReplacement,
@@ -101,7 +99,7 @@ class RolloutReplayConfig:
             storage=LazyTensorStorage(longest_rollout, device=device),
             sampler=SamplerWithoutReplacement(),
             batch_size=self.batch_size,
-            generator=generator,
+            generator=torch.Generator(device).manual_seed(seed),
         )
 
 

@@ -330,8 +330,8 @@ def begin_sweep(overrides: Sequence[str] = ()) -> Iterator[Sweep]:
         previous = {n: signal.signal(n, receive) for n in (signal.SIGINT, signal.SIGTERM)}
         try:
             yield sweep
-            sweep.end()
         finally:
+            sweep.end()
             for number, handler in previous.items():
                 signal.signal(number, handler)
             Sweep.begun_here = None

@@ -164,10 +164,12 @@ class Experiment:
         )
         ended = self._ended(budget)
         with self._process, bar, stop_on_signals() as signals, checkpoint_named(self.folder):
+            # What goes on for longer begins at another rate than it had ended with.
+            anneal(self.config.optimizer, self.agent.optimizer, self._spent(full) / full.total)
             while not ended:
                 episode = next(schedule)
                 row = self._row(episode, full)
-                row |= self._gain.after(row, ends_round=episode.ends_round)
+                row |= self._gain.after(row, full, ends_round=episode.ends_round)
                 self._write(row, bar)
                 anneal(self.config.optimizer, self.agent.optimizer, self._spent(full) / full.total)
                 self._best_policy.after(len(self.metrics))

@@ -109,7 +109,7 @@ class PerStepConfig(OffPolicyConfig):
         default=1000, ge=0, description="frames with random actions, before learning starts"
     )
     reward_scale: float | None = Field(
-        default=1.0, description="factor on rewards while learning; null: 1 - gamma"
+        default=1.0, gt=0, description="factor on rewards while learning; null: 1 - gamma"
     )
     schedule: Literal["step", "episode"] = Field(default="step", description="when updates happen")
     replay_ratio: float | None = Field(

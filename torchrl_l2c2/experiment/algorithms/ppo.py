@@ -51,7 +51,7 @@ class PPOConfig(AlgorithmConfig):
         default=(64, 64), description="neurons of the hidden layers of both networks"
     )
     reward_scale: float | None = Field(
-        default=1.0, description="factor on rewards while learning; null: 1 - gamma"
+        default=1.0, gt=0, description="factor on rewards while learning; null: 1 - gamma"
     )
     schedule: Literal["rollout"] = Field(
         default="rollout", description="updates follow every rollout"

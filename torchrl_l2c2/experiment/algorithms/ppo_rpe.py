@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 from pydantic import Field
 
 from torchrl_l2c2.experiment.algorithms.base import Layers, OffPolicyConfig
-from torchrl_l2c2.experiment.settings import settings
+from torchrl_l2c2.experiment.settings import SettingError, settings
 
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
@@ -59,7 +59,9 @@ class PPORPEConfig(OffPolicyConfig):
         default="target", description="which copy of the policy acts [inferred: target]"
     )
     reward_scale: float | None = Field(
-        default=None, description="factor on rewards while learning; null: 1 - gamma [inferred]"
+        default=None,
+        gt=0,
+        description="factor on rewards while learning; null: 1 - gamma [inferred]",
     )
     squash: Literal["tanh", "sigmoid", "none"] = Field(
         default="tanh", description="how actions are kept in their bounds [inferred: tanh]"
@@ -103,9 +105,18 @@ class PPORPEConfig(OffPolicyConfig):
     )
     nu: float = Field(
         default=1.0,
-        gt=0,
+        ge=1e-30,
         description="t-soft update: degrees of freedom; larger is less robust [paper]",
     )
+
+    def __post_init__(self) -> None:
+        OffPolicyConfig.__post_init__(self)
+        # As in PPORPELoss, which could say it only once a task has been made.
+        widest = 2.0 * (1.0 - self.beta) / (self.beta * max(1.0, 1.0 / self.beta - 1.0))
+        if self.kappa >= widest:
+            raise SettingError(
+                "kappa", f"must be below {widest:g} with beta={self.beta:g}, got {self.kappa:g}."
+            )
 
     def make_agent(
         self, env: EnvBase, regularizer: RegularizerConfig, optimizer: OptimizerConfig
