@@ -21,7 +21,6 @@ from torchrl_l2c2.gains import (
     GradientGain,
     RampGain,
     TargetGain,
-    gradient_shares,
 )
 
 
@@ -142,11 +141,9 @@ class GainControl:
             return {"all": fmean(numbers) if numbers else self._seen[-1]}
         if not due:
             return dict.fromkeys(self.gains, float("nan"))
-        shares = gradient_shares(self._learner.agent.loss, self._learner.example())
-        # What the loss's own terms do not train, as a predictor beside the policy, has no share.
-        finite = {key: share for key, share in shares.items() if share < float("inf")}
+        shares = self._learner.shares(self._learner.example())
         return {
-            name: max((finite[key] for key in keys if key in finite), default=float("nan"))
+            name: max((shares[key] for key in keys if key in shares), default=float("nan"))
             for name, keys in self._terms().items()
         }
 

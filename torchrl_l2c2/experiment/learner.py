@@ -157,9 +157,7 @@ class Learner:
 
     def _tell_faint_regularizer(self) -> None:
         with self.at_full_gain():
-            shares = gradient_shares(self.agent.loss, self.update.example())
-        # What the loss's own terms do not train, as a predictor beside the policy, has no share.
-        shares = {key: share for key, share in shares.items() if math.isfinite(share)}
+            shares = self.shares(self.update.example())
         if shares and max(shares.values()) < TOLD_BELOW:
             each = ", ".join(f"{key}: {share:.1g}" for key, share in shares.items())
             warnings.warn(
@@ -168,6 +166,14 @@ class Learner:
                 "nothing: raise the gains of the regularizer, or lower algorithm.reward_scale.",
                 stacklevel=2,
             )
+
+    def shares(self, batch: TensorDictBase) -> dict[str, float]:
+        """Of the regularizer's terms, :func:`~.gradient_shares` that are finite.
+
+        What the loss's own terms do not train, as a predictor beside the policy, has none.
+        """
+        shares = gradient_shares(self.agent.loss, batch)
+        return {key: share for key, share in shares.items() if math.isfinite(share)}
 
     def report(self, last_frame: int) -> dict[str, float]:
         """Means of every entry of the loss over the updates since the last report.
