@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import os
 import re
-import subprocess
+import runpy
 import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 ROOT = Path(__file__).parents[1]
 # One plays what a run has exported, test_export.py; others are for rsl_rl, test_rsl_rl.py, and for
@@ -30,18 +30,18 @@ def test_all_four_are_there() -> None:
     assert names >= {"sac_loop", "ppo_loop", "own_regularizer", "torchrl_trainer"}
 
 
-def test_it_trains_and_says_what_it_learned(example: Path, tmp_path: Path) -> None:
+def test_it_trains_and_says_what_it_learned(
+    example: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     """It ends well, with a return and an action variation that are numbers."""
-    done = subprocess.run(
-        [sys.executable, str(example)],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    told = dict(re.findall(r"^([a-z_ ]+) (\S+)$", done.stdout, re.M))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", [str(example)])
+    with torch.random.fork_rng():
+        runpy.run_path(str(example), run_name="__main__")
+    told = dict(re.findall(r"^([a-z_ ]+) (\S+)$", capsys.readouterr().out, re.M))
     assert {"return", "action variation"} <= told.keys()
     assert all(math.isfinite(float(number)) for number in told.values())
     assert -2000 < float(told["return"]) < 0  # what 200 steps of the pendulum can give

@@ -599,20 +599,14 @@ def test_in_a_sweep_a_failed_job_is_told_and_the_others_go_on(tmp_path):
     assert (run.folder / "evaluation.json").stat().st_mtime_ns == written
 
 
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["task=gymnasium", "task.env_id=Nowhere-v0"], "Nowhere-v0' is not a task that Gymnasium"),
-        (["regularizer.sigma=-1"], "sigma must be greater than 0, got -1"),
-    ],
-)
-def test_a_wrong_setting_ends_with_one_clear_line(tmp_path, overrides, message):
+def test_a_wrong_setting_ends_with_one_clear_line(tmp_path):
     """No traceback: what was given and what is allowed; and nothing is written half."""
-    failed = run_train(*overrides, folder=tmp_path, check=False)
+    wrong = ("task=gymnasium", "task.env_id=Nowhere-v0")  # in a sweep, above, sigma=-1
+    failed = run_train(*wrong, folder=tmp_path, check=False)
     assert failed.returncode == 1
     assert "Traceback" not in failed.stderr
     assert failed.stderr.strip().splitlines()[-1].startswith("error: ")
-    assert message in failed.stderr
+    assert "Nowhere-v0' is not a task that Gymnasium" in failed.stderr
     assert not list(tmp_path.iterdir())
 
 

@@ -166,7 +166,8 @@ def test_compiled_it_learns_the_same_and_follows_what_may_change(name):
 
 
 @pytest.mark.skipif(not compiler_available(), reason="no C++ compiler")
-@pytest.mark.parametrize("name", ["td3", pytest.param("sac", marks=pytest.mark.slow)])
+@pytest.mark.slow  # two graphs each
+@pytest.mark.parametrize("name", ["td3", "sac"])
 def test_a_loss_that_was_compiled_still_has_its_contents(name):
     """With and without the policy, two graphs, and then as it is: TorchRL's losses keep tensors."""
     algorithm = {"td3": TD3Config, "sac": SACConfig}[name](hidden=(8,), random_frames=0)
