@@ -20,10 +20,17 @@ from losses import (
     transitions,
 )
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
+from torchrl.data import Bounded
 from torchrl.envs import CatFrames, GymEnv, TransformedEnv
-from torchrl.modules import Actor, IndependentNormal, NormalParamExtractor, ProbabilisticActor
+from torchrl.modules import (
+    Actor,
+    AdditiveGaussianModule,
+    IndependentNormal,
+    NormalParamExtractor,
+    ProbabilisticActor,
+)
 from torchrl.objectives import DDPGLoss, DQNLoss, PPOLoss
 
 from torchrl_l2c2 import ASAPLoss, CAPSLoss, CATSLoss, GradCAPSLoss, L2C2Loss, LCPLoss, SR2LLoss
@@ -44,6 +51,7 @@ from torchrl_l2c2.experiment import (
     UniformReplayConfig,
 )
 from torchrl_l2c2.experiment.compilation import compiler_available
+from torchrl_l2c2.gains import _norm, gradient_shares
 from torchrl_l2c2.objectives.cats import cats_term
 from torchrl_l2c2.objectives.grad_caps import grad_caps_term
 from torchrl_l2c2.objectives.lcp import lcp_term
@@ -271,6 +279,15 @@ class TestASAP:
         twin.asap_predictor.module.weight.data.zero_()
         assert loss.asap_predictor.module.weight.equal(self.PREDICTOR)
 
+    def test_a_policy_that_explores_is_compared_without_its_noise(self):
+        """Also outside of the loss's own forward: a copy predicts for the same state."""
+        noise = AdditiveGaussianModule(Bounded(-9.0, 9.0, (2,)), sigma_init=1.0, sigma_end=1.0)
+        policy = TensorDictSequential(Actor(nn.Linear(3, 2)), noise)
+        batch = self.batch()
+        batch["before"] = batch["observation"]
+        loss = ASAPLoss(DDPGLoss(policy, qvalue()), previous_key="before")
+        assert loss.policy_regularizer(batch)["loss_asap_spatial"].item() == 0.0
+
     def test_what_grad_caps_refuses_is_refused(self):
         """By its own name."""
         base = DQNLoss(action_values(), action_space="one-hot")
@@ -290,6 +307,14 @@ def test_what_takes_gradients_says_so_in_inference_mode(make):
         assert not loss.policy_regularizer(batch).is_empty()
     with torch.inference_mode(), pytest.raises(RuntimeError, match="validate under"):
         loss.policy_regularizer(batch)
+
+
+def test_shares_of_gradients_are_refused_in_inference_mode_and_squared_in_float32():
+    """Where they would all be 0, which says that nothing is trained."""
+    with torch.inference_mode(), pytest.raises(RuntimeError, match="gradient_shares takes grad"):
+        gradient_shares(CATSLoss(linear_base()), transitions(4))
+    small = torch.full((4,), 1e-4, dtype=torch.float16)
+    assert _norm([small, None]) == pytest.approx(2e-4, rel=1e-2)
 
 
 class TestSR2L:

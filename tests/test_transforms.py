@@ -30,6 +30,7 @@ from torchrl.envs import (
 )
 
 from torchrl_l2c2 import Neighborhood, NeighborTransform, ObservationNoise
+from torchrl_l2c2.transforms import draw_neighbors
 
 NEAR = Neighborhood(sigma=2.0, lambda_min=0.1, lambda_max=1.0)
 
@@ -287,6 +288,14 @@ def test_wrong_settings_of_neighbors(arguments, error, message):
     """Wrong settings are refused at construction."""
     with pytest.raises(error, match=message):
         NeighborTransform(**{"neighborhood": NEAR, **arguments})
+
+
+def test_a_loss_that_draws_by_itself_refuses_a_reserved_name_too():
+    """Its neighbors would be written over by the distances."""
+    entry = torch.zeros(4, 3)
+    batch = TensorDict({"distance": entry, "next": {"distance": entry}}, [4])
+    with pytest.raises(ValueError, match=r"none called 'distance'.*or choose other in_keys"):
+        draw_neighbors(batch, NEAR, ["distance"])
 
 
 def test_reprs_show_the_settings():

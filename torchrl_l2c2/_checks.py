@@ -1,4 +1,4 @@
-"""What a setting may be, such as a real number in a range, and what shape is compared."""
+"""What a setting may be, such as a real number in a range, and what a regularizer may be given."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from collections.abc import Sequence
 from numbers import Real
 from typing import Any
 
+import torch
 from torch import Tensor
+from torch.compiler import is_compiling
 
 
 def check_positive_int(name: str, value: Any) -> None:
@@ -130,4 +132,17 @@ def check_of_each(shape: Sequence[int], batch: Sequence[int]) -> None:
             f"a regularizer compares each of the {tuple(batch)} states by itself, got differences "
             f"of shape {tuple(shape)}: give what the network writes a last dimension, "
             "of 1 for a value or an action of one number."
+        )
+
+
+def check_takes_gradients(regularizer: str) -> None:
+    """Refuses inference mode, for what takes gradients of its own.
+
+    Raises:
+        RuntimeError: torch keeps none in this mode.
+    """
+    if not is_compiling() and torch.is_inference_mode_enabled():
+        raise RuntimeError(
+            f"{regularizer} takes gradients of its own, of which torch.inference_mode keeps "
+            "none: validate under torch.no_grad()."
         )

@@ -20,7 +20,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from torchrl_l2c2._checks import as_number, check_real
+from torchrl_l2c2._checks import as_number, check_real, check_takes_gradients
 
 
 class ConstantGain:
@@ -267,6 +267,7 @@ def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]
 
     Raises:
         ValueError: a term is not a single number.
+        RuntimeError: in inference mode, which keeps no gradients.
 
     Examples:
         >>> import torch
@@ -289,6 +290,7 @@ def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]
     added = [key for key in loss.out_keys if key in getattr(loss, "added_terms", ())]
     if not added:
         return {}
+    check_takes_gradients("gradient_shares")
     # A copy, as some losses keep statistics of what they have seen.
     devices = {parameter.device for parameter in loss.parameters() if parameter.is_cuda}
     with torch.random.fork_rng(devices=devices):
@@ -316,4 +318,10 @@ def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]
 
 
 def _norm(gradients: Iterable[Tensor | None]) -> float:
-    return sum(float(g.square().sum()) for g in gradients if g is not None) ** 0.5
+    # In half precision the squares of small gradients are 0.
+    squares = (
+        g.to(torch.promote_types(g.dtype, torch.float32)).square().sum()
+        for g in gradients
+        if g is not None
+    )
+    return sum(map(float, squares)) ** 0.5

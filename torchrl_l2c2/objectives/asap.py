@@ -8,6 +8,7 @@ from typing import Literal
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torchrl.envs.utils import set_exploration_type
 from torchrl.objectives import LossModule
 
 from torchrl_l2c2.distances import squared_error
@@ -119,7 +120,7 @@ class ASAPLoss(GradCAPSLoss):
         rows = tensordict.select(*predictor.in_keys, strict=False).detach()
         rows.update(self.states_around(tensordict)[0])
         squashed = self.grad_caps_mean == "action"
-        with in_full_precision(rows):
+        with set_exploration_type(self.deterministic_sampling_mode), in_full_precision(rows):
             if not self.has_stochastic_policy():
                 return policy_mean(predictor(rows)[self.policy_action()], squashed=squashed)
             predicted = predictor.build_dist_from_params(predictor.get_dist_params(rows))

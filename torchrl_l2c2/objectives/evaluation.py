@@ -263,19 +263,6 @@ def _split(
     return out.split(parts, dim)
 
 
-def check_takes_gradients(regularizer: str) -> None:
-    """Refuses inference mode, for what takes gradients of its own.
-
-    Raises:
-        RuntimeError: torch keeps none in this mode.
-    """
-    if not is_compiling() and torch.is_inference_mode_enabled():
-        raise RuntimeError(
-            f"{regularizer} takes gradients by the state, of which torch.inference_mode keeps "
-            "none: validate under torch.no_grad()."
-        )
-
-
 def _thread() -> int:
     # Not to be compiled; a compiled call has begun and ended its pass by the time that it runs.
     return 0 if is_compiling() else get_ident()

@@ -9,8 +9,8 @@ from torch import Tensor
 from torch.distributions import Distribution
 from torchrl.objectives import LossModule
 
+from torchrl_l2c2._checks import check_takes_gradients
 from torchrl_l2c2.distances import log_prob_of
-from torchrl_l2c2.objectives.evaluation import check_takes_gradients
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
 
 

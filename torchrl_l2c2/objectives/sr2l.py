@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.distributions import Distribution
 from torchrl.objectives import LossModule
 
-from torchrl_l2c2._checks import check_positive_int, check_real
-from torchrl_l2c2.objectives.evaluation import Policy, check_takes_gradients
+from torchrl_l2c2._checks import check_positive_int, check_real, check_takes_gradients
+from torchrl_l2c2.objectives.evaluation import Policy
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
 from torchrl_l2c2.policy_distances import (
     PolicyDistance,

@@ -39,6 +39,7 @@ def draw_neighbors(
         >>> near["observation"].shape, near["distance"].shape
         (torch.Size([4, 2, 3]), torch.Size([4, 2]))
     """
+    _check_names(in_keys)
     transitions = _transitions(tensordict, in_keys)
     uniform = _draw(tensordict, transitions, neighborhood, num_samples, generator)
     return _place(tensordict, transitions, neighborhood, uniform)
@@ -84,6 +85,16 @@ def _place(
             neighbors.set(key, torch.where(left_out, state.unsqueeze(ndim), near))
     numbers = distance.new_tensor(neighborhood.numbers).expand(*tensordict.batch_size, -1)
     return neighbors.set("neighborhood", numbers).set("distance", distance)
+
+
+def _check_names(keys: Sequence[NestedKey]) -> None:
+    roots = [key if isinstance(key, str) else key[0] for key in keys]
+    if not roots or {"distance", "neighborhood"} & set(roots):
+        raise ValueError(
+            f"in_keys must name at least one entry and none called 'distance' or 'neighborhood', "
+            f"which say how far away neighbors are; got {list(keys)}. Rename it in the "
+            "environment, or choose other in_keys (or moved_keys)."
+        )
 
 
 def _transitions(tensordict: TensorDictBase, in_keys: Sequence[NestedKey]) -> Transitions:
@@ -173,12 +184,7 @@ class NeighborTransform(RandomTransform):
             out_keys=[out_key],
             generator=generator,
         )
-        roots = [key if isinstance(key, str) else key[0] for key in self.in_keys]
-        if not roots or {"distance", "neighborhood"} & set(roots):
-            raise ValueError(
-                f"in_keys must name at least one entry and none called 'distance' or "
-                f"'neighborhood', which say how far away neighbors are; got {self.in_keys}."
-            )
+        _check_names(self.in_keys)
         self.neighborhood = neighborhood
         self.num_samples = num_samples
 
