@@ -28,9 +28,10 @@ from torchrl.envs import (
     TransformedEnv,
     check_env_specs,
 )
+from torchrl.modules import Actor, ValueOperator
+from torchrl.objectives import DDPGLoss
 
-from torchrl_l2c2 import Neighborhood, NeighborTransform, ObservationNoise
-from torchrl_l2c2.transforms import draw_neighbors
+from torchrl_l2c2 import L2C2Loss, Neighborhood, NeighborTransform, ObservationNoise
 
 NEAR = Neighborhood(sigma=2.0, lambda_min=0.1, lambda_max=1.0)
 
@@ -292,10 +293,13 @@ def test_wrong_settings_of_neighbors(arguments, error, message):
 
 def test_a_loss_that_draws_by_itself_refuses_a_reserved_name_too():
     """Its neighbors would be written over by the distances."""
+    actor = Actor(torch.nn.Linear(3, 1), in_keys=["distance"])
+    value = ValueOperator(torch.nn.Bilinear(3, 1, 1), in_keys=["distance", "action"])
+    loss = L2C2Loss(DDPGLoss(actor, value), NEAR)
     entry = torch.zeros(4, 3)
     batch = TensorDict({"distance": entry, "next": {"distance": entry}}, [4])
-    with pytest.raises(ValueError, match=r"none called 'distance'.*or choose other in_keys"):
-        draw_neighbors(batch, NEAR, ["distance"])
+    with pytest.raises(ValueError, match=r"none called 'distance'.*\(or moved_keys\)"):
+        loss.policy_regularizer(batch)
 
 
 def test_reprs_show_the_settings():

@@ -18,6 +18,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.linalg import vector_norm
 from torchrl.objectives import LossModule
 
 from torchrl_l2c2._checks import as_number, check_real, check_takes_gradients
@@ -318,10 +319,5 @@ def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]
 
 
 def _norm(gradients: Iterable[Tensor | None]) -> float:
-    # In half precision the squares of small gradients are 0.
-    squares = (
-        g.to(torch.promote_types(g.dtype, torch.float32)).square().sum()
-        for g in gradients
-        if g is not None
-    )
-    return sum(map(float, squares)) ** 0.5
+    # Not of their squares, which in half precision are 0 where gradients are small.
+    return math.hypot(*(float(vector_norm(g)) for g in gradients if g is not None))

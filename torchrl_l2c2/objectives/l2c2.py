@@ -127,7 +127,8 @@ class L2C2Loss(RegularizedLoss):
     Raises:
         TypeError: the loss has neither a policy nor a value function, cannot be regularized, has no
             policy for ``policy_distance``, or an argument has the wrong type.
-        ValueError: an argument is out of its range.
+        ValueError: an argument is out of its range; in use, an observation to be moved is called
+            ``"distance"`` or ``"neighborhood"``.
 
     Warns:
         UserWarning: the loss lacks a policy or a trained value function, so that one term is left

@@ -91,7 +91,7 @@ def _check_names(keys: Sequence[NestedKey]) -> None:
     roots = [key if isinstance(key, str) else key[0] for key in keys]
     if not roots or {"distance", "neighborhood"} & set(roots):
         raise ValueError(
-            f"in_keys must name at least one entry and none called 'distance' or 'neighborhood', "
+            "in_keys must name at least one entry and none called 'distance' or 'neighborhood', "
             f"which say how far away neighbors are; got {list(keys)}. Rename it in the "
             "environment, or choose other in_keys (or moved_keys)."
         )
