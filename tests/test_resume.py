@@ -290,6 +290,25 @@ def test_a_policy_needs_its_folder_alone(tmp_path):
     assert policy(td)["loc"].equal(loc)
 
 
+@pytest.mark.parametrize(
+    "code, run, refused", [("run", "run", True), ("", "pack/run", True), ("own", "run", False)]
+)
+def test_a_run_brings_no_code(tmp_path, monkeypatch, code, run, refused):
+    """Of its folder, or of a package around it; a task of one's own, from elsewhere, is made."""
+    module = tmp_path / code / "pack" / "__init__.py"
+    for folder in (tmp_path / run, module.parent):
+        folder.mkdir(parents=True, exist_ok=True)
+    module.write_text(f"open({str(tmp_path / 'executed')!r}, 'w')")
+    settings = small().to_dict()
+    settings["task"]["env_id"] = "pack:Stray-v0"
+    (tmp_path / run / "config.json").write_text(json.dumps(settings))
+    monkeypatch.delitem(sys.modules, "pack", raising=False)
+    monkeypatch.syspath_prepend(tmp_path / code)
+    with pytest.raises(ValueError, match="comes with the run" if refused else "Gymnasium"):
+        load_policy(tmp_path / run)
+    assert (tmp_path / "executed").exists() is not refused
+
+
 def of_other_versions(folder, **changed):
     """Makes the newest checkpoint one that other versions wrote."""
     newest = list_checkpoints(folder)[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import io
 import math
 from dataclasses import replace
@@ -50,7 +51,8 @@ def load_policy(
     Raises:
         FileNotFoundError: the folder is not a run's, or holds no such policy nor a checkpoint.
         CheckpointError: its policy, or all of its checkpoints, are damaged.
-        ValueError: its ``config.json`` is damaged.
+        ValueError: its ``config.json`` is damaged, or names a module from the folder itself as
+            that of its task, which a policy that somebody else trained might have beside it.
         SettingError: a scale of noise that is negative or not finite, or a seed that NumPy does
             not take.
 
@@ -75,6 +77,7 @@ def load_policy(
         raise FileNotFoundError(f"{str(folder)!r} is not the folder of a run: no config.json.")
     config = ExperimentConfig.from_dict(read_config(folder))
     config = replace(config, device="cpu")
+    _check_origin(config.task.env_id, folder)
     noise = config.task.noise_scale if noise_scale is None else noise_scale
     task = replace(config.task, noise_scale=noise)
     env = make_env(task, config.seed + TEST_SEED if seed is None else seed, render=render)
@@ -92,6 +95,25 @@ def load_policy(
     else:
         raise FileNotFoundError(f"{str(folder)!r} holds neither policy.pt nor a checkpoint yet.")
     return agent.policy, env, config.task.time_limit
+
+
+def _check_origin(env_id: str, folder: Path) -> None:
+    """Refuses a task whose module is in the run's folder, or in a package around it.
+
+    A run's settings may be somebody else's, and importing executes.
+    """
+    name = env_id.rpartition(":")[0].partition(".")[0]
+    # Of what is not within another no finder imports anything.
+    spec = importlib.util.find_spec(name) if name else None
+    places = spec and (spec.submodule_search_locations or filter(None, [spec.origin]))
+    run = folder.resolve()
+    for place in [Path(place).resolve() for place in places or ()]:
+        if place in (run, *run.parents) or run in place.parents:
+            raise ValueError(
+                f"{folder / 'config.json'}: task.env_id={env_id!r} would execute {place}, which is "
+                "no module of yours but comes with the run. Put it beside your own code if you "
+                "trust it, or install it."
+            )
 
 
 def _load_weights(policy: TensorDictModule, path: Path) -> None:
