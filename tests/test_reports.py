@@ -25,6 +25,7 @@ from torchrl_l2c2.experiment import (
     SACConfig,
     TD3Config,
 )
+from torchrl_l2c2.experiment.optimizers import AdamConfig
 from torchrl_l2c2.experiment.regularizers import REGULARIZERS
 from torchrl_l2c2.experiment.reports import (
     draw_learning_curves,
@@ -549,7 +550,7 @@ class TestGroups:
         assert run.until(21) is None and run.until(0) is None
 
     def test_a_run_of_frames_is_cut_by_them(self, tmp_path):
-        """Its episodes are as long as they like."""
+        """Its episodes are as long as they like, and the last one ends beyond what was asked."""
         config = make_config()
         config = replace(config, task=replace(config.task, frames=2000))
         make_run(tmp_path / "run", config, 1.0, 0.1)
@@ -557,7 +558,7 @@ class TestGroups:
         assert run.record.length == "2000 frames"
         assert (run.until(1550).record.length, run.until(1550).record.episodes) == (
             "1550 frames",
-            15,
+            16,
         )
 
     def test_runs_of_several_versions_are_pooled_and_told(self, records):
@@ -1084,6 +1085,17 @@ class TestReport:
         assert "20 runs are not as long as a length that was asked for" in printed
         report = (tmp_path / "report.md").read_text()
         assert report.count("**Statistics") == 1 and "0.50 [0.50, 0.50]" in report
+
+    def test_what_goes_by_the_length_is_told_of_runs_that_were_cut(self, tmp_path, capsys):
+        """They are not what a shorter training would have been; whole ones are."""
+        ramped = make_config(regularizer="l2c2_ramp", optimizer=AdamConfig(linear=True))
+        make_run(tmp_path / "run", ramped, 1.0, 0.1)
+        main([str(tmp_path), "--length", "10"])
+        printed = capsys.readouterr().out
+        for setting in ("optimizer.linear=true", "regularizer.gain=ramp"):
+            assert f"1 runs, cut to a length, have {setting} as in their own, longer" in printed
+        main([str(tmp_path), "--length", "20"])
+        assert "as in their own" not in capsys.readouterr().out
 
     def test_a_run_of_a_length_stands_for_its_seed_before_one_that_was_cut_to_it(
         self, tmp_path, capsys

@@ -15,7 +15,7 @@ from torchrl_l2c2.experiment.config import (
     OtherRunError,
 )
 from torchrl_l2c2.experiment.errors import SimulatorError
-from torchrl_l2c2.experiment.saved import differing
+from torchrl_l2c2.experiment.saved import differing, of_length
 from torchrl_l2c2.experiment.tasks import Budget, TaskConfig
 from torchrl_l2c2.experiment.versions import versions
 
@@ -157,12 +157,8 @@ def check_continuable(
     check_length(asked, before, played)
     if played >= asked.total:
         tell_past(saved, config.to_dict())
-    followed = {
-        "optimizer.linear=true": config.optimizer.linear,
-        "regularizer.gain=ramp": config.regularizer.ramped,
-    }
-    for setting, chosen in followed.items():
-        if chosen and asked != before:
+    for setting in of_length(config):
+        if asked != before:
             warnings.warn(
                 f"{setting} has been till now as in a training of {before.total} {before.unit}s; "
                 f"{asked.total} {asked.unit}s in one go would give other numbers.",

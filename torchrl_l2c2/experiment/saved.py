@@ -10,7 +10,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from torchrl_l2c2.experiment.config import GROUPS, NEUTRAL_SETTINGS, is_free, is_neutral
+from torchrl_l2c2.experiment.config import (
+    GROUPS,
+    NEUTRAL_SETTINGS,
+    ExperimentConfig,
+    is_free,
+    is_neutral,
+)
 
 NOT_THEN = "none, as it is a setting since"
 REMEDY = "it was changed or cut since it was written; restore it."
@@ -122,6 +128,16 @@ def differing(saved: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, tup
         for name, (was, is_now) in pairs.items()
         if was != is_now and not (was == NOT_THEN and is_neutral(name, is_now))
     }
+
+
+def of_length(config: ExperimentConfig) -> list[str]:
+    """The settings that go by how long a training is to be, so that a longer one's beginning is
+    not a shorter one."""
+    going = {
+        "optimizer.linear=true": config.optimizer.linear,
+        "regularizer.gain=ramp": config.regularizer.ramped,
+    }
+    return [setting for setting, chosen in going.items() if chosen]
 
 
 def is_tested(run: str | Path, settings: Mapping[str, Any]) -> bool:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from itertools import chain
 from pathlib import Path
 
+from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.reports.against import against_table
 from torchrl_l2c2.experiment.reports.groups import group_records
 from torchrl_l2c2.experiment.reports.page import fill_page
@@ -17,6 +19,7 @@ from torchrl_l2c2.experiment.reports.results import printed_tables
 from torchrl_l2c2.experiment.reports.runs import FinishedRun, Found, find_runs
 from torchrl_l2c2.experiment.reports.score import Reading, readings
 from torchrl_l2c2.experiment.reports.tables import score_table
+from torchrl_l2c2.experiment.saved import of_length
 
 DESCRIPTION = """\
 Reads every finished run below folders, prints their tables beside the paper's numbers, and writes a
@@ -182,6 +185,12 @@ def _shortened(
     notes = list(found.notes)
     if len(long) < len(cut):
         notes.append(f"{len(cut) - len(long)} runs are not as long as a length that was asked for")
+    going = [
+        of_length(ExperimentConfig.from_dict(run.config)) for run in long if not run.evaluation
+    ]
+    for setting, many in Counter(chain.from_iterable(going)).items():
+        as_longer = "as in their own, longer training: so short a one would give other numbers"
+        notes.append(f"{many} runs, cut to a length, have {setting} {as_longer}")
     if len(runs) < len(long):
         what = "have the settings, seed and length of another, left out"
         notes.append(f"{len(long) - len(runs)} runs, cut to a length, {what}")

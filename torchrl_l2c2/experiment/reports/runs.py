@@ -135,19 +135,19 @@ class FinishedRun:
         played.
 
         Args:
-            length (int): in episodes, or in frames where the run's own length is in frames; at
-                least as many as the first episode has.
+            length (int): in episodes, or in frames where the run's own length is in frames.
         """
         unit = "episodes" if self.config["task"].get("frames") is None else "frames"
         if self.record.length == f"{length} {unit}":
             return self
         column = self.column("episode" if unit == "episodes" else "frames")
-        if not column or not column[0] <= length <= column[-1]:
+        if not column or not 0 < length <= column[-1]:
             return None
+        # Training ends with the episode that reaches its length.
         kept = [
             {name: cell for name, cell in row.items() if not name.startswith("test_")}
-            for row, reached in zip(self.metrics, column, strict=True)
-            if reached <= length
+            for row, before in zip(self.metrics, [0.0, *column[:-1]], strict=True)
+            if before < length
         ]
         config = {**self.config, "task": {**self.config["task"], unit: length}}
         return replace(self, config=config, evaluation={}, metrics=kept)
