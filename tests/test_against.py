@@ -1,6 +1,8 @@
 """One method against each other one, by hand and on the command line."""
 
 import json
+import math
+from dataclasses import replace
 
 import pytest
 
@@ -9,6 +11,7 @@ from torchrl_l2c2.experiment import CATSConfig, PPOConfig
 from torchrl_l2c2.experiment.reports import read_runs, write_records
 from torchrl_l2c2.experiment.reports.__main__ import main
 from torchrl_l2c2.experiment.reports.against import against_table
+from torchrl_l2c2.experiment.reports.pairwise import pairwise_tables
 
 # Return, action variation and Sm of seeds 0 and 1.
 RUNS = {
@@ -48,6 +51,19 @@ def test_a_row_has_both_means_and_how_probable_a_better_run_is(records):
     vanilla, cats = ([cell.split()[0] for cell in row[4:]] for row in table.rows)
     assert vanilla == ["20.00", "15.00", "0.75", "0.200", "0.250", "0.50", "0.150", "0.150", "0.50"]
     assert cats == ["20.00", "25.00", "0.25", "0.200", "0.300", "1.00", "0.150", "0.300", "1.00"]
+
+
+def test_seeds_without_a_measure_are_told(records):
+    """As of a policy whose only test episode had two frames; they are in no mean and in no pair."""
+    lacking = [
+        replace(r, last_mean_sm_asap=math.nan) if (r.method, r.seed) == ("l2c2", 1) else r
+        for r in records
+    ]
+    row = against_table(lacking, "L2C2").rows[0]
+    assert row[4] == "20.00" and row[7].endswith(", of 1 runs")
+    notes = [table.notes for table in pairwise_tables(lacking)]
+    assert [len(each) for each in notes] == [1, 2]
+    assert notes[1][1] == "Not all runs have it: pendulum, L2C2, of 1 runs."
 
 
 def test_the_command_prints_it_and_has_it_on_a_page_and_in_a_report(records, tmp_path, capsys):

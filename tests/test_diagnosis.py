@@ -304,6 +304,9 @@ class TestMeasured:
         found = diagnose(policy, GymWrapper(Walk()))
         assert found.spread == pytest.approx(0.1, rel=0.1)
         assert torch.equal(before, torch.get_rng_state())
+        # One of 400 is at one of the bounds nearly always: by the task's hand, not the policy's.
+        module[0].bias.data = torch.tensor([0.0, 400.0])
+        assert diagnose(policy, GymWrapper(Walk())).spread == pytest.approx(1.0, rel=0.1)
 
     def test_the_worst_states_are_places_apart(self):
         """In time and among the states; the second largest is beside the largest."""

@@ -571,19 +571,17 @@ class TestGroups:
         told = "swingup, ppo_rpe, CAPS: runs of more than one commit (abc, unknown) are pooled."
         assert told in last.notes
 
-    def test_unfinished_failed_and_damaged_folders_are_counted_and_named(self, tmp_path):
+    def test_unfinished_and_damaged_folders_are_counted_and_named(self, tmp_path):
         """None is passed over in silence, and none stops the others from being read."""
         make_run(tmp_path / "good", make_config(), 1.0, 0.1)
         make_run(tmp_path / "cut", make_config(seed=1), 1.0, 0.1)
         (tmp_path / "cut" / "evaluation.json").write_text('{"run"')
         make_run(tmp_path / "going", make_config(seed=2), 1.0, 0.1)
         (tmp_path / "going" / "evaluation.json").unlink()
-        (tmp_path / "refused" / ".hydra").mkdir(parents=True)
         found = find_runs([tmp_path])
         assert [run.folder.name for run in found.runs] == ["good"]
         for start, name in (
             ("1 unfinished", "going"),
-            ("1 failed before they began", "refused"),
             ("1 unreadable", "cut"),
         ):
             assert sum(n.startswith(start) and str(tmp_path / name) in n for n in found.notes) == 1
@@ -1005,6 +1003,16 @@ class TestPictures:
         (group, *_) = group_records(records)
         many = [replace(group, name=f"L2C2, gain_target={i}, " + "long " * 8) for i in range(20)]
         draw_plane(many, "late_mean", tmp_path / "plane.svg")
+
+    def test_a_tasks_name_is_no_formula(self, records, tmp_path):
+        """Of one's own; dollars in it were read as LaTeX's, which it is not."""
+        own = [replace(record, task="$^$") for record in records if record.task == "swingup"]
+        draw_plane(group_records(own), "late_mean", tmp_path / "plane.svg")
+        config = make_config()
+        make_run(tmp_path / "run", replace(config, task=replace(config.task, name="$^$")), 1.0, 0.1)
+        draw_learning_curves(read_runs(tmp_path / "run"), tmp_path / "curves.svg")
+        for picture in ("plane.svg", "curves.svg"):
+            assert "$^$" in (tmp_path / picture).read_text()
 
     def test_a_single_run_is_drawn_as_png(self, forty, tmp_path):
         """As every run's folder has it."""

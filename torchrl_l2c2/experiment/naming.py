@@ -41,7 +41,7 @@ def run_name(config: ExperimentConfig) -> str:
         'swingup/ppo_rpe/l2c2/sigma-2.0_beta-0.2/seed_3'
     """
     chosen = [getattr(config, group).name for group in ("task", "algorithm", "regularizer")]
-    parts = [*map(_plain, chosen), *_settings_part(config), f"seed_{config.seed}"]
+    parts = [*map(plain, chosen), *_settings_part(config), f"seed_{config.seed}"]
     return str(PurePosixPath(*map(_short, parts)))
 
 
@@ -84,12 +84,13 @@ def _usual(group: str, chosen: Any) -> Any:
 
 
 def _written(name: str, value: Any) -> str:
-    return f"{_plain(name)}-{_plain(value)}"
+    return f"{plain(name)}-{plain(value)}"
 
 
-def _plain(value: Any) -> str:
+def plain(value: Any) -> str:
+    """A value in characters that file names take."""
     if isinstance(value, tuple):
-        return "x".join(map(_plain, value))
+        return "x".join(map(plain, value))
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
     return re.sub(r"[^A-Za-z0-9.+_-]+", "-", str(value)).rstrip(".")

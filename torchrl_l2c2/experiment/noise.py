@@ -24,6 +24,7 @@ from torchrl_l2c2.experiment.errors import told_in_a_line
 from torchrl_l2c2.experiment.evaluate import evaluate_policy
 from torchrl_l2c2.experiment.files import make_folder, write_atomically, write_json
 from torchrl_l2c2.experiment.frames import check_finite
+from torchrl_l2c2.experiment.naming import plain
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.reports import FinishedRun, find_runs
 from torchrl_l2c2.experiment.reports.comparison import Estimate
@@ -170,7 +171,7 @@ def write_noise(folder: str | Path, played: Sequence[Played]) -> list[Path]:
     folder = make_folder(folder)
     kinds: dict[Path, list[Played]] = {}
     for each in played:
-        named = f"noise_{each.run.task.replace('/', '_')}_{each.run.algorithm}.svg"
+        named = f"noise_{plain(each.run.task)}_{each.run.algorithm}.svg"
         kinds.setdefault(folder / named, []).append(each)
     pictures, table = list(kinds), folder / "noise.md"
     shown = [f"![{path.stem.replace('_', ' ')}]({path.name})" for path in pictures]

@@ -84,7 +84,7 @@ def _strip(one: Diagnosis) -> tuple[Picture, Any]:
         axis.plot(one.relative[:, number].numpy(), color=COLORS[place], linewidth=0.7)
     axis.set_ylim(-0.08, 1.08)
     axis.set_axis_off()
-    figure.suptitle(one.name, fontsize=7, y=0.99)
+    figure.suptitle(one.name, fontsize=7, y=0.99, parse_math=False)
     pixels = np.asarray(imread(io.BytesIO(drawn(figure, "png"))))[..., :3]
     steps = np.stack([np.arange(len(one.actions)), np.zeros(len(one.actions))], 1)
     places = axis.transData.transform(steps)[:, 0] * pixels.shape[1] / figure.bbox.width

@@ -69,8 +69,8 @@ class Diagnosis:
         noise_action: root mean square change of the action by this noise.
         noise_share: the part of the action's mean squared change from step to step that such
             noise, drawn anew at every step, makes alone.
-        spread: standard deviation of the policy's samples, of half the actions' range; 0 for a
-            deterministic policy, NaN for discrete actions.
+        spread: standard deviation of the policy's samples, clipped into their bounds, of half the
+            actions' range; 0 for a deterministic policy, NaN for discrete actions.
         rate: actions per second; ``None`` where it is not known.
         shares: of the loss's terms.
         entries: what the coordinates of an observation are called.
@@ -337,7 +337,9 @@ def _spread(
     rows = states[::apart].repeat_interleave(SAMPLES, 0)
     with torch.random.fork_rng(devices=[]), set_exploration_type(ExplorationType.RANDOM):
         torch.manual_seed(seed)
-        drawn = _flat(policy(TensorDict({key: rows}, rows.shape[:1]))[env.action_key])
+        drawn = policy(TensorDict({key: rows}, rows.shape[:1]))[env.action_key]
+    # Some policies leave it to the task to clip them.
+    drawn = _flat(env.action_spec.project(drawn))
     half = ((high - low) / 2).clamp_min(torch.finfo(low.dtype).eps)
     deviation = (drawn / half).unflatten(0, (-1, SAMPLES)).std(1)
     return float(deviation.square().mean().sqrt())

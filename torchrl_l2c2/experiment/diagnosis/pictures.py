@@ -36,9 +36,8 @@ def draw_together(diagnoses: Sequence[Diagnosis]) -> bytes:
         for place, number in enumerate(busiest(one)):
             axis.plot(one.actions[:, number].numpy(), **_line(place, number))
         total, variation = (one.measures[name] for name in ("return", "action_variation"))
-        axis.set_title(
-            f"{one.name}: return {total:.4g}, action variation {variation:.2g}", fontsize=10
-        )
+        title = f"{one.name}: return {total:.4g}, action variation {variation:.2g}"
+        axis.set_title(title, fontsize=10, parse_math=False)
         axis.set_ylabel("action")
         axis.grid(alpha=0.25)
         _legend(axis, one)  # Policies differ in which actions change most.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import statistics
 from collections.abc import Iterable, Mapping
@@ -29,7 +28,7 @@ from torchrl_l2c2.experiment.frames import PREVIOUS
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.regularizers.base import GainConfig
 from torchrl_l2c2.experiment.reports.runs import LATE
-from torchrl_l2c2.experiment.saved import read_config
+from torchrl_l2c2.experiment.saved import read_config, read_rows
 from torchrl_l2c2.experiment.trained import load_policy
 from torchrl_l2c2.experiment.video import play_pictures
 from torchrl_l2c2.gains import gradient_shares
@@ -164,8 +163,7 @@ def _shares(
 def _sizes(path: Path) -> dict[str, float]:
     if not path.exists():
         return {}
-    with open(path, newline="") as file:
-        rows = list(csv.DictReader(file))
+    _, rows = read_rows(path)
     late = rows[-max(1, round(LATE * len(rows))) :]
     columns = [name for name in (late[-1] if late else {}) if name.split("_")[0] == "share"]
     known = {

@@ -8,7 +8,7 @@ from torchrl_l2c2.experiment.reports.comparison import improvement, probability
 from torchrl_l2c2.experiment.reports.field import FIELD_MEASURES, field_groups
 from torchrl_l2c2.experiment.reports.groups import Group
 from torchrl_l2c2.experiment.reports.records import Record
-from torchrl_l2c2.experiment.reports.tables import Table, number, number_range
+from torchrl_l2c2.experiment.reports.tables import Table, number, number_range, of_runs
 
 LEGEND = (
     "Means over seeds of the last policy's test episodes with its mean actions. P: how probable it "
@@ -59,4 +59,6 @@ def _row(ours: Group, theirs: Group) -> list[str]:
 
 def _mean(group: Group, quantity: str) -> str:
     scores = group.scores("last_mean", quantity)
-    return number(float(scores.mean()), quantity) if len(scores) else "-"
+    if not len(scores):
+        return "-"
+    return number(float(scores.mean()), quantity) + of_runs(len(scores), len(group.records))

@@ -10,7 +10,7 @@ from torchrl_l2c2.experiment.reports.comparison import Estimate, improvement, pr
 from torchrl_l2c2.experiment.reports.groups import Group, baseline_of, by_task, group_records
 from torchrl_l2c2.experiment.reports.records import Record
 from torchrl_l2c2.experiment.reports.statistics import mean
-from torchrl_l2c2.experiment.reports.tables import Table, number, number_range
+from torchrl_l2c2.experiment.reports.tables import Table, number, number_range, of_runs
 from torchrl_l2c2.experiment.tasks import FIELD_TASKS
 
 
@@ -114,8 +114,8 @@ def _row(group: Group, vanilla: Group | None) -> list[str]:
             cells.append("-")
         else:
             write = partial(number, quantity=quantity, beside=center.value)
-            known, runs = len(group.scores("last_mean", quantity)), len(group.records)
-            cells.append(center.text(write) + (f", of {known} runs" if known < runs else ""))
+            known = len(group.scores("last_mean", quantity))
+            cells.append(center.text(write) + of_runs(known, len(group.records)))
     if vanilla is None:
         cells += [""] * len(BETTER)
     else:

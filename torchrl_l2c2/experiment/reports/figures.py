@@ -94,7 +94,8 @@ def draw_plane(
         for group in together:
             hollow |= _draw_point(axis, group, test, measure, looks[group.name])
         title = f"{of.task}, {of.algorithm}"
-        axis.set_title(f"{title}\n{settings}" if settings else title, fontsize=10)
+        title = f"{title}\n{settings}" if settings else title
+        axis.set_title(title, fontsize=10, parse_math=False)
         axis.set_xlabel(FIELD_MEASURES[measure])
         axis.set_ylabel("return")
     for axis in axes[len(panels) :]:
@@ -250,7 +251,8 @@ def finish(
         axis.grid(alpha=0.25)
         handles, names = axis.get_legend_handles_labels()
         named.update(zip(names, handles, strict=True))
-    figure.suptitle(title, fontsize=11)
+    # What a user calls a task is no formula.
+    figure.suptitle(title, fontsize=11, parse_math=False)
     if named:
         # A longer name, at some 14 letters an inch, leaves fewer beside one another.
         width = figure.get_figwidth() / (0.7 + max(map(len, named)) / 14)

@@ -9,7 +9,7 @@ import numpy as np
 
 from torchrl_l2c2.experiment.reports.groups import group_records
 from torchrl_l2c2.experiment.reports.runs import FinishedRun
-from torchrl_l2c2.experiment.reports.tables import Table, number_range
+from torchrl_l2c2.experiment.reports.tables import Table, number_range, of_runs
 
 # As evaluation.json names them (experiment/evaluate.py): how they are told.
 MEASURE_NAMES = {
@@ -56,4 +56,4 @@ def _pooled(values: Sequence[float | None]) -> str:
     cell = f"{np.mean(present):.3g}"
     if len(present) > 1:
         cell += f" ({np.std(present, ddof=1):.2g})"
-    return f"{cell}, of {len(present)} runs" if len(present) < len(values) else cell
+    return cell + of_runs(len(present), len(values))

@@ -10,7 +10,7 @@ from torchrl_l2c2.experiment.reports.comparison import improvement, probability
 from torchrl_l2c2.experiment.reports.field import BETTER, field_groups
 from torchrl_l2c2.experiment.reports.groups import Group, over_tasks
 from torchrl_l2c2.experiment.reports.records import Record
-from torchrl_l2c2.experiment.reports.tables import Table
+from torchrl_l2c2.experiment.reports.tables import Table, of_runs
 
 MOST = 12  # Methods of a table: more are what a search tried, and are told by their plane.
 LEGEND = (
@@ -53,4 +53,11 @@ def _table(better: str, quantity: str, methods: dict[str, list[Group]]) -> Table
     rows = [[name, *(cell(name, other) for other in methods)] for name in methods]
     of = [group.first for group in next(iter(methods.values()))]
     title = f"{better}, {of[0].algorithm} on {', '.join(record.task for record in of)}"
-    return Table(title, ["method", *methods], rows, [LEGEND])
+    lacking = [
+        f"{group.first.task}, {name}{of_runs(known, len(group.records))}"
+        for name, groups in methods.items()
+        for group in groups
+        if (known := len(group.scores("last_mean", quantity))) < len(group.records)
+    ]
+    notes = [f"Not all runs have it: {'; '.join(lacking)}."] if lacking else []
+    return Table(title, ["method", *methods], rows, [LEGEND, *notes])

@@ -8,6 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from torchrl_l2c2.experiment.files import make_folder, write_atomically, write_json
+from torchrl_l2c2.experiment.naming import plain
 from torchrl_l2c2.experiment.reports.choice import choice_table
 from torchrl_l2c2.experiment.reports.comparison import statistics_tables, summary
 from torchrl_l2c2.experiment.reports.document import picture, whole_page
@@ -103,7 +104,7 @@ def _draw(folder: Path, records: Sequence[Record], runs: Sequence[FinishedRun]) 
     paths = []
     for task, algorithm in dict.fromkeys((run.task, run.algorithm) for run in runs):
         together = [run for run in runs if (run.task, run.algorithm) == (task, algorithm)]
-        paths.append(folder / f"learning_curves_{task.replace('/', '_')}_{algorithm}.svg")
+        paths.append(folder / f"learning_curves_{plain(task)}_{algorithm}.svg")
         draw_learning_curves(together, paths[-1])
     for test in TESTS:
         groups = [g for g in group_records(records) if len(g.scores(test, "return"))]
@@ -114,7 +115,7 @@ def _draw(folder: Path, records: Sequence[Record], runs: Sequence[FinishedRun]) 
         paths.append(folder / "plane_field.svg")
         draw_plane(of_field, "last_mean", paths[-1], "sm_asap")
     for number, found in enumerate(searched(group_records(records)), 1):
-        paths.append(folder / f"front_{number}_{found[0].first.task.replace('/', '_')}.svg")
+        paths.append(folder / f"front_{number}_{plain(found[0].first.task)}.svg")
         draw_front(found, front_test(found), paths[-1])
     return paths
 

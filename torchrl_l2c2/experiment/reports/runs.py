@@ -222,8 +222,8 @@ def find_runs(folders: Iterable[str | Path], *, required: bool = False) -> Found
         required (bool): whether to refuse folders without a finished run. Default ``False``.
 
     Returns:
-        Found: runs in the order of their tables, and notes on folders that are unfinished, never
-        started, cannot be read, or repeat another.
+        Found: runs in the order of their tables, and notes on folders that are unfinished, cannot
+        be read, or repeat another.
 
     Raises:
         FileNotFoundError: one of the folders is not there, or is none; or nothing that is required.
@@ -245,7 +245,6 @@ def find_runs(folders: Iterable[str | Path], *, required: bool = False) -> Found
     newest, repeated = _newest(runs)
     named = {
         "unfinished (running, interrupted or failed)": [str(path) for path in places["unfinished"]],
-        "failed before they began": [str(path) for path in places["failed"]],
         "unreadable": unread,
         "the same settings and seed as a newer one, left out": repeated,
     }
@@ -271,16 +270,15 @@ def _places(folders: Iterable[Path]) -> dict[str, list[Path]]:
     marks: dict[Path, set[str]] = {}
     shown: dict[Path, Path] = {}
     for folder in folders:
-        for name in ("config.json", "evaluation.json", ".hydra"):
+        for name in ("config.json", "evaluation.json"):
             for path in folder.rglob(name):
                 place = path.parent.resolve()
                 marks.setdefault(place, set()).add(name)
                 shown.setdefault(place, path.parent)
-    stages: dict[str, list[Path]] = {"finished": [], "unfinished": [], "failed": []}
+    stages: dict[str, list[Path]] = {"finished": [], "unfinished": []}
     for place in sorted(marks):
-        found = marks[place]
-        began = "unfinished" if "config.json" in found else "failed"
-        stages["finished" if "evaluation.json" in found else began].append(shown[place])
+        stage = "finished" if "evaluation.json" in marks[place] else "unfinished"
+        stages[stage].append(shown[place])
     return stages
 
 

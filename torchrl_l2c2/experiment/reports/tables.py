@@ -206,8 +206,12 @@ def pooled(group: Group, test: str, quantity: str) -> str:
     cell = number(center.item(), quantity)
     if len(scores) > 1:
         cell += f" ({number(deviation.item(), quantity, center.item())})"
-    missing = len(group.records) - len(scores)
-    return f"{cell}, of {len(scores)} runs" if missing else cell
+    return cell + of_runs(len(scores), len(group.records))
+
+
+def of_runs(known: int, all_runs: int) -> str:
+    """Behind a cell, of how many runs it is where some lack it."""
+    return f", of {known} runs" if known < all_runs else ""
 
 
 def or_dash(value: float, spec: str) -> str:
