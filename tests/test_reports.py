@@ -178,7 +178,7 @@ class TestPaperTable:
         table = paper_table(groups)
         assert [row[:2] for row in table.rows] == [["swingup", "vanilla"], ["swingup", "L2C2"]]
         row = dict(zip(table.columns, table.rows[1], strict=True))
-        assert row["P(larger return)"].split()[0] == "0.75"
+        assert row["P(returns more)"].split()[0] == "0.75"
         assert row["P(smoother)"].split()[0] == "0.75"
         assert table.rows[1][3:6] == ["20.00 (7.07)†", "693.8 (123.8)", "50.00 (7.07)"]
         assert table.rows[0][6] == table.rows[0][-2] == ""
@@ -231,7 +231,7 @@ class TestPaperTable:
             for r in records
         ]
         table = paper_table(group_records(equal))
-        better, smoother = map(table.columns.index, ("P(larger return)", "P(smoother)"))
+        better, smoother = map(table.columns.index, ("P(returns more)", "P(smoother)"))
         (row,) = (row for row in table.rows if row[:2] == ["2 tasks", "L2C2"])
         assert (row[better].split()[0], row[smoother].split()[0]) == ("0.75", "1.00")
         assert not any(cell for i, cell in enumerate(row[2:], 2) if i not in (better, smoother))

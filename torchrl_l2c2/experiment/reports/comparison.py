@@ -114,8 +114,8 @@ def statistics_table(test: str, groups: Sequence[Group]) -> Table:
         groups (sequence of Group): a row each, and one for each method that several tasks have.
     """
     columns = ["task", "algorithm", "method", "runs"]
-    for quantity, better in zip(QUANTITIES.values(), ("larger", "smaller"), strict=True):
-        columns += [f"{quantity}: interquartile mean", f"P({better} than vanilla)"]
+    for quantity, better in zip(QUANTITIES.values(), ("returns more", "smoother"), strict=True):
+        columns += [f"{quantity}: interquartile mean", f"P({better})"]
     rows = [_statistics_row(test, group, baseline_of(group, groups)) for group in groups]
     rows += _across_tasks(test, groups)
     notes = [

@@ -41,7 +41,7 @@ def faster_targets_table(records: Sequence[Record]) -> Table | None:
         return None
     groups = group_records(found)
     columns = ["task", "method", "seeds", "return", "last policy", "the paper's"]
-    columns += ["P(larger return than beta=0)"]
+    columns += ["P(returns more than beta=0)"]
     rows = [_row(group, groups) for group in groups]
     return Table("Faster target networks", columns, rows, [LEGEND])
 

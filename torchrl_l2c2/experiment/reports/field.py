@@ -55,7 +55,7 @@ NAMES = {
 }
 FIELD_MEASURES = {"return": "return", "sm_asap": "Sm", "action_variation": "action variation"}
 # How probable a method's run is better by each than one of vanilla.
-BETTER = {"return": "P(larger return)", "sm_asap": "P(smaller Sm)"}
+BETTER = {"return": "P(returns more)", "sm_asap": "P(smaller Sm)"}
 LEGEND = (
     "Means over seeds of the last policy's test episodes with its mean actions, 95% intervals of "
     "the bootstrap over seeds in brackets. Sm as the published one: `(2 / N) sum_i f_i |FFT_i|` at "

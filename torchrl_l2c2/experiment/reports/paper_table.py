@@ -32,7 +32,7 @@ DEPLOYED_LEGEND = (
 # Late policies in the first column, as they are steadier than the paper's test of the last one.
 FIRST, SECOND = "late_sampled", "last_sampled"
 DEPLOYED = ("late_mean", "last_mean")
-BETTER = ("P(larger return)", "P(smoother)")
+BETTER = ("P(returns more)", "P(smoother)")
 
 
 def paper_table(groups: Sequence[Group]) -> Table | None:
