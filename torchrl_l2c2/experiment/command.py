@@ -31,7 +31,7 @@ from torchrl_l2c2.experiment.composition import (
     tell_sweep,
     tell_tuned,
 )
-from torchrl_l2c2.experiment.config import ExperimentConfig, OtherRunError
+from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.errors import EXPECTED, show_cause
 from torchrl_l2c2.experiment.progress import log
 from torchrl_l2c2.experiment.settings import SettingError
@@ -52,10 +52,6 @@ LOST_SECONDS = 180.0
 LAUNCHERS = {
     "ray_cluster": ("hydra_plugins.hydra_ray_launcher", "ray"),
     "slurm_cluster": ("hydra_plugins.hydra_submitit_launcher", "slurm"),
-}
-HINTS: dict[type[Exception], str] = {
-    SettingError: "--help lists every setting.",
-    OtherRunError: "In a shell: outputs=FOLDER, allow_other_versions=true, task.episodes=N.",
 }
 
 
@@ -172,7 +168,8 @@ def _standing(sweep: Sweep) -> str:
 def _tell(error: Exception) -> str:
     """Says what went wrong: of a user's own environment with where it did."""
     show_cause(error)
-    told = f"{str(error) or type(error).__name__} {HINTS.get(type(error), '')}".strip()
+    hint = " --help lists every setting." if isinstance(error, SettingError) else ""
+    told = f"{str(error) or type(error).__name__}{hint}"
     print(f"error: {told}", file=sys.stderr)
     return told
 

@@ -292,10 +292,6 @@ def _read_group(group: str, values: Mapping[str, Any]) -> Any:
     raise SettingError("name", f"must be one of {sorted(choices)}, got {name!r}.", group)
 
 
-class OtherRunError(ValueError):
-    """A checkpoint is of a run with other settings."""
-
-
 # What may differ between a run and its continuation: it changes none of the numbers.
 FREE_SETTINGS = {
     "logger",
@@ -330,13 +326,16 @@ NEUTRAL_SETTINGS = {
 }
 
 
-def is_free(name: str) -> bool:
+def is_free(name: str, gain_of: str | None = None) -> bool:
     """Whether a setting may differ between a run and its continuation.
 
     Args:
         name (str): with its group, such as ``"task.solved_at"``; or of a group as a whole.
+        gain_of (str, optional): of the regularizer: what a gain follows is part of the training.
     """
     group, _, setting = name.partition(".")
+    if group == "late_share" and str(gain_of).startswith("test_"):
+        return False
     return group in FREE_SETTINGS or (group == "task" and setting in FREE_TASK_SETTINGS)
 
 

@@ -10,11 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_l2c2.experiment.checkpoints import CheckpointError, list_checkpoints, load_newest
-from torchrl_l2c2.experiment.config import (
-    ExperimentConfig,
-    OtherRunError,
-)
-from torchrl_l2c2.experiment.errors import SimulatorError
+from torchrl_l2c2.experiment.config import ExperimentConfig
+from torchrl_l2c2.experiment.errors import OtherRunError, SimulatorError
 from torchrl_l2c2.experiment.saved import differing
 from torchrl_l2c2.experiment.tasks import Budget, TaskConfig
 from torchrl_l2c2.experiment.versions import versions
@@ -32,7 +29,8 @@ def check_same_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> Non
     for name, (was, is_now) in differing(saved, now).items():
         raise OtherRunError(
             f"the checkpoint was made with {name.removesuffix('.name')}={was}, not {is_now}: "
-            "give the same settings, or begin in another folder. Nothing was changed."
+            "give the same settings, or begin in another folder (in a shell, outputs=FOLDER). "
+            "Nothing was changed."
         )
 
 
@@ -72,7 +70,8 @@ def check_length(asked: Budget, before: Budget, played: int) -> None:
     if asked.total < least:
         raise OtherRunError(
             f"{asked.unit}s={asked.total} is fewer than the {least} that this run already has: ask "
-            "for as many or more, or choose another folder. Nothing was changed."
+            "for as many or more, or begin in another folder (in a shell, outputs=FOLDER). Nothing "
+            "was changed."
         )
 
 
@@ -157,7 +156,9 @@ def check_continuable(
     check_length(asked, before, played)
     if played >= asked.total:
         tell_past(saved, config.to_dict())
+    gain_of = str(getattr(config.regularizer, "gain_of", None))
     followed = {
+        f"regularizer.gain_of={gain_of}": gain_of.startswith("test_"),
         "optimizer.linear=true": config.optimizer.linear,
         "regularizer.gain=ramp": config.regularizer.ramped,
     }

@@ -8,6 +8,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 
+class OtherRunError(ValueError):
+    """A checkpoint is of a run with other settings."""
+
+
 class SimulatorError(RuntimeError):
     """The environment or the policy in it raised an error; the cause is chained."""
 

@@ -116,7 +116,12 @@ def differing(saved: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, tup
     before, after = by_name(as_it_was(saved)), by_name(now)
     # The settings of another choice are others anyway.
     names = sorted(before.keys() | after.keys(), key=lambda n: (not n.endswith(".name"), n))
-    pairs = {n: (before.get(n, NOT_THEN), after.get(n, NOT_THEN)) for n in names if not is_free(n)}
+    followed = after.get("regularizer.gain_of")
+    pairs = {
+        name: (before.get(name, NOT_THEN), after.get(name, NOT_THEN))
+        for name in names
+        if not is_free(name, followed)
+    }
     return {
         name: (was, is_now)
         for name, (was, is_now) in pairs.items()
