@@ -142,7 +142,7 @@ class ExperimentConfig:
         description="final fraction of training whose policies play one test episode each; 0: none",
     )
     checkpoint_interval: float = Field(
-        default=60.0, ge=0, description="seconds between checkpoints, at the ends of episodes"
+        default=60.0, ge=0, description="seconds between checkpoints, after episodes or rollouts"
     )
     checkpoint_keep: int = Field(
         default=2, ge=1, description="newest checkpoints that stay in the folder"
