@@ -35,6 +35,7 @@ from torchrl_l2c2.experiment.checkpoints import (
     load_checkpoint,
     save_checkpoint,
 )
+from torchrl_l2c2.experiment.command import _end_logged
 from torchrl_l2c2.experiment.config import GROUPS
 from torchrl_l2c2.experiment.continuation import check_same_settings
 from torchrl_l2c2.experiment.errors import OtherRunError
@@ -425,7 +426,7 @@ def test_another_choice_is_named_and_not_what_it_brings():
         check_same_settings(saved, small().to_dict())
 
 
-@pytest.mark.parametrize("file", ["checkpoint_00000002.pt", "metrics.csv"])
+@pytest.mark.parametrize("file", ["checkpoint_00000002.pt", "metrics.csv", "train.log"])
 def test_a_full_disk_names_the_file_and_the_last_good_checkpoint(tmp_path, monkeypatch, file):
     """And the run continues from there when there is room again."""
     experiment = Experiment(small(), tmp_path)
@@ -444,6 +445,13 @@ def test_a_full_disk_names_the_file_and_the_last_good_checkpoint(tmp_path, monke
     experiment.close()
     monkeypatch.undo()
     assert len(Experiment(small(), tmp_path).train()) == 6
+
+
+def test_an_error_that_there_is_no_room_to_log_is_told(tmp_path):
+    """And not that of the log in its place."""
+    (tmp_path / "train.log").mkdir()
+    with pytest.raises(ValueError, match="its own"), _end_logged(tmp_path):
+        raise ValueError("its own")
 
 
 def start(folder, episodes, *extra, log=None):

@@ -108,6 +108,14 @@ def test_what_cannot_be_composed_ends_in_a_line(settings_of, monkeypatch, line, 
     assert said.startswith(f"error: {told}") and "\n" not in said and "search path" not in said
 
 
+def test_a_folder_that_hydra_cannot_make_ends_in_a_line(tmp_path):
+    """Of ``hydra.run.dir``, say."""
+    (tmp_path / "file").touch()
+    told = r"error: '.*run' cannot be made \(Not a directory\); choose another."
+    with pytest.raises(SystemExit, match=told), composing():
+        (tmp_path / "file" / "run").mkdir(parents=True)
+
+
 def test_the_whole_error_is_shown_where_it_is_asked_for(settings_of, monkeypatch):
     """As Hydra has it."""
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")

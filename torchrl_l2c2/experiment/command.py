@@ -12,7 +12,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -249,9 +249,9 @@ def _end_logged(folder: Path) -> Iterator[None]:
     """What ends a run early is in its ``train.log`` too."""
     try:
         yield
-    except (Interrupted, KeyboardInterrupt) as interruption:
-        log(folder, str(interruption) or "interrupted")
-        raise
-    except Exception as error:
-        log(folder, "".join(traceback.format_exception(error)))
+    except (KeyboardInterrupt, Exception) as error:
+        stopped = isinstance(error, KeyboardInterrupt | Interrupted)
+        told = [str(error) or "interrupted"] if stopped else traceback.format_exception(error)
+        with suppress(OSError):  # The error itself may be that there is no room.
+            log(folder, "".join(told))
         raise

@@ -120,6 +120,10 @@ def composing() -> Iterator[None]:
         if shown:
             raise
         sys.exit(f"error: {refusal(error)}")
+    except OSError as error:  # Of a folder that Hydra makes, before anything runs in it.
+        if shown:
+            raise
+        sys.exit(f"error: {error.filename!r} cannot be made ({error.strerror}); choose another.")
     finally:
         if not shown:
             os.environ.pop("HYDRA_FULL_ERROR", None)

@@ -66,7 +66,7 @@ def begin_folder(folder: Path, settings: dict[str, Any], *, begun: bool, ended: 
             (folder / name).unlink(missing_ok=True)
     write_json(folder / "config.json", settings)
     write_json(folder / "versions.json", {**versions(), "commit": code_commit()})
-    (folder / "README.txt").write_text(README)
+    write_atomically(folder / "README.txt", README.encode())
 
 
 def bring_files(old: Path, new: Path) -> None:
