@@ -42,6 +42,15 @@ def settings_of():
         ("seed=zero", "seed must be a valid integer, got 'zero'."),
         ("device=mps", "device must be cpu, cuda or cuda:N, a number from 0 up, got 'mps'."),
         ("seed=1.5", "seed must be a valid integer, got 1.5."),
+        ("threads=1e11", "threads must be less than or equal to 1024, got 100000000000."),
+        (
+            "task.noise_scale=1e308",
+            "task.noise_scale must be less than or equal to 1000000000, got 1e+308.",
+        ),
+        (
+            "algorithm.hidden=[10000000]",
+            "algorithm.hidden must be less than or equal to 1000000, got",
+        ),
         ("threads=0", "threads must be greater than or equal to 1, got 0."),
         ("num_workers=0", "num_workers must be greater than or equal to 1, got 0."),
         ("num_workers=2 algorithm.schedule=step", "num_workers must be 1 with algorithm.schedule"),
@@ -94,6 +103,7 @@ def test_a_wrong_setting_gives_its_line(settings_of, line, message):
             "regularizer=lipsnet",
             "In 'config': Could not find 'regularizer/lipsnet' Available",
         ),
+        ("task=5", "task, algorithm, regularizer, replay, optimizer, logger are chosen by name (Conf"),
         ("seed=${oder}", "Interpolation key 'oder' not found full_key: seed"),
         ("seed=[1", "no viable alternative at input '[1'"),
     ],

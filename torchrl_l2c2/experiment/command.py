@@ -54,6 +54,8 @@ LAUNCHERS = {
     "slurm_cluster": ("hydra_plugins.hydra_submitit_launcher", "slurm"),
 }
 
+OF_MEMORY = "algorithm.hidden, replay.capacity, replay.batch_size or threads"
+
 
 def check_launcher(arguments: Sequence[str]) -> None:
     """Says which extra a launcher needs, where Hydra would say that it cannot be loaded."""
@@ -168,8 +170,11 @@ def _standing(sweep: Sweep) -> str:
 def _tell(error: Exception) -> str:
     """Says what went wrong: of a user's own environment with where it did."""
     show_cause(error)
-    hint = " --help lists every setting." if isinstance(error, SettingError) else ""
-    told = f"{str(error) or type(error).__name__}{hint}"
+    told = str(error) or type(error).__name__
+    if isinstance(error, SettingError):
+        told += " --help lists every setting."
+    elif isinstance(error, MemoryError) or "alloc" in told:
+        told = f"{told.rstrip('.')}. There is no memory for it: choose smaller {OF_MEMORY}."
     print(f"error: {told}", file=sys.stderr)
     return told
 

@@ -116,12 +116,12 @@ def composing() -> Iterator[None]:
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     try:
         yield
-    except (HydraException, OmegaConfBaseException) as error:
+    except (HydraException, OmegaConfBaseException, ValueError) as error:
         if shown:
             raise
         sys.exit(f"error: {refusal(error)}")
     except OSError as error:  # Of a folder that Hydra makes, before anything runs in it.
-        if shown:
+        if shown or error.filename is None:
             raise
         sys.exit(f"error: {error.filename!r} cannot be made ({error.strerror}); choose another.")
     finally:
@@ -133,6 +133,8 @@ def refusal(error: Exception) -> str:
     """What Hydra, or OmegaConf, refuses, in a line; of a name that there is not what was meant."""
     if found := re.match("Could not override '([^']+)'", str(error)):
         return unknown_setting(found[1])
+    if "group override must be" in str(error):
+        return f"{', '.join(GROUPS)} are chosen by name ({error})."
     return " ".join(str(error).partition("\nConfig search path:")[0].split())
 
 

@@ -96,7 +96,7 @@ class ExperimentConfig:
         "played on the CPU, by a copy of the policy",
     )
     threads: int = Field(
-        default=1, ge=1, description="of PyTorch; the networks are too small to gain from more"
+        default=1, ge=1, le=1024, description="of PyTorch; networks so small gain nothing from more"
     )
     num_workers: int = Field(
         default=1,

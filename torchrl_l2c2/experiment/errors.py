@@ -17,7 +17,9 @@ class SimulatorError(RuntimeError):
 
 
 # Anything else is a fault of the program.
-EXPECTED = (ValueError, OSError, RuntimeError, FloatingPointError, OverflowError, ImportError)
+EXPECTED = (
+    ValueError, OSError, RuntimeError, FloatingPointError, OverflowError, ImportError, MemoryError,
+)  # fmt: skip
 
 
 def show_cause(error: Exception) -> None:

@@ -6,7 +6,8 @@ import csv
 import dataclasses
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,20 @@ REMEDY = "it was changed or cut since it was written; restore it."
 # How long a training is; a longer one is of the same kind.
 BUDGETS = ("task.episodes", "task.frames")
 ANEW = " Or delete it: the command that made the run tests its policy again."
+
+
+@contextmanager
+def read_back(run: str | Path) -> Iterator[None]:
+    """What is not as it was written is an error of the folder, whatever it is found by.
+
+    Raises:
+        ValueError: names the folder, in the place of errors of what was read in it.
+    """
+    try:
+        yield
+    except (LookupError, TypeError, AttributeError, ArithmeticError) as error:
+        found = f"{type(error).__name__}: {error}"
+        raise ValueError(f"the run in {str(run)!r} is damaged ({found}): {REMEDY}") from error
 
 
 def read_json(path: str | Path) -> dict[str, Any]:
@@ -135,13 +150,14 @@ def is_tested(run: str | Path, settings: Mapping[str, Any]) -> bool:
     Settings that change none of the numbers may differ, but for how long the training is.
 
     Raises:
-        ValueError: as :func:`read_config`.
+        ValueError: as :func:`read_config` and :func:`read_back`.
     """
     if not (Path(run) / "evaluation.json").exists():
         return False
-    saved = read_config(run)
-    before, after = ([by_name(each).get(name) for name in BUDGETS] for each in (saved, settings))
-    return before == after and not differing(saved, settings)
+    with read_back(run):
+        saved = read_config(run)
+        before, after = ([by_name(s).get(name) for name in BUDGETS] for s in (saved, settings))
+        return before == after and not differing(saved, settings)
 
 
 def read_evaluation(run: str | Path) -> dict[str, Any]:
