@@ -103,7 +103,10 @@ def test_a_wrong_setting_gives_its_line(settings_of, line, message):
             "regularizer=lipsnet",
             "In 'config': Could not find 'regularizer/lipsnet' Available",
         ),
-        ("task=5", "task, algorithm, regularizer, replay, optimizer, logger are chosen by name (Conf"),
+        (
+            "task=5",
+            "task, algorithm, regularizer, replay, optimizer, logger are chosen by name (Conf",
+        ),
         ("seed=${oder}", "Interpolation key 'oder' not found full_key: seed"),
         ("seed=[1", "no viable alternative at input '[1'"),
     ],
@@ -124,6 +127,28 @@ def test_a_folder_that_hydra_cannot_make_ends_in_a_line(tmp_path):
     told = r"error: '.*run' cannot be made \(Not a directory\); choose another."
     with pytest.raises(SystemExit, match=told), composing():
         (tmp_path / "file" / "run").mkdir(parents=True)
+
+
+@pytest.mark.parametrize(
+    ("line", "meant"),
+    [
+        ("regularizer=cap", "; did you mean regularizer=caps?"),
+        (
+            "task=Pendulum-v1",
+            "task=pendulum? An id of Gymnasium's: task=gymnasium task.env_id=Pendulum-v1.",
+        ),
+        (
+            "sigma=2",
+            "sigma is not a setting; did you mean regularizer.sigma? --help lists every setting.",
+        ),
+        ("outputs=~/runs", "No shell expands this ~: write $HOME."),
+    ],
+)
+def test_what_cannot_be_composed_ends_with_what_was_meant(settings_of, line, meant):
+    """Of choices, of settings without their group, and of a path."""
+    with pytest.raises(SystemExit) as ended, composing():
+        settings_of(line)
+    assert str(ended.value).endswith(meant)
 
 
 def test_the_whole_error_is_shown_where_it_is_asked_for(settings_of, monkeypatch):

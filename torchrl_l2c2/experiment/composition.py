@@ -135,7 +135,17 @@ def refusal(error: Exception) -> str:
         return unknown_setting(found[1])
     if "group override must be" in str(error):
         return f"{', '.join(GROUPS)} are chosen by name ({error})."
-    return " ".join(str(error).partition("\nConfig search path:")[0].split())
+    said = " ".join(str(error).partition("\nConfig search path:")[0].split())
+    if found := re.search(r"Could not find '(\w+)/([^']+)'", said):
+        return f"{said}{_choice_meant(*found.groups())}"
+    return f"{said}. No shell expands this ~: write $HOME." if "=~" in said else said
+
+
+def _choice_meant(group: str, name: str) -> str:
+    near = get_close_matches(name, GROUPS.get(group, ()), 1)
+    meant = f"; did you mean {group}={near[0]}?" if near else "."
+    ids = f" An id of Gymnasium's: task=gymnasium task.env_id={name}." if group == "task" else ""
+    return meant + ids
 
 
 def unknown_setting(name: str) -> str:
@@ -146,15 +156,21 @@ def unknown_setting(name: str) -> str:
         'task.epsodes is not a setting; did you mean task.episodes? --help lists every setting.'
         >>> unknown_setting("algorithm.num_envs")
         'algorithm.num_envs is a setting of algorithm=ppo alone.'
+        >>> unknown_setting("sigma")
+        'sigma is not a setting; did you mean regularizer.sigma? --help lists every setting.'
     """
     group, _, setting = name.partition(".")
-    choices = GROUPS.get(group, {}).items()
-    settings = {choice: {f.name for f in dataclasses.fields(of)} for choice, of in choices}
-    if having := [choice for choice, names in settings.items() if setting in names]:
+    settings = {
+        (each, choice): {field.name for field in dataclasses.fields(of)}
+        for each, choices in GROUPS.items()
+        for choice, of in choices.items()
+    }
+    if having := [of[1] for of, names in settings.items() if of[0] == group and setting in names]:
         return f"{name} is a setting of {group}={' or '.join(having)} alone."
     known = {*STEERING, *(field.name for field in dataclasses.fields(ExperimentConfig))}
-    known |= {f"{group}.{each}" for names in settings.values() for each in names}
-    near = get_close_matches(name, sorted(known), 1)
+    known |= {f"{of[0]}.{each}" for of, names in settings.items() for each in names}
+    near = sorted(each for each in known if each.endswith(f".{name}"))
+    near = near or get_close_matches(name, sorted(known), 1)
     meant = f"; did you mean {near[0]}?" if near else "."
     return f"{name} is not a setting{meant} --help lists every setting."
 
