@@ -13,6 +13,7 @@ import sys
 import time
 import warnings
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -35,7 +36,7 @@ from torchrl_l2c2.experiment.checkpoints import (
     load_checkpoint,
     save_checkpoint,
 )
-from torchrl_l2c2.experiment.command import _end_logged
+from torchrl_l2c2.experiment.command import _end_logged, run
 from torchrl_l2c2.experiment.config import GROUPS
 from torchrl_l2c2.experiment.continuation import check_same_settings
 from torchrl_l2c2.experiment.errors import OtherRunError
@@ -248,6 +249,17 @@ def test_what_only_training_reads_is_told_when_that_is_over(tmp_path):
         Experiment(small(evaluate_every=2, task=replace(SWINGUP, episodes=8)), tmp_path).close()
 
 
+def test_a_finished_run_without_checkpoints_is_not_begun_anew(tmp_path):
+    """By another length, or another test; its results would be gone."""
+    finished(tmp_path)
+    for path in list_checkpoints(tmp_path):
+        path.unlink()
+    before = contents(tmp_path)
+    with pytest.raises(CheckpointError, match=r"has ended, and no checkpoint.* any more to go on"):
+        Experiment(small(test_episodes=3), tmp_path)
+    assert contents(tmp_path) == before
+
+
 def test_a_test_of_other_length_replaces_the_old_one_when_it_has_ended(tmp_path):
     """Interrupted, the old one is still there, and the same command plays the new one."""
     finished(tmp_path)
@@ -311,6 +323,16 @@ def test_what_is_refused_from_elsewhere_leaves_no_folder(tmp_path, what):
     with pytest.raises(OtherRunError if what == "other settings" else CheckpointError):
         Experiment(small(seed=7), tmp_path / "b" / "c", resume=tmp_path / "a")
     assert not (tmp_path / "b").exists()
+
+
+def test_what_is_no_run_is_refused_where_there_is_one_already(tmp_path):
+    """One that has checkpoints, and one that the command finds finished."""
+    finished(tmp_path)
+    values = {"resume": str(tmp_path / "nonsense"), "allow_other_versions": False}
+    for again in (partial(Experiment, small(), tmp_path, resume=values["resume"]),
+                  partial(run, small(), tmp_path, values)):  # fmt: skip
+        with pytest.raises(CheckpointError, match=r"nonsense' holds no checkpoint_.*leave resume"):
+            again()
 
 
 def test_other_versions_are_refused_unless_they_are_allowed(tmp_path):

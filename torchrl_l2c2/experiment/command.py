@@ -196,7 +196,7 @@ def run(
         patience (float): seconds to wait for a process that has its folder.
     """
     # Here, as settings are checked before anything waits for torch.
-    from torchrl_l2c2.experiment.continuation import tell_past
+    from torchrl_l2c2.experiment.continuation import check_elsewhere, tell_past
     from torchrl_l2c2.experiment.lock import wait_for_folder
     from torchrl_l2c2.experiment.process import keep_freed_memory
     from torchrl_l2c2.experiment.reports import (
@@ -223,6 +223,7 @@ def run(
     print(f"{standing}: {named}" if standing else named, flush=True)
     tell_tuned(config)
     wait_for_folder(folder, patience)
+    check_elsewhere(values["resume"])
     finished = finished_run(folder, config.to_dict())
     if finished is not None:
         tell_past(finished.config, config.to_dict())
