@@ -244,7 +244,7 @@ def test_a_signal_is_heeded_after_a_rollout_that_no_episode_ended_in(tmp_path, m
     settings = {"optimizer": AdamConfig(linear=True), "regularizer": ramp}
     whole = experiment(task, **settings)
     whole.train()
-    first = experiment(task, tmp_path, **settings)
+    first = experiment(task, tmp_path / "first", **settings)
     learn = first.learner.learn_rollout
     end = partial(os.kill, os.getpid(), signal.SIGTERM)
     monkeypatch.setattr(first.learner, "learn_rollout", lambda epochs: (learn(epochs), end()))
@@ -252,7 +252,7 @@ def test_a_signal_is_heeded_after_a_rollout_that_no_episode_ended_in(tmp_path, m
         first.train()
     assert first.player.frames == 40 and 0.0 < first._gain.gains["all"].value < 0.3
     first.close()
-    again = experiment(task, tmp_path, **settings)
+    again = Experiment(first.config, tmp_path / "again", resume=tmp_path / "first")
     again.train()
     for row in (*again.metrics, *whole.metrics):
         del row["frames_per_second"]
