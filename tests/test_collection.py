@@ -15,6 +15,7 @@ from torchrl.envs import (
     GymEnv,
     GymWrapper,
     SerialEnv,
+    StepCounter,
     TransformedEnv,
     set_exploration_type,
 )
@@ -26,6 +27,7 @@ from torchrl_l2c2.experiment import (
     TaskConfig,
     make_env,
 )
+from torchrl_l2c2.experiment.collection import play_episodes
 from torchrl_l2c2.experiment.frames import Frame, stack_frames
 from torchrl_l2c2.experiment.rollouts import RolloutCollector
 
@@ -185,6 +187,16 @@ def test_other_environments_are_played_by_torchrls_own_loop(name):
     assert shapes == ([(7,)] * 2 if name == "another transform" else [(2, 10)] * 2)
     with pytest.raises(RuntimeError, match="ObservationNoise"):
         by_episode.generator_state()
+
+
+@pytest.mark.parametrize("transforms", [[], [StepCounter()]], ids=("fast", "by torchrl"))
+def test_a_test_episode_that_is_cut_is_not_gone_on_with(transforms):
+    """Where the environment's own limit is longer, or it has none."""
+    env = GymEnv("Pendulum-v1")
+    env = TransformedEnv(env, *transforms) if transforms else env
+    first, second = play_episodes(make_actor(3, env.action_spec), env, 2, max_steps=5)
+    assert len(first) == len(second) == 5
+    assert not second["observation"][0].equal(first["next", "observation"][-1])
 
 
 class TestSeveralWorkers:

@@ -8,7 +8,12 @@ import pytest
 
 from tests.test_reports import make_config, make_run
 from torchrl_l2c2.experiment import L2C2Config, PPOConfig
-from torchrl_l2c2.experiment.reports import find_runs, read_runs
+from torchrl_l2c2.experiment.reports import (
+    compare_with_paper,
+    find_runs,
+    finished_run,
+    read_runs,
+)
 from torchrl_l2c2.experiment.reports.__main__ import main
 from torchrl_l2c2.experiment.reports.choice import choice_table
 from torchrl_l2c2.experiment.reports.field import field_table
@@ -183,6 +188,23 @@ class TestFolders:
         assert [run.folder.name for run in found.runs] == ["good"]
         (note,) = found.notes
         assert "1 unreadable" in note and str(tmp_path / "bad") in note and told in note
+
+    @pytest.mark.parametrize(
+        ("name", "wrong"),
+        [
+            ("config.json", {"replay": 5}),
+            ("evaluation.json", {"summary": {"episodes": 2}}),
+            ("evaluation.json", {"training": {"episodes": "two"}}),
+        ],
+    )
+    def test_a_damaged_run_that_is_run_again_is_named(self, tmp_path, name, wrong):
+        """What it has is JSON, of another form than it was."""
+        config = make_config(test_episodes=2)
+        make_run(tmp_path / "bad", config, 1.0, 0.1)
+        path = tmp_path / "bad" / name
+        path.write_text(json.dumps({**json.loads(path.read_text()), **wrong}))
+        with pytest.raises(ValueError, match=r"the run in '.*bad' is damaged \(.*restore it"):
+            compare_with_paper(finished_run(tmp_path / "bad", config.to_dict()))
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ import sys
 import time
 import warnings
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -35,10 +36,14 @@ from torchrl_l2c2.experiment.checkpoints import (
     load_checkpoint,
     save_checkpoint,
 )
-from torchrl_l2c2.experiment.config import GROUPS, OtherRunError
+from torchrl_l2c2.experiment.command import _end_logged, run
+from torchrl_l2c2.experiment.config import GROUPS
 from torchrl_l2c2.experiment.continuation import check_same_settings
+from torchrl_l2c2.experiment.errors import OtherRunError
 from torchrl_l2c2.experiment.files import write_json
+from torchrl_l2c2.experiment.naming import run_name
 from torchrl_l2c2.experiment.reports import results
+from torchrl_l2c2.experiment.reports.differences import fingerprint
 from torchrl_l2c2.experiment.reports.runs import find_runs, finished_run
 from torchrl_l2c2.experiment.trained import load_policy
 
@@ -52,6 +57,7 @@ def contents(folder):
     return {p: p.read_bytes() for p in folder.iterdir() if not p.name.startswith(".lock")}
 
 
+OF_TESTS = L2C2Config(gain="target", gain_target=1.0, gain_of="test_action_variation")
 # A tenth of the usual updates: two or so after each episode.
 FEW_UPDATES = PPORPEConfig(replay_ratio=1.0)
 
@@ -243,6 +249,17 @@ def test_what_only_training_reads_is_told_when_that_is_over(tmp_path):
         Experiment(small(evaluate_every=2, task=replace(SWINGUP, episodes=8)), tmp_path).close()
 
 
+def test_a_finished_run_without_checkpoints_is_not_begun_anew(tmp_path):
+    """By another length, or another test; its results would be gone."""
+    finished(tmp_path)
+    for path in list_checkpoints(tmp_path):
+        path.unlink()
+    before = contents(tmp_path)
+    with pytest.raises(CheckpointError, match=r"has ended, and no checkpoint.* any more to go on"):
+        Experiment(small(test_episodes=3), tmp_path)
+    assert contents(tmp_path) == before
+
+
 def test_a_test_of_other_length_replaces_the_old_one_when_it_has_ended(tmp_path):
     """Interrupted, the old one is still there, and the same command plays the new one."""
     finished(tmp_path)
@@ -327,6 +344,16 @@ def test_what_is_refused_from_elsewhere_leaves_no_folder(tmp_path, what):
     assert not (tmp_path / "b").exists()
 
 
+def test_what_is_no_run_is_refused_where_there_is_one_already(tmp_path):
+    """One that has checkpoints, and one that the command finds finished."""
+    finished(tmp_path)
+    values = {"resume": str(tmp_path / "nonsense"), "allow_other_versions": False}
+    for again in (partial(Experiment, small(), tmp_path, resume=values["resume"]),
+                  partial(run, small(), tmp_path, values)):  # fmt: skip
+        with pytest.raises(CheckpointError, match=r"nonsense' holds no checkpoint_.*leave resume"):
+            again()
+
+
 def test_other_versions_are_refused_unless_they_are_allowed(tmp_path):
     """The error names what differs, with both versions; a package only there now matters not."""
     Experiment(small(), tmp_path).train()
@@ -383,6 +410,7 @@ def test_the_episodes_of_the_last_rollout_may_be_more_than_were_asked_for(tmp_pa
     [
         ({"optimizer": AdamConfig(linear=True)}, "optimizer.linear=true"),
         ({"regularizer": L2C2Config(gain="ramp")}, "regularizer.gain=ramp"),
+        ({"regularizer": OF_TESTS}, "regularizer.gain_of=test_action_variation"),
     ],
 )
 def test_what_followed_another_length_is_told(tmp_path, setting, told):
@@ -403,6 +431,15 @@ def test_what_changes_no_number_may_change(tmp_path):
         logger=GROUPS["logger"]["tensorboard"], late_share=0.5, test_episodes=3, checkpoint_keep=5
     )
     assert len(Experiment(other, tmp_path).metrics) == 6
+
+
+def test_which_policies_are_tested_may_not_change_where_a_gain_follows_the_tests():
+    """Nor are such runs pooled, or share a folder."""
+    now, other = (small(regularizer=OF_TESTS, late_share=share) for share in (0.1, 0.5))
+    with pytest.raises(OtherRunError, match=r"late_share=0.1, not 0.5: .*shell, outputs=FOLDER"):
+        check_same_settings(now.to_dict(), other.to_dict())
+    assert fingerprint(now.to_dict()) != fingerprint(other.to_dict())
+    assert run_name(now) != run_name(other)
 
 
 def test_a_setting_that_a_checkpoint_does_not_know_is_named(tmp_path):
@@ -430,7 +467,7 @@ def test_another_choice_is_named_and_not_what_it_brings():
         check_same_settings(saved, small().to_dict())
 
 
-@pytest.mark.parametrize("file", ["checkpoint_00000002.pt", "metrics.csv"])
+@pytest.mark.parametrize("file", ["checkpoint_00000002.pt", "metrics.csv", "train.log"])
 def test_a_full_disk_names_the_file_and_the_last_good_checkpoint(tmp_path, monkeypatch, file):
     """And the run continues from there when there is room again."""
     experiment = Experiment(small(), tmp_path)
@@ -449,6 +486,13 @@ def test_a_full_disk_names_the_file_and_the_last_good_checkpoint(tmp_path, monke
     experiment.close()
     monkeypatch.undo()
     assert len(Experiment(small(), tmp_path).train()) == 6
+
+
+def test_an_error_that_there_is_no_room_to_log_is_told(tmp_path):
+    """And not that of the log in its place."""
+    (tmp_path / "train.log").mkdir()
+    with pytest.raises(ValueError, match="its own"), _end_logged(tmp_path):
+        raise ValueError("its own")
 
 
 def start(folder, episodes, *extra, log=None):

@@ -1,5 +1,9 @@
 """Rollouts of a fixed length: what is in them, what is learned from them, how they are saved."""
 
+import os
+import signal
+from functools import partial
+
 import gymnasium
 import numpy as np
 import pytest
@@ -14,6 +18,7 @@ from torchrl_l2c2.experiment import (
     EpisodeCollector,
     Experiment,
     ExperimentConfig,
+    L2C2Config,
     NoRegularizerConfig,
     PPOConfig,
     RolloutReplayConfig,
@@ -24,6 +29,7 @@ from torchrl_l2c2.experiment import (
 from torchrl_l2c2.experiment.diagnosis.run import value_function
 from torchrl_l2c2.experiment.evaluate import evaluate_policy
 from torchrl_l2c2.experiment.rollouts import RolloutCollector
+from torchrl_l2c2.experiment.signals import Interrupted
 from torchrl_l2c2.metrics import saturation
 
 NOISY = TaskConfig("pendulum", "Pendulum-v1", noise_scale=0.1, max_steps=9)
@@ -152,16 +158,16 @@ def test_a_simulator_that_does_not_repeat_itself_is_told():
     assert len(collector.ended[-1].transitions) == 20
 
 
-ADAM = AdamConfig()
+ADAM, NONE = AdamConfig(), NoRegularizerConfig()
 
 
-def experiment(task, folder=None, optimizer=ADAM, **algorithm):
+def experiment(task, folder=None, optimizer=ADAM, regularizer=NONE, **algorithm):
     settings = {"num_envs": 2, "frames": 40, "epochs": 1, "hidden": (8,), **algorithm}
     return Experiment(
         ExperimentConfig(
             task=task,
             algorithm=PPOConfig(**settings),
-            regularizer=NoRegularizerConfig(),
+            regularizer=regularizer,
             replay=RolloutReplayConfig(batch_size=20),
             optimizer=optimizer,
             compile=False,
@@ -217,15 +223,46 @@ def test_what_a_cut_leaves_is_bootstrapped(monkeypatch):
 
 
 def test_training_learns_after_every_rollout_and_tells_ended_episodes():
-    """40 frames a rollout of two simulators with episodes of 30: 60 and 120 frames end two each."""
+    """40 frames a rollout of two simulators with episodes of 30: 60 and 120 frames end two each.
+
+    130 frames end the training with the fourth rollout, which no episode ends in.
+    """
     task = TaskConfig("pendulum", "Pendulum-v1", frames=130, max_steps=30)
     run = experiment(task)
     rows = run.train()
-    assert [row["frames"] for row in rows] == [59, 60, 119, 120, 179, 180]
-    assert [row["length"] for row in rows] == [30] * 6
-    # Batches of 20 in a rollout's 40 frames; the last episodes end in the fifth rollout.
-    assert [row["updates"] for row in rows] == [4, 4, 6, 6, 10, 10]
-    assert run.player.frames == 200
+    assert [row["frames"] for row in rows] == [59, 60, 119, 120]
+    assert [row["length"] for row in rows] == [30] * 4
+    # Batches of 20 in a rollout's 40 frames.
+    assert [row["updates"] for row in rows] == [4, 4, 6, 6]
+    assert run.player.frames == 160 and run.learner.updates == 8
+
+
+def test_a_signal_is_heeded_after_a_rollout_that_no_episode_ended_in(tmp_path, monkeypatch):
+    """And saved, with the losses since the last episode: the run is the one in one go."""
+    task = TaskConfig("pendulum", "Pendulum-v1", frames=160, max_steps=60)
+    ramp = L2C2Config(policy_distance="mean", gain="ramp")
+    settings = {"optimizer": AdamConfig(linear=True), "regularizer": ramp}
+    whole = experiment(task, **settings)
+    whole.train()
+    first = experiment(task, tmp_path / "first", **settings)
+    learn = first.learner.learn_rollout
+    end = partial(os.kill, os.getpid(), signal.SIGTERM)
+    monkeypatch.setattr(first.learner, "learn_rollout", lambda epochs: (learn(epochs), end()))
+    with pytest.raises(Interrupted, match="SIGTERM ended the training after episode 0"):
+        first.train()
+    assert first.player.frames == 40 and 0.0 < first._gain.gains["all"].value < 0.3
+    first.close()
+    again = Experiment(first.config, tmp_path / "again", resume=tmp_path / "first")
+    again.train()
+    for row in (*again.metrics, *whole.metrics):
+        del row["frames_per_second"]
+    assert str(again.metrics) == str(whole.metrics)  # Many are NaN.
+
+
+def test_a_training_ends_with_an_episode_at_least():
+    """Its results are of that, though the frames were used up before."""
+    run = experiment(TaskConfig("pendulum", "Pendulum-v1", frames=10, max_steps=30))
+    assert len(run.train()) == 2 and run.player.frames == 80
 
 
 def test_a_policy_is_read_back_with_its_normalization(tmp_path):

@@ -6,6 +6,7 @@ import signal
 import pytest
 
 from torchrl_l2c2.experiment.command import _tell
+from torchrl_l2c2.experiment.errors import EXPECTED
 from torchrl_l2c2.experiment.signals import Terminated, stop_on_signals
 
 
@@ -31,6 +32,12 @@ def test_other_failures_are_told_with_or_without_one(error):
         raise error
     with pytest.raises(RuntimeError, match="its own"), stop_on_signals():
         raise RuntimeError("its own")
+
+
+@pytest.mark.parametrize("error", [MemoryError("std::bad_alloc"), RuntimeError("cannot allocate")])
+def test_what_takes_too_much_memory_is_told_with_what_takes_less(error):
+    """As 1e15 transitions do, which a component alone finds."""
+    assert isinstance(error, EXPECTED) and "choose smaller algorithm.hidden, repl" in _tell(error)
 
 
 def test_an_error_without_a_text_has_its_name():

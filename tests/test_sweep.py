@@ -10,11 +10,12 @@ import time
 from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 
 from torchrl_l2c2.experiment.checkpoints import list_checkpoints, load_checkpoint
 from torchrl_l2c2.experiment.command import check_launcher, check_sweep
 from torchrl_l2c2.experiment.settings import SettingError
-from torchrl_l2c2.experiment.sweep import Sweep, begin_sweep
+from torchrl_l2c2.experiment.sweep import ShareSweep, Sweep, begin_sweep
 
 ROOT = Path(__file__).parent.parent
 SETTINGS = (
@@ -208,6 +209,18 @@ def test_a_sweep_that_is_refused_ends_and_leaves_nothing(tmp_path):
         assert [*tmp_path.iterdir()]
         sys.exit("error")
     assert not [*tmp_path.iterdir()]
+
+
+def test_a_sweep_whose_outputs_cannot_be_written_to_says_so_in_a_line(tmp_path):
+    """And has not been stopped by anyone."""
+    (tmp_path / "file").touch()
+    where = OmegaConf.create({"hydra": {"sweep": {"dir": str(tmp_path / "file" / "outputs")}}})
+    told = r"error: the folder '.*outputs' cannot be written to \(Not a directory\); choose another"
+    with begin_sweep() as begun:
+        with pytest.raises(SystemExit, match=told):
+            ShareSweep().on_multirun_start(where)
+        assert begun.stopped_by is None
+    assert Sweep(tmp_path / "file" / "sweep", ("", 0), ()).stopped_by == signal.SIGTERM
 
 
 def test_a_sweep_says_how_much_of_it_is_left():

@@ -42,6 +42,15 @@ def settings_of():
         ("seed=zero", "seed must be a valid integer, got 'zero'."),
         ("device=mps", "device must be cpu, cuda or cuda:N, a number from 0 up, got 'mps'."),
         ("seed=1.5", "seed must be a valid integer, got 1.5."),
+        ("threads=1e11", "threads must be less than or equal to 1024, got 100000000000."),
+        (
+            "task.noise_scale=1e308",
+            "task.noise_scale must be less than or equal to 1000000000, got 1e+308.",
+        ),
+        (
+            "algorithm.hidden=[10000000]",
+            "algorithm.hidden must be less than or equal to 1000000, got",
+        ),
         ("threads=0", "threads must be greater than or equal to 1, got 0."),
         ("num_workers=0", "num_workers must be greater than or equal to 1, got 0."),
         ("num_workers=2 algorithm.schedule=step", "num_workers must be 1 with algorithm.schedule"),
@@ -94,6 +103,10 @@ def test_a_wrong_setting_gives_its_line(settings_of, line, message):
             "regularizer=lipsnet",
             "In 'config': Could not find 'regularizer/lipsnet' Available",
         ),
+        (
+            "task=5",
+            "task, algorithm, regularizer, replay, optimizer, logger are chosen by name (Conf",
+        ),
         ("seed=${oder}", "Interpolation key 'oder' not found full_key: seed"),
         ("seed=[1", "no viable alternative at input '[1'"),
     ],
@@ -106,6 +119,36 @@ def test_what_cannot_be_composed_ends_in_a_line(settings_of, monkeypatch, line, 
     said = str(ended.value)
     assert "HYDRA_FULL_ERROR" not in os.environ
     assert said.startswith(f"error: {told}") and "\n" not in said and "search path" not in said
+
+
+def test_a_folder_that_hydra_cannot_make_ends_in_a_line(tmp_path):
+    """Of ``hydra.run.dir``, say."""
+    (tmp_path / "file").touch()
+    told = r"error: '.*run' cannot be made \(Not a directory\); choose another."
+    with pytest.raises(SystemExit, match=told), composing():
+        (tmp_path / "file" / "run").mkdir(parents=True)
+
+
+@pytest.mark.parametrize(
+    ("line", "meant"),
+    [
+        ("regularizer=cap", "; did you mean regularizer=caps?"),
+        (
+            "task=Pendulum-v1",
+            "task=pendulum? An id of Gymnasium's: task=gymnasium task.env_id=Pendulum-v1.",
+        ),
+        (
+            "sigma=2",
+            "sigma is not a setting; did you mean regularizer.sigma? --help lists every setting.",
+        ),
+        ("outputs=~/runs", "No shell expands this ~: write $HOME."),
+    ],
+)
+def test_what_cannot_be_composed_ends_with_what_was_meant(settings_of, line, meant):
+    """Of choices, of settings without their group, and of a path."""
+    with pytest.raises(SystemExit) as ended, composing():
+        settings_of(line)
+    assert str(ended.value).endswith(meant)
 
 
 def test_the_whole_error_is_shown_where_it_is_asked_for(settings_of, monkeypatch):

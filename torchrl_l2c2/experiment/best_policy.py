@@ -10,10 +10,9 @@ import torch
 from tensordict.nn import TensorDictModule
 
 from torchrl_l2c2.experiment.config import ExperimentConfig
-from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
-from torchrl_l2c2.experiment.evaluate import evaluate_policy
+from torchrl_l2c2.experiment.environments import TEST_SEED
+from torchrl_l2c2.experiment.evaluate import evaluate_task
 from torchrl_l2c2.experiment.files import write_json
-from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.trained import save_policy
 
 EPISODES = 10
@@ -46,12 +45,8 @@ class BestPolicy:
         """Tests the policy where it is time to."""
         if not self._every or episode % self._every:
             return
-        seed = self._seed + 2 * TEST_SEED
-        # Seeding an environment seeds the process, too.
-        with ProcessState(seed, torch.get_num_threads()):
-            env = make_env(self._task, seed)
-            result = evaluate_policy(self._policy, env, EPISODES, max_steps=self._task.time_limit)
-            env.close()
+        seed, threads = self._seed + 2 * TEST_SEED, torch.get_num_threads()
+        result = evaluate_task(self._policy, self._task, seed, EPISODES, threads=threads)
         self.tests.append({"episode": episode, **result.summary()})
         if self._folder is None:
             return

@@ -196,6 +196,12 @@ class EpisodeCollector(Collector):
             following["truncated"].item(),
         )
 
+    def reset(self, index: Any = None, **kwargs: Any) -> None:
+        """The next frame begins an episode, wherever the present one is."""
+        if self._simulator is None:
+            super().reset(index, **kwargs)
+        self._observation = None
+
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
         """Seeds the simulator and, with another seed, its noise; the next episode starts anew.
 
@@ -286,6 +292,8 @@ def play_episodes(
         for number in range(1, episodes + 1):
             with simulating(f"the task failed in test episode {number}"):
                 episode = collector.rollout()
+                if not episode["next", "done"][-1].any():  # No end of the environment's own.
+                    collector.reset()
             yield episode
     finally:
         collector.shutdown(close_env=False)

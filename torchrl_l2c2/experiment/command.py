@@ -12,7 +12,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,7 +31,7 @@ from torchrl_l2c2.experiment.composition import (
     tell_sweep,
     tell_tuned,
 )
-from torchrl_l2c2.experiment.config import ExperimentConfig, OtherRunError
+from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.errors import EXPECTED, show_cause
 from torchrl_l2c2.experiment.progress import log
 from torchrl_l2c2.experiment.settings import SettingError
@@ -53,10 +53,8 @@ LAUNCHERS = {
     "ray_cluster": ("hydra_plugins.hydra_ray_launcher", "ray"),
     "slurm_cluster": ("hydra_plugins.hydra_submitit_launcher", "slurm"),
 }
-HINTS: dict[type[Exception], str] = {
-    SettingError: "--help lists every setting.",
-    OtherRunError: "In a shell: outputs=FOLDER, allow_other_versions=true, task.episodes=N.",
-}
+
+OF_MEMORY = "algorithm.hidden, replay.capacity, replay.batch_size or threads"
 
 
 def check_launcher(arguments: Sequence[str]) -> None:
@@ -172,7 +170,11 @@ def _standing(sweep: Sweep) -> str:
 def _tell(error: Exception) -> str:
     """Says what went wrong: of a user's own environment with where it did."""
     show_cause(error)
-    told = f"{str(error) or type(error).__name__} {HINTS.get(type(error), '')}".strip()
+    told = str(error) or type(error).__name__
+    if isinstance(error, SettingError):
+        told += " --help lists every setting."
+    elif isinstance(error, MemoryError) or "alloc" in told:
+        told = f"{told.rstrip('.')}. There is no memory for it: choose smaller {OF_MEMORY}."
     print(f"error: {told}", file=sys.stderr)
     return told
 
@@ -194,7 +196,7 @@ def run(
         patience (float): seconds to wait for a process that has its folder.
     """
     # Here, as settings are checked before anything waits for torch.
-    from torchrl_l2c2.experiment.continuation import tell_past
+    from torchrl_l2c2.experiment.continuation import check_elsewhere, tell_past
     from torchrl_l2c2.experiment.lock import wait_for_folder
     from torchrl_l2c2.experiment.process import keep_freed_memory
     from torchrl_l2c2.experiment.reports import (
@@ -221,6 +223,7 @@ def run(
     print(f"{standing}: {named}" if standing else named, flush=True)
     tell_tuned(config)
     wait_for_folder(folder, patience)
+    check_elsewhere(values["resume"])
     finished = finished_run(folder, config.to_dict())
     if finished is not None:
         tell_past(finished.config, config.to_dict())
@@ -252,9 +255,9 @@ def _end_logged(folder: Path) -> Iterator[None]:
     """What ends a run early is in its ``train.log`` too."""
     try:
         yield
-    except (Interrupted, KeyboardInterrupt) as interruption:
-        log(folder, str(interruption) or "interrupted")
-        raise
-    except Exception as error:
-        log(folder, "".join(traceback.format_exception(error)))
+    except (KeyboardInterrupt, Exception) as error:
+        stopped = isinstance(error, KeyboardInterrupt | Interrupted)
+        told = [str(error) or "interrupted"] if stopped else traceback.format_exception(error)
+        with suppress(OSError):  # The error itself may be that there is no room.
+            log(folder, "".join(told))
         raise

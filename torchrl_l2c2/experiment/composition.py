@@ -116,10 +116,14 @@ def composing() -> Iterator[None]:
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     try:
         yield
-    except (HydraException, OmegaConfBaseException) as error:
+    except (HydraException, OmegaConfBaseException, ValueError) as error:
         if shown:
             raise
         sys.exit(f"error: {refusal(error)}")
+    except OSError as error:  # Of a folder that Hydra makes, before anything runs in it.
+        if shown or error.filename is None:
+            raise
+        sys.exit(f"error: {error.filename!r} cannot be made ({error.strerror}); choose another.")
     finally:
         if not shown:
             os.environ.pop("HYDRA_FULL_ERROR", None)
@@ -129,7 +133,19 @@ def refusal(error: Exception) -> str:
     """What Hydra, or OmegaConf, refuses, in a line; of a name that there is not what was meant."""
     if found := re.match("Could not override '([^']+)'", str(error)):
         return unknown_setting(found[1])
-    return " ".join(str(error).partition("\nConfig search path:")[0].split())
+    if "group override must be" in str(error):
+        return f"{', '.join(GROUPS)} are chosen by name ({error})."
+    said = " ".join(str(error).partition("\nConfig search path:")[0].split())
+    if found := re.search(r"Could not find '(\w+)/([^']+)'", said):
+        return f"{said}{_choice_meant(*found.groups())}"
+    return f"{said}. No shell expands this ~: write $HOME." if "=~" in said else said
+
+
+def _choice_meant(group: str, name: str) -> str:
+    near = get_close_matches(name, GROUPS.get(group, ()), 1)
+    meant = f"; did you mean {group}={near[0]}?" if near else "."
+    ids = f" An id of Gymnasium's: task=gymnasium task.env_id={name}." if group == "task" else ""
+    return meant + ids
 
 
 def unknown_setting(name: str) -> str:
@@ -140,15 +156,21 @@ def unknown_setting(name: str) -> str:
         'task.epsodes is not a setting; did you mean task.episodes? --help lists every setting.'
         >>> unknown_setting("algorithm.num_envs")
         'algorithm.num_envs is a setting of algorithm=ppo alone.'
+        >>> unknown_setting("sigma")
+        'sigma is not a setting; did you mean regularizer.sigma? --help lists every setting.'
     """
     group, _, setting = name.partition(".")
-    choices = GROUPS.get(group, {}).items()
-    settings = {choice: {f.name for f in dataclasses.fields(of)} for choice, of in choices}
-    if having := [choice for choice, names in settings.items() if setting in names]:
+    settings = {
+        (each, choice): {field.name for field in dataclasses.fields(of)}
+        for each, choices in GROUPS.items()
+        for choice, of in choices.items()
+    }
+    if having := [of[1] for of, names in settings.items() if of[0] == group and setting in names]:
         return f"{name} is a setting of {group}={' or '.join(having)} alone."
     known = {*STEERING, *(field.name for field in dataclasses.fields(ExperimentConfig))}
-    known |= {f"{group}.{each}" for names in settings.values() for each in names}
-    near = get_close_matches(name, sorted(known), 1)
+    known |= {f"{of[0]}.{each}" for of, names in settings.items() for each in names}
+    near = sorted(each for each in known if each.endswith(f".{name}"))
+    near = near or get_close_matches(name, sorted(known), 1)
     meant = f"; did you mean {near[0]}?" if near else "."
     return f"{name} is not a setting{meant} --help lists every setting."
 

@@ -96,7 +96,7 @@ class ExperimentConfig:
         "played on the CPU, by a copy of the policy",
     )
     threads: int = Field(
-        default=1, ge=1, description="of PyTorch; the networks are too small to gain from more"
+        default=1, ge=1, le=1024, description="of PyTorch; networks so small gain nothing from more"
     )
     num_workers: int = Field(
         default=1,
@@ -142,7 +142,7 @@ class ExperimentConfig:
         description="final fraction of training whose policies play one test episode each; 0: none",
     )
     checkpoint_interval: float = Field(
-        default=60.0, ge=0, description="seconds between checkpoints, at the ends of episodes"
+        default=60.0, ge=0, description="seconds between checkpoints, after episodes or rollouts"
     )
     checkpoint_keep: int = Field(
         default=2, ge=1, description="newest checkpoints that stay in the folder"
@@ -292,10 +292,6 @@ def _read_group(group: str, values: Mapping[str, Any]) -> Any:
     raise SettingError("name", f"must be one of {sorted(choices)}, got {name!r}.", group)
 
 
-class OtherRunError(ValueError):
-    """A checkpoint is of a run with other settings."""
-
-
 # What may differ between a run and its continuation: it changes none of the numbers.
 FREE_SETTINGS = {
     "logger",
@@ -330,13 +326,16 @@ NEUTRAL_SETTINGS = {
 }
 
 
-def is_free(name: str) -> bool:
+def is_free(name: str, gain_of: str | None = None) -> bool:
     """Whether a setting may differ between a run and its continuation.
 
     Args:
         name (str): with its group, such as ``"task.solved_at"``; or of a group as a whole.
+        gain_of (str, optional): of the regularizer: what a gain follows is part of the training.
     """
     group, _, setting = name.partition(".")
+    if group == "late_share" and str(gain_of).startswith("test_"):
+        return False
     return group in FREE_SETTINGS or (group == "task" and setting in FREE_TASK_SETTINGS)
 
 

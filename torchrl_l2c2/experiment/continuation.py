@@ -10,11 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_l2c2.experiment.checkpoints import CheckpointError, list_checkpoints, load_newest
-from torchrl_l2c2.experiment.config import (
-    ExperimentConfig,
-    OtherRunError,
-)
-from torchrl_l2c2.experiment.errors import SimulatorError
+from torchrl_l2c2.experiment.config import ExperimentConfig
+from torchrl_l2c2.experiment.errors import OtherRunError, SimulatorError
 from torchrl_l2c2.experiment.saved import differing, of_length
 from torchrl_l2c2.experiment.tasks import Budget, TaskConfig
 from torchrl_l2c2.experiment.versions import versions
@@ -32,7 +29,8 @@ def check_same_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> Non
     for name, (was, is_now) in differing(saved, now).items():
         raise OtherRunError(
             f"the checkpoint was made with {name.removesuffix('.name')}={was}, not {is_now}: "
-            "give the same settings, or begin in another folder. Nothing was changed."
+            "give the same settings, or begin in another folder (in a shell, outputs=FOLDER). "
+            "Nothing was changed."
         )
 
 
@@ -72,7 +70,8 @@ def check_length(asked: Budget, before: Budget, played: int) -> None:
     if asked.total < least:
         raise OtherRunError(
             f"{asked.unit}s={asked.total} is fewer than the {least} that this run already has: ask "
-            "for as many or more, or choose another folder. Nothing was changed."
+            "for as many or more, or begin in another folder (in a shell, outputs=FOLDER). Nothing "
+            "was changed."
         )
 
 
@@ -97,19 +96,39 @@ def find_checkpoint(
     """The newest checkpoint in a folder that is whole, with its path, if it can be gone on from.
 
     Raises:
-        CheckpointError: there are checkpoints, but none can be read.
+        CheckpointError: there are checkpoints, but none can be read; or there are none any more,
+            of a run that has ended, whose results one that began anew would take the place of.
         OtherRunError: as :func:`check_continuable`.
 
     Warns:
         UserWarning: a newer one is damaged; and as :func:`check_continuable`.
     """
     if (found := load_newest(folder)) is None:
+        if any((Path(folder) / name).exists() for name in ("evaluation.json", "policy.pt")):
+            raise CheckpointError(
+                f"{str(folder)!r} holds a run that has ended, and no checkpoint_*.pt any more to "
+                "go on from: restore one, or begin in another folder (in a shell, outputs=FOLDER). "
+                "Nothing was changed."
+            )
         return None
     path, state, damaged = found
     for message in damaged:
         warnings.warn(f"{message} The one before it is used.", stacklevel=4)
     check_continuable(state, config, allow_other_versions=allow_other_versions)
     return path, state
+
+
+def check_elsewhere(folder: str | Path | None) -> None:
+    """Refuses to go on from where no checkpoint is.
+
+    Raises:
+        CheckpointError: names the folder.
+    """
+    if folder is not None and not list_checkpoints(folder):
+        raise CheckpointError(
+            f"resume={str(folder)!r} holds no checkpoint_*.pt: name another run's folder, or leave "
+            "resume out; a run that has begun needs none."
+        )
 
 
 def find_elsewhere(
@@ -128,14 +147,10 @@ def find_elsewhere(
         CheckpointError: none is where it was to be; and as :func:`find_checkpoint`.
         OtherRunError: as :func:`find_checkpoint`, which has the same options.
     """
+    check_elsewhere(folder)
     if folder is None or (own is not None and list_checkpoints(own)):
         return None
-    if (
-        found := find_checkpoint(folder, config, allow_other_versions=allow_other_versions)
-    ) is None:
-        hint = " Name its folder." if Path(folder).is_file() else ""
-        raise CheckpointError(f"resume={str(folder)!r} holds no checkpoint_*.pt.{hint}")
-    return found
+    return find_checkpoint(folder, config, allow_other_versions=allow_other_versions)
 
 
 def check_continuable(

@@ -8,12 +8,18 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 
+class OtherRunError(ValueError):
+    """A checkpoint is of a run with other settings."""
+
+
 class SimulatorError(RuntimeError):
     """The environment or the policy in it raised an error; the cause is chained."""
 
 
 # Anything else is a fault of the program.
-EXPECTED = (ValueError, OSError, RuntimeError, FloatingPointError, OverflowError, ImportError)
+EXPECTED = (
+    ValueError, OSError, RuntimeError, FloatingPointError, OverflowError, ImportError, MemoryError,
+)  # fmt: skip
 
 
 def show_cause(error: Exception) -> None:

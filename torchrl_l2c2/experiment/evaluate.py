@@ -164,6 +164,26 @@ def evaluate_policy(
     return Evaluation(returns, variations, lengths, measures)
 
 
+def evaluate_task(
+    policy: TensorDictModule,
+    task: TaskConfig,
+    seed: int,
+    episodes: int,
+    *,
+    threads: int,
+    **options: bool,
+) -> Evaluation:
+    """As :func:`evaluate_policy`, which has the options, in an environment of its own.
+
+    The process's random generators and number of threads are left as they are found.
+    """
+    with ProcessState(seed, threads):  # Seeding an environment seeds the process, too.
+        env = make_env(task, seed)
+        result = evaluate_policy(policy, env, episodes, max_steps=task.time_limit, **options)
+        env.close()
+    return result
+
+
 def _return(episode: TensorDictBase) -> float:
     total: float = episode["next", "reward"].sum().item()
     if not math.isfinite(total):

@@ -66,11 +66,10 @@ def begin_folder(folder: Path, settings: dict[str, Any], *, begun: bool, ended: 
             (folder / name).unlink(missing_ok=True)
     write_json(folder / "config.json", settings)
     write_json(folder / "versions.json", {**versions(), "commit": code_commit()})
-    (folder / "README.txt").write_text(README)
+    write_atomically(folder / "README.txt", README.encode())
 
 
 def bring_files(old: Path, new: Path) -> None:
     """Copies what a run in another folder goes on writing there."""
-    of_tests = (old / name for name in ("evaluations.json", "policy_best.pt"))
-    for path in (old / "metrics.csv", *filter(Path.exists, of_tests)):
+    for path in filter(Path.exists, (old / name for name in OF_THE_WAY)):
         write_atomically(new / path.name, path.read_bytes())

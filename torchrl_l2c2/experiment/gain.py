@@ -64,9 +64,11 @@ class GainControl:
 
         Without an update since the last time nothing is set, and no gradient measured. Where one
         is, a measure is the mean over the episodes since then: with rollouts, those of the last.
+        After a rollout that no episode ended in, a target has nothing to be set from.
 
         Args:
-            row (Mapping): what is logged of the episode.
+            row (Mapping): what is logged of the episode; without one, how many ``"episode"`` and
+                ``"frames"`` there were.
             training (Budget): all of it, over which a ramp rises.
 
         Keyword Args:
@@ -77,6 +79,9 @@ class GainControl:
             dict: the gains that were applied, what was measured, and the target; empty where the
             gain is constant.
         """
+        config = self._config
+        if config is not None and config.gain == "target" and config.gain_of not in row:
+            return {}
         logged = {}
         due = ends_round and self._learner.updates > self._updates
         measured = self._measure(row, training, due)

@@ -61,6 +61,7 @@ class Learner:
         compiles: whether the update is compiled.
         updates: gradient steps so far.
         skipped_updates: batches that were not finite and changed nothing.
+        unreported: the loss's entries in every update since the last report.
         first_update_seconds: how long the first took, compilation included; ``None`` before it.
         tells_faint_regularizer: whether to warn of a regularizer whose gradients are too small.
         at_full_gain: within it the regularizer has the gain that it is to end with.
@@ -85,7 +86,7 @@ class Learner:
         self._reward_factor = reward_factor
         self.compiles = compile
         self._skip_nonfinite = skip_nonfinite
-        self._terms: list[torch.Tensor] = []
+        self.unreported: list[torch.Tensor] = []
         self._learned_from: TensorDictBase | None = None
         self._rows = RowWriter(replay)
         self._read_keys = list(agent.loss.in_keys)
@@ -151,7 +152,7 @@ class Learner:
             self.skipped_updates += 1
             return
         self.updates += 1
-        self._terms.append(result[0])
+        self.unreported.append(result[0])
         if self.updates == MEASURED_AFTER and self.tells_faint_regularizer:
             self._tell_faint_regularizer()
 
@@ -188,8 +189,8 @@ class Learner:
             FloatingPointError: an entry was NaN or infinite, or a parameter is now; names it, the
                 update and the frame.
         """
-        keys, terms = self.agent.loss.out_keys, self._terms
-        self._terms = []
+        keys, terms = self.agent.loss.out_keys, self.unreported
+        self.unreported = []
         if terms:
             values = torch.stack(terms)
             self._check_finite(values, last_frame)

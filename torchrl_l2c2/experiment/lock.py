@@ -55,7 +55,9 @@ def lock_folder(folder: Path, holder: Any) -> weakref.finalize[..., Any]:
         ) from None
     # Not write_atomically: this file is for people, and not worth a flush of the disk.
     since = time.strftime("%Y-%m-%d %H:%M:%S")
-    owner.write_text(json.dumps({"pid": os.getpid(), "host": socket.gethostname(), "since": since}))
+    who = {"pid": os.getpid(), "host": socket.gethostname(), "since": since}
+    with contextlib.suppress(OSError):  # A full disk is told with what is worth something.
+        owner.write_text(json.dumps(who))
     return weakref.finalize(holder, _release, lock, owner)
 
 

@@ -70,9 +70,9 @@ def _unusual(config: ExperimentConfig) -> Iterator[tuple[str, str, Any]]:
             if not free and value != getattr(usual, name):
                 alone = group == "regularizer" or names[name] == 1
                 yield group, name if alone else f"{group}.{name}", value
-    usual = ExperimentConfig()
+    usual, followed = ExperimentConfig(), getattr(config.regularizer, "gain_of", None)
     for name in sorted(vars(config).keys() - GROUPS.keys() - {"seed"}):
-        if not is_free(name) and getattr(config, name) != getattr(usual, name):
+        if not is_free(name, followed) and getattr(config, name) != getattr(usual, name):
             yield "", name, getattr(config, name)
 
 

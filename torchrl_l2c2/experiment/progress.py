@@ -11,14 +11,19 @@ from types import TracebackType
 
 from tqdm import tqdm
 
+from torchrl_l2c2.experiment.files import append_line
+
 LINE_SECONDS = 60.0
 
 
 def log(folder: Path | None, line: str) -> None:
-    """Adds a line, with the time, to the ``train.log`` of a run's folder."""
+    """Adds a line, with the time, to the ``train.log`` of a run's folder.
+
+    Raises:
+        OSError: names the file.
+    """
     if folder is not None and folder.is_dir():
-        with open(folder / "train.log", "a", encoding="utf-8") as file:
-            file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {line}\n")
+        append_line(folder / "train.log", f"{time.strftime('%Y-%m-%d %H:%M:%S')} {line}\n")
 
 
 def say(folder: Path | None, line: str) -> None:

@@ -6,7 +6,8 @@ import csv
 import dataclasses
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,20 @@ REMEDY = "it was changed or cut since it was written; restore it."
 # How long a training is; a longer one is of the same kind.
 BUDGETS = ("task.episodes", "task.frames")
 ANEW = " Or delete it: the command that made the run tests its policy again."
+
+
+@contextmanager
+def read_back(run: str | Path) -> Iterator[None]:
+    """What is not as it was written is an error of the folder, whatever it is found by.
+
+    Raises:
+        ValueError: names the folder, in the place of errors of what was read in it.
+    """
+    try:
+        yield
+    except (LookupError, TypeError, AttributeError, ArithmeticError) as error:
+        found = f"{type(error).__name__}: {error}"
+        raise ValueError(f"the run in {str(run)!r} is damaged ({found}): {REMEDY}") from error
 
 
 def read_json(path: str | Path) -> dict[str, Any]:
@@ -122,7 +137,12 @@ def differing(saved: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, tup
     before, after = by_name(as_it_was(saved)), by_name(now)
     # The settings of another choice are others anyway.
     names = sorted(before.keys() | after.keys(), key=lambda n: (not n.endswith(".name"), n))
-    pairs = {n: (before.get(n, NOT_THEN), after.get(n, NOT_THEN)) for n in names if not is_free(n)}
+    followed = after.get("regularizer.gain_of")
+    pairs = {
+        name: (before.get(name, NOT_THEN), after.get(name, NOT_THEN))
+        for name in names
+        if not is_free(name, followed)
+    }
     return {
         name: (was, is_now)
         for name, (was, is_now) in pairs.items()
@@ -133,7 +153,9 @@ def differing(saved: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, tup
 def of_length(config: ExperimentConfig) -> list[str]:
     """The settings that go by how long a training is to be, so that a longer one's beginning is
     not a shorter one."""
+    gain_of = str(getattr(config.regularizer, "gain_of", None))
     going = {
+        f"regularizer.gain_of={gain_of}": gain_of.startswith("test_"),
         "optimizer.linear=true": config.optimizer.linear,
         "regularizer.gain=ramp": config.regularizer.ramped,
     }
@@ -146,13 +168,14 @@ def is_tested(run: str | Path, settings: Mapping[str, Any]) -> bool:
     Settings that change none of the numbers may differ, but for how long the training is.
 
     Raises:
-        ValueError: as :func:`read_config`.
+        ValueError: as :func:`read_config` and :func:`read_back`.
     """
     if not (Path(run) / "evaluation.json").exists():
         return False
-    saved = read_config(run)
-    before, after = ([by_name(each).get(name) for name in BUDGETS] for each in (saved, settings))
-    return before == after and not differing(saved, settings)
+    with read_back(run):
+        saved = read_config(run)
+        before, after = ([by_name(s).get(name) for name in BUDGETS] for s in (saved, settings))
+        return before == after and not differing(saved, settings)
 
 
 def read_evaluation(run: str | Path) -> dict[str, Any]:

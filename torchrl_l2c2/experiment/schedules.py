@@ -1,7 +1,8 @@
 """When a run learns: after every frame, after every episode, or after every rollout.
 
 Each schedule is the whole loop: it plays, remembers, learns, and hands out the episodes that it has
-learned from. What a run does between two of them, and when it ends, is the caller's.
+learned from, or ``None`` after a rollout that none has ended in. What a run does then, and when it
+ends, is the caller's.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ def by_episode(player: Player, learner: Learner, algorithm: OffPolicyConfig) -> 
             yield episode
 
 
-def by_rollout(player: Player, learner: Learner, algorithm: PPOConfig) -> Iterator[Episode]:
+def by_rollout(player: Player, learner: Learner, algorithm: PPOConfig) -> Iterator[Episode | None]:
     """Updates with everything that one policy has played, once it is enough."""
     if algorithm.num_envs is not None:
         return by_frames(player, learner, algorithm)
@@ -57,7 +58,7 @@ def by_episodes(player: Player, learner: Learner, algorithm: PPOConfig) -> Itera
             yield episode
 
 
-def by_frames(player: Player, learner: Learner, algorithm: PPOConfig) -> Iterator[Episode]:
+def by_frames(player: Player, learner: Learner, algorithm: PPOConfig) -> Iterator[Episode | None]:
     """Updates after so many frames, wherever episodes are then; hands out those that have ended."""
     normalization = learner.agent.normalization
     while True:
@@ -68,7 +69,7 @@ def by_frames(player: Player, learner: Learner, algorithm: PPOConfig) -> Iterato
         if normalization is not None:
             normalization.follow()
             learner.agent.refresh_policy()
-        yield from episodes
+        yield from episodes or (None,)
 
 
 def _learn(learner: Learner, algorithm: OffPolicyConfig, frames: int, last_frame: int) -> None:
@@ -78,7 +79,7 @@ def _learn(learner: Learner, algorithm: OffPolicyConfig, frames: int, last_frame
         learner.learn(algorithm.updates_after(frames, last_frame, stored, batch_size))
 
 
-SCHEDULES: dict[str, Callable[[Player, Learner, Any], Iterator[Episode]]] = {
+SCHEDULES: dict[str, Callable[[Player, Learner, Any], Iterator[Episode | None]]] = {
     "step": by_step,
     "episode": by_episode,
     "rollout": by_rollout,

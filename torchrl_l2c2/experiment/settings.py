@@ -86,7 +86,8 @@ def _plain(value: Any) -> Any:
     if isinstance(value, list):
         return tuple(value)
     # Where a float is wanted, pydantic makes one of the integer.
-    return int(value) if isinstance(value, float) and value.is_integer() else value
+    whole = isinstance(value, float) and value.is_integer() and abs(value) < 2**63
+    return int(value) if whole else value
 
 
 # Of every group that was asked for: the command's help and its nodes ask many times.

@@ -33,6 +33,8 @@ from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
+from torchrl_l2c2.experiment.errors import told_in_a_line
+from torchrl_l2c2.experiment.files import make_folder
 from torchrl_l2c2.experiment.settings import SettingError
 from torchrl_l2c2.experiment.signals import FINISHING, SAME_SIGNAL_SECONDS, terminate
 
@@ -88,7 +90,7 @@ class Sweep:
         """The signal that stopped it; ``None`` where it goes on."""
         try:
             return int((self._folder / "stopped").read_text())
-        except FileNotFoundError:
+        except OSError:
             # A job that was still to come, of a sweep that has ended.
             return None if self._folder.is_dir() else signal.SIGTERM
 
@@ -98,9 +100,13 @@ class Sweep:
             self._put("stopped", str(signal_number))
 
     def share(self, outputs: Path) -> None:
-        """Has what jobs tell below a folder that all their machines see; before any begins."""
-        stopped, self._folder = self.stopped_by, outputs / f".{self._folder.name}"
-        self._folder.mkdir(parents=True)
+        """Has what jobs tell below a folder that all their machines see; before any begins.
+
+        Raises:
+            OSError: it cannot be written to.
+        """
+        stopped, self._folder = self.stopped_by, make_folder(outputs) / f".{self._folder.name}"
+        self._folder.mkdir()
         self.publish()
         if stopped is not None:
             self.stop(stopped)
@@ -251,9 +257,14 @@ class ShareSweep(Callback):
     """Puts what a sweep's jobs tell beside its runs, where every machine that runs one sees it."""
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        """Called by Hydra, once the folder is known and before its launcher starts."""
+        """Called by Hydra, once the folder is known and before its launcher starts.
+
+        Raises:
+            SystemExit: the folder cannot be written to; Hydra swallows other errors.
+        """
         if Sweep.begun_here is not None:
-            Sweep.begun_here.share(Path(config.hydra.sweep.dir).absolute())
+            with told_in_a_line():
+                Sweep.begun_here.share(Path(config.hydra.sweep.dir).absolute())
 
 
 def enter_folder() -> None:

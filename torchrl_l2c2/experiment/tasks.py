@@ -52,6 +52,7 @@ class TaskConfig:
     noise_scale: float | None = Field(
         default=None,
         ge=0,
+        le=1e9,
         description="standard deviation of the white noise on every observation; null: the paper's "
         ".01 for Swingup, none for other ids [paper]",
     )

@@ -20,8 +20,8 @@ from torchrl_l2c2.experiment.continuation import (
     find_checkpoint,
     find_elsewhere,
 )
-from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
-from torchrl_l2c2.experiment.evaluate import Evaluation, LateTests, evaluate_policy
+from torchrl_l2c2.experiment.environments import TEST_SEED
+from torchrl_l2c2.experiment.evaluate import Evaluation, LateTests, evaluate_task
 from torchrl_l2c2.experiment.files import make_folder
 from torchrl_l2c2.experiment.folder import begin_folder, bring_files
 from torchrl_l2c2.experiment.gain import GainControl
@@ -124,8 +124,8 @@ class Experiment:
     ) -> list[dict[str, float]]:
         """Trains from where it left off, or where a checkpoint did.
 
-        SIGTERM and SIGINT end the training after the episode that is being played, with a
-        checkpoint; a second one ends it at once.
+        SIGTERM and SIGINT end the training after the episode, or rollout, that is being played,
+        with a checkpoint; a second one ends it at once.
 
         Args:
             episodes (int, optional): how many there are to be in all. Default: the task's, or its
@@ -168,12 +168,13 @@ class Experiment:
             anneal(self.config.optimizer, self.agent.optimizer, self._spent(full) / full.total)
             while not ended:
                 episode = next(schedule)
-                row = self._row(episode, full)
-                row |= self._gain.after(row, full, ends_round=episode.ends_round)
-                self._write(row, bar)
+                if episode is None:
+                    counts = {"episode": len(self.metrics), "frames": self.player.frames}
+                    self._gain.after(counts, full)
+                else:
+                    self._record(episode, full, bar)
                 anneal(self.config.optimizer, self.agent.optimizer, self._spent(full) / full.total)
-                self._best_policy.after(len(self.metrics))
-                if not episode.ends_round:
+                if episode is not None and not episode.ends_round:
                     continue
                 ended = self._ended(budget)
                 overdue = time.monotonic() - saved > self.config.checkpoint_interval
@@ -191,12 +192,11 @@ class Experiment:
         if self.folder is None:
             return None
         self.learner.check_parameters()
-        return save_checkpoint(
-            self.folder, len(self.metrics), self.state_dict(), self.config.checkpoint_keep
-        )
+        keep = self.config.checkpoint_keep
+        return save_checkpoint(self.folder, len(self.metrics), self.state_dict(), keep)
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that the rest of the run depends on, between two episodes."""
+        """Everything that the rest of the run depends on, between two episodes or rollouts."""
         learner = self.learner
         return {
             "config": json.dumps(self.config.to_dict()),
@@ -206,6 +206,7 @@ class Experiment:
             "collector": self.player.collector.generator_state(),
             "global_rng": self._process.state_dict(),
             "counters": [self.player.frames, learner.updates, learner.skipped_updates],
+            "unreported": learner.unreported,
             "metrics": json.dumps(self.metrics),
         }
 
@@ -223,6 +224,7 @@ class Experiment:
         load_replay_state(learner.replay, state["replay"])
         self.player.collector.set_generator_state(state["collector"])
         self.player.frames, learner.updates, learner.skipped_updates = state["counters"]
+        learner.unreported = list(state.get("unreported", []))
         self.metrics = json.loads(state["metrics"])
         # Some of the tensors that a compiled update was made for are others now.
         learner.renew()
@@ -242,19 +244,16 @@ class Experiment:
             Evaluation: give it to :meth:`finish` to have it written.
         """
         config = self.config
-        with ProcessState(config.seed + TEST_SEED, config.threads):
-            env = make_env(config.task, config.seed + TEST_SEED)
-            result = evaluate_policy(
-                self.agent.policy,
-                env,
-                config.test_episodes if episodes is None else episodes,
-                max_steps=config.task.time_limit,
-                sampled=sampled,
-                compile_policy=self._compile,
-                progress=progress,
-            )
-            env.close()
-        return result
+        return evaluate_task(
+            self.agent.policy,
+            config.task,
+            config.seed + TEST_SEED,
+            config.test_episodes if episodes is None else episodes,
+            threads=config.threads,
+            sampled=sampled,
+            compile_policy=self._compile,
+            progress=progress,
+        )
 
     def finish(self, result: Evaluation, sampled: Evaluation | None = None) -> FinishedRun:
         """Writes what a finished run's folder holds: policy, test episodes and picture.
@@ -304,8 +303,7 @@ class Experiment:
             self._go_on(*found)
         if self.folder is not None:
             ended = self._ended(self.config.task.budget)
-            begun = bool(self.metrics)
-            begin_folder(self.folder, self.config.to_dict(), begun=begun, ended=ended)
+            begin_folder(self.folder, self.config.to_dict(), begun=found is not None, ended=ended)
 
     def _go_on(self, path: Path, state: dict[str, Any]) -> None:
         if self.folder is not None and path.parent != self.folder:
@@ -328,12 +326,14 @@ class Experiment:
         return budget.spent(len(self.metrics), self.player.frames)
 
     def _ended(self, budget: Budget) -> bool:
-        return self._spent(budget) >= budget.total
+        # Rollouts may have used up the frames before an episode ended, which results are of.
+        least = bool(self.metrics) or budget.unit == "episode"
+        return least and self._spent(budget) >= budget.total
 
-    def _row(self, episode: Episode, budget: Budget) -> dict[str, float]:
+    def _record(self, episode: Episode, full: Budget, bar: Progress) -> None:
         number = len(self.metrics) + 1
-        late = budget.is_late(budget.spent(number, episode.last_frame), self.config.late_share)
-        return {
+        late = full.is_late(full.spent(number, episode.last_frame), self.config.late_share)
+        row = {
             "episode": number,
             "frames": episode.last_frame,
             "updates": self.learner.updates,
@@ -342,9 +342,9 @@ class Experiment:
             **(self._late_tests.play(number) if late else self._late_tests.none()),
             **self.learner.report(episode.last_frame),
         }
-
-    def _write(self, row: dict[str, float], bar: Progress) -> None:
+        row |= self._gain.after(row, full, ends_round=episode.ends_round)
         row["frames_per_second"] = bar.frames_per_second(self.player.frames)
         self.metrics.append(row)
         self._log.write(row)
         bar.show(self.metrics, self.learner.first_update_seconds)
+        self._best_policy.after(number)

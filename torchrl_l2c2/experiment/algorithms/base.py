@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from torchrl_l2c2.experiment.optimizers import OptimizerConfig
     from torchrl_l2c2.experiment.regularizers import RegularizerConfig
 
-Layers = tuple[Annotated[int, Field(ge=1)], ...]
+Layers = tuple[Annotated[int, Field(ge=1, le=1_000_000)], ...]
 """Neurons of hidden layers."""
 
 

@@ -33,10 +33,11 @@ def fingerprint(config: Mapping[str, Any]) -> str:
     Raises:
         SettingError: a setting that is not known.
     """
+    own = by_name(ExperimentConfig.from_dict(config).to_dict())
     compared = {
         name: value
-        for name, value in by_name(ExperimentConfig.from_dict(config).to_dict()).items()
-        if _counts(name) and name != "task.name" and not is_neutral(name, value)
+        for name, value in own.items()
+        if _counts(name, own) and name != "task.name" and not is_neutral(name, value)
     }
     return hashlib.sha256(json.dumps(compared, sort_keys=True).encode()).hexdigest()[:10]
 
@@ -66,7 +67,7 @@ def differences(config: Mapping[str, Any]) -> dict[str, str]:
     return {
         name: _word(value)
         for name, value in sorted(own.items())
-        if (_counts(name) or name in BUDGETS)
+        if (_counts(name, own) or name in BUDGETS)
         and value != (usual if name.endswith(".name") else chosen)[name]
     }
 
@@ -95,8 +96,8 @@ def _names(config: Mapping[str, Any], groups: Any) -> dict[str, Any]:
     return named
 
 
-def _counts(name: str) -> bool:
-    return name != "seed" and not is_free(name)
+def _counts(name: str, settings: Mapping[str, Any]) -> bool:
+    return name != "seed" and not is_free(name, settings.get("regularizer.gain_of"))
 
 
 def _word(value: Any) -> str:

@@ -18,6 +18,7 @@ from torchrl_l2c2.experiment.reports.paper_table import paper_table
 from torchrl_l2c2.experiment.reports.records import QUANTITIES, Record
 from torchrl_l2c2.experiment.reports.runs import FinishedRun, find_runs
 from torchrl_l2c2.experiment.reports.tables import Table, results_tables
+from torchrl_l2c2.experiment.saved import read_back
 
 if TYPE_CHECKING:
     from torchrl_l2c2.experiment.config import ExperimentConfig
@@ -48,15 +49,20 @@ def write_results(
 
 
 def compare_with_paper(run: FinishedRun) -> str:
-    """The end of a run in lines: its results and, for the paper's tasks, the paper's."""
+    """The end of a run in lines: its results and, for the paper's tasks, the paper's.
+
+    Raises:
+        ValueError: its folder is damaged.
+    """
     lines = [f"{'':>20}  {'return':>18}  {'action variation':>18}"]
     tests = {"mean actions": run.evaluation, "sampled actions": run.evaluation.get("sampled")}
     for name, test in tests.items():
         own = (test or {}).get("summary")
         if own is not None:
-            total, variation = ((own[f"{q}_mean"], own[f"{q}_std"]) for q in QUANTITIES)
-            what = f"{own['episodes']} test episodes, seed {run.seed}"
-            lines.append(_compared(name, total, variation, what))
+            with read_back(run.folder):
+                total, variation = ((own[f"{q}_mean"], own[f"{q}_std"]) for q in QUANTITIES)
+                what = f"{own['episodes']} test episodes, seed {run.seed}"
+                lines.append(_compared(name, total, variation, what))
     paper = run.record.paper
     if paper:
         lines.append(_compared("the paper", paper[:2], paper[2:], "18 seeds"))

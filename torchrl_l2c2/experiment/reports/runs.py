@@ -20,6 +20,7 @@ from torchrl_l2c2.experiment.reports.records import QUANTITIES, Record
 from torchrl_l2c2.experiment.saved import (
     REMEDY,
     is_tested,
+    read_back,
     read_config,
     read_evaluation,
     read_json,
@@ -195,11 +196,16 @@ def finished_run(folder: str | Path, settings: dict[str, Any]) -> FinishedRun | 
     """The run in a folder whose test is of these settings, and has as many episodes as they ask.
 
     ``None`` where there is none; any number of episodes is enough for settings that want none.
+
+    Raises:
+        ValueError: it is damaged.
     """
     if not is_tested(folder, settings):
         return None
-    run = FinishedRun.read(Path(folder))
-    return run if settings["test_episodes"] in (0, run.test_episodes) else None
+    with read_back(folder):
+        run = FinishedRun.read(Path(folder))
+        _ = run.record
+        return run if settings["test_episodes"] in (0, run.test_episodes) else None
 
 
 @dataclass(frozen=True)
