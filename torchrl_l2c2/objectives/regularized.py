@@ -195,10 +195,6 @@ class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
         """Whether the policy, a declared network, is a distribution; otherwise it is an action."""
         return self._evaluation.wiring[POLICY_NETWORK].stochastic
 
-    def policy_action(self) -> NestedKey:
-        """The entry that is the action, where the policy, a declared network, is deterministic."""
-        return self._evaluation.wiring[POLICY_NETWORK].output
-
     def is_ensemble(self, network: str) -> bool:
         """Whether the loss has expanded a network's parameters to those of several."""
         return is_ensemble(self, network)
