@@ -16,7 +16,7 @@ from torchrl.envs.utils import set_exploration_type
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import _vmap_func
 
-from torchrl_l2c2.objectives.precision import autocast_at, in_full_precision
+from torchrl_l2c2.objectives.precision import as_parameters, autocast_at, in_full_precision
 from torchrl_l2c2.objectives.wiring import POLICY_NETWORK, Wiring, parameters_of, wiring_of
 
 Policy = Distribution | Tensor
@@ -226,13 +226,14 @@ class EvaluatedNetworks:
 
     def _evaluate(self, loss: LossModule, network: str, rows: TensorDictBase) -> TensorDictBase:
         net, wiring = getattr(loss, network), self.wiring.get(network)
-        rows = rows.select(*net.in_keys, strict=False)
         params = parameters_of(loss, network)
+        parameters = net.parameters() if params is None else params.values(True, True)
+        rows = as_parameters(rows.select(*net.in_keys, strict=False), parameters)
         if wiring is not None and wiring.has_buffers:
             # Running statistics are the loss's own: spare copies take the update.
             params = TensorDict.from_module(net) if params is None else params
             params = params.apply(lambda p: p if p.requires_grad else p.clone())
-        policy = wiring is None or network == POLICY_NETWORK
+        policy = wiring is None or network == POLICY_NETWORK  # or a copy of it, which is not wired
         run = net.get_dist_params if policy and self.wiring[POLICY_NETWORK].stochastic else net
         with set_exploration_type(loss.deterministic_sampling_mode), in_full_precision(rows):
             if params is None:
