@@ -48,6 +48,8 @@ class Squish(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Applies the activation to every element."""
+        if x.dtype.itemsize < 4:  # The square of 256 is infinite in float16.
+            return self.forward(x.float()).to(x.dtype)
         return 0.5 * x * (1.0 + x * torch.rsqrt(x.square() + self.b))
 
     def extra_repr(self) -> str:
