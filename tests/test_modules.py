@@ -268,6 +268,8 @@ def test_compiled_they_give_the_same_numbers():
         (lambda: make_actor(3, 1, squish_b=0.0), ValueError, "b must be finite"),
         (lambda: make_actor(3, Unbounded(shape=(2,))), ValueError, "needs finite bounds"),
         (lambda: make_actor(3, Bounded(-1.0, math.inf, (2,))), ValueError, "needs finite bounds"),
+        (lambda: make_actor(3, Bounded(1.0, 1.0, (2,))), ValueError, "lower below the upper"),
+        (lambda: make_actor(3, 1, scale_mapping=3), TypeError, "must be a name, .* got 3"),
         (lambda: make_actor(3, Bounded(-1.0, 1.0, (4, 2))), ValueError, "action_spec_unbatched"),
         (lambda: make_actor(3, Categorical(4)), TypeError, "must be continuous"),
         (lambda: make_actor(3, Composite(a=Unbounded((2,)))), TypeError, "single tensor"),
