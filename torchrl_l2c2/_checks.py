@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any
 
 import torch
@@ -13,13 +13,13 @@ from torch.compiler import is_compiling
 
 
 def check_positive_int(name: str, value: Any) -> None:
-    """Refuses all but integers of at least 1; ``True`` is not one.
+    """Refuses all but integers of at least 1, also NumPy's; ``True`` is not one.
 
     Raises:
         TypeError: it is not an integer.
         ValueError: it is below 1.
     """
-    if not isinstance(value, int) or isinstance(value, bool):
+    if not isinstance(value, Integral) or isinstance(value, bool):
         raise TypeError(f"{name} must be an integer, got {value!r} ({type(value).__name__}).")
     if value < 1:
         raise ValueError(f"{name} must be at least 1, got {value!r}.")

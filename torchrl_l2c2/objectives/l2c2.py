@@ -186,7 +186,7 @@ class L2C2Loss(RegularizedLoss):
         self.l2c2_policy_distance = policy_distance
         self._l2c2_distance = choose_policy_distance(policy_distance, hellinger_samples)
         self.l2c2_neighborhood = neighborhood
-        self.l2c2_num_samples = num_samples
+        self.l2c2_num_samples = int(num_samples)
         self.l2c2_over_neighbors: Literal["mean", "max"] = over_neighbors
         self.l2c2_fraction = float(fraction)
         self.l2c2_hellinger_samples = hellinger_samples

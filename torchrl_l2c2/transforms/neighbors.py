@@ -186,7 +186,7 @@ class NeighborTransform(RandomTransform):
         )
         _check_names(self.in_keys)
         self.neighborhood = neighborhood
-        self.num_samples = num_samples
+        self.num_samples = int(num_samples)
 
     @property
     def out_key(self) -> NestedKey:
