@@ -320,6 +320,20 @@ def test_shares_of_gradients_are_never_zero_by_the_mode_or_the_precision():
     assert share > 0 and halved == pytest.approx(share, rel=0.1)
 
 
+@pytest.mark.parametrize("kind", [CAPSLoss, CATSLoss, GradCAPSLoss, ASAPLoss])
+def test_observations_around_may_be_of_another_precision(kind):
+    """They are compared in that of the state, which the policy takes."""
+    loss, batch = kind(linear_base()), transitions(4)
+    batch["frames"] = torch.cat((batch["observation"], batch["observation"]), -1)
+    around = ["frames", ("next", "observation")]
+    wider = batch.copy().update(batch.select(*around).double())
+    terms = []
+    for each in (batch, wider):
+        torch.manual_seed(0)
+        terms.append(loss.policy_regularizer(each))
+    torch.testing.assert_close(*terms, rtol=0.0, atol=0.0)
+
+
 class TestSR2L:
     def test_of_a_linear_policy_the_worst_state_is_a_corner(self):
         """1/2 max |W d|^2 over the corners of the box."""

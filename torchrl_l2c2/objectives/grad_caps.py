@@ -123,7 +123,7 @@ class GradCAPSLoss(RegularizedLoss):
                 "CatTensors."
             )
         ((key, (state, successor)),) = transitions.items()
-        before = self._before(tensordict, key, state).detach()
+        before = self._before(tensordict, key, state).detach().to(state.dtype)
         states = torch.stack((before, finite_successor(state, successor)))
         return TensorDict({key: states}, batch_size=[2, *tensordict.batch_size])
 

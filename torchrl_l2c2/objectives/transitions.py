@@ -125,7 +125,11 @@ def find_states(
 
 
 def finite_successor(state: Tensor, successor: Tensor) -> Tensor:
-    """The successor, with the state's own coordinates where it is not finite, as at some ends."""
+    """The successor, with the state's own coordinates where it is not finite, as at some ends.
+
+    In the state's precision, which the network takes.
+    """
+    successor = successor.to(state.dtype)
     return torch.where(successor.isfinite(), successor, state)
 
 
