@@ -348,6 +348,21 @@ class TestAttributes:
         with pytest.raises(ValueError, match="has nothing to scale"):
             inner.l2c2_beta = torch.tensor(0.1)
 
+    def test_a_gain_that_was_refused_is_not_kept(self):
+        """Also of ``-=``, which writes before it assigns, and around another regularizer."""
+        inner = L2C2Loss(ddpg())
+        outer = Stillness(inner)
+        outer.l2c2_coeff = 0.5
+        outer.l2c2_coeff += 0.25
+        twin = copy.deepcopy(outer)
+        for loss in (inner, outer, twin):
+            with pytest.raises(ValueError, match="l2c2_coeff must be finite and at least 0"):
+                loss.l2c2_coeff -= 5.0
+            with pytest.raises(TypeError, match="detach it"):
+                loss.l2c2_coeff *= nn.Parameter(torch.tensor(2.0))
+            assert loss.l2c2_coeff.item() == 0.75
+            assert not loss.l2c2_coeff.requires_grad
+
     def test_load_hooks_outlive_the_wrapped_loss(self):
         """Hooks of the plain loss that name their module work when only the new one is left."""
         loss = L2C2Loss(IQLLoss(gaussian_actor(), qvalue(), critic(), num_qvalue_nets=1))
