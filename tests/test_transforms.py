@@ -253,8 +253,10 @@ def test_deep_copies_have_their_own_generator():
 )
 def test_neighbors_are_refused_to_environments(attach):
     """In an environment there is no successor yet, and the error says where it belongs."""
+    transform = NeighborTransform(NEAR)
     with pytest.raises(ValueError, match="belongs to a replay buffer"):
-        attach(GymEnv("Pendulum-v1"), NeighborTransform(NEAR))
+        attach(GymEnv("Pendulum-v1"), transform)
+    replay(TensorDictReplayBuffer, transform)  # There it still can be put.
 
 
 @pytest.mark.parametrize(
@@ -525,6 +527,10 @@ def test_wrong_environments_are_refused(transforms, error, message):
     with pytest.raises(error, match=message):
         for transform in transforms:
             env.append_transform(transform.clone())
+    other = Compose(StepCounter(), refused := transforms[-1].clone())
+    with pytest.raises(error, match=message):
+        TransformedEnv(GymEnv("Pendulum-v1"), other)
+    assert refused.parent is None
 
 
 def test_drawing_and_placing_is_what_forward_does():

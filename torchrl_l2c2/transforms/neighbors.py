@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import Tensor
+from torchrl.envs import EnvBase
 
 from torchrl_l2c2._checks import check_positive_int
 from torchrl_l2c2.neighborhood import Neighborhood
@@ -211,13 +211,11 @@ class NeighborTransform(RandomTransform):
         neighbors = _place(tensordict, transitions, self.neighborhood, uniform)
         return tensordict.set(self.out_key, neighbors)
 
-    def set_container(self, container: Any) -> None:
-        super().set_container(container)
-        if self.parent is not None:
-            raise ValueError(
-                "NeighborTransform belongs to a replay buffer, not to an environment: neighbors "
-                "need the successor of the state. Append it to the buffer with append_transform."
-            )
+    def _check_environment(self, env: EnvBase) -> None:
+        raise ValueError(
+            "NeighborTransform belongs to a replay buffer, not to an environment: neighbors need "
+            "the successor of the state. Append it to the buffer with append_transform."
+        )
 
     def __repr__(self) -> str:
         return (
