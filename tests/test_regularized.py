@@ -427,6 +427,15 @@ class TestWhatIsRefused:
         with pytest.raises(TypeError, match=message):
             loss.policy_regularizer(batch)
 
+    def test_a_name_of_torchrls_own_is_told_to_be_the_reason(self):
+        """An observation that begins with an underscore has the right type."""
+        hidden = Actor(mlp(OBSERVATION, ACTION), in_keys=["_observation"])
+        base, batch = DDPGLoss(hidden, qvalue()), transitions(4)
+        with pytest.raises(TypeError, match=r"reads no observation .*'_'"):
+            L2C2Loss(base).policy_regularizer(batch)
+        with pytest.raises(ValueError, match=r"names \['_observation'\].* begins with '_'"):
+            L2C2Loss(base, moved_keys="_observation")
+
     @pytest.mark.parametrize("pixels", ["actor_network", "qvalue_network"])
     def test_each_network_needs_a_state_of_its_own(self, pixels):
         """The one that reads integers alone is named, where the other's states would do."""

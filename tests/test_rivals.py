@@ -196,6 +196,13 @@ class TestGradCAPS:
         with pytest.raises(ValueError, match=r"of shape \(2, 6\), got \(2, 9\)"):
             loss.policy_regularizer(batch)
 
+    @pytest.mark.parametrize("kind", [GradCAPSLoss, ASAPLoss])
+    @pytest.mark.parametrize("name", ["frames_key", "previous_key"])
+    def test_names_are_checked_when_the_loss_is_made(self, kind, name):
+        """Not with the first batch."""
+        with pytest.raises(TypeError, match=rf"^{name} must be a string or a tuple .* got 3"):
+            kind(linear_base(), **{name: 3})
+
     def test_a_loss_without_a_policy_is_refused(self):
         """As for the others."""
         base = DQNLoss(action_values(), action_space="one-hot")

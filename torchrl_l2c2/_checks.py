@@ -8,6 +8,7 @@ from numbers import Integral, Real
 from typing import Any
 
 import torch
+from tensordict import NestedKey, unravel_key
 from torch import Tensor
 from torch.compiler import is_compiling
 
@@ -119,6 +120,17 @@ def _range(
         return f"in {brackets[0]}{low:.4g}, {high:.4g}{brackets[1]}"
     bound = f"greater than {low:.4g}" if at_least is None else f"at least {low:.4g}"
     return f"finite and {bound}" if finite else bound
+
+
+def read_key(name: str, key: NestedKey) -> NestedKey:
+    """An entry's name, flat.
+
+    Raises:
+        TypeError: it is none; says what it is of.
+    """
+    if isinstance(key, str) or (isinstance(key, tuple) and key):
+        return unravel_key(key)
+    raise TypeError(f"{name} must be a string or a tuple of strings, got {key!r}.")
 
 
 def check_of_each(shape: Sequence[int], batch: Sequence[int]) -> None:

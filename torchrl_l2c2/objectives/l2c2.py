@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.distributions import Categorical
 from torchrl.objectives import DistributionalDQNLoss, LossModule
 
-from torchrl_l2c2._checks import check_choice, check_positive_int, check_real
+from torchrl_l2c2._checks import check_choice, check_positive_int, check_real, read_key
 from torchrl_l2c2.distances import squared_error, squared_hellinger
 from torchrl_l2c2.neighborhood import Neighborhood
 from torchrl_l2c2.objectives.evaluation import at_rows
@@ -21,7 +21,6 @@ from torchrl_l2c2.objectives.neighbors import (
     check_moved,
     draw_rows,
     l2c2_penalty,
-    read_key,
     read_moved_keys,
     read_neighbors,
     warn_of_other_neighbors,
