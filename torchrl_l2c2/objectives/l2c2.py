@@ -117,7 +117,8 @@ class L2C2Loss(RegularizedLoss):
             dimensions; ``"kl"`` (:func:`~torchrl_l2c2.policy_distances.kl_divergence`), of the
             policy at :math:`s` from the other, is relative and unbounded. Each wants its own gains.
             A function takes two distributions ``[K, *B]`` and returns ``[K, *B]``; neither it nor
-            ``"kl"`` takes deterministic policies. Defaults to ``"hellinger"``.
+            ``"kl"`` takes deterministic policies. A module's parameters are not the loss's.
+            Defaults to ``"hellinger"``.
         hellinger_samples (int, optional): actions drawn from each policy for the paper's Monte
             Carlo estimate of :math:`d_\pi`, at least 1. Defaults to ``None``, its closed form.
         neighbor_key (NestedKey): the entry that ``NeighborTransform`` writes. Defaults to
@@ -182,7 +183,6 @@ class L2C2Loss(RegularizedLoss):
                 "largest is the mean."
             )
         check_real("fraction", fraction, above=0, at_most=1)
-        self.l2c2_policy_distance = policy_distance
         self._l2c2_distance = choose_policy_distance(policy_distance, hellinger_samples)
         self.l2c2_neighborhood = neighborhood
         self.l2c2_num_samples = int(num_samples)
