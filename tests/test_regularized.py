@@ -267,6 +267,20 @@ class TestTheClass:
         with pytest.raises(TypeError, match=r"both define \['policies_at'\]"):
             L2C2Loss(Clashing(deterministic_actor(), qvalue()))
 
+    @pytest.mark.parametrize("name", ["forward", "policy_at", "policy_terms", "_evaluation"])
+    def test_nor_are_ours_by_an_attribute_of_the_loss(self, name):
+        """Whatever it is, it would be found first, or be lost."""
+        loss = ddpg()
+        setattr(loss, name, nn.Linear(1, 1))
+        with pytest.raises(TypeError, match=rf"has \['{name}'\], which this DDPGLoss has as attr"):
+            L2C2Loss(loss)
+
+    def test_around_a_compiled_loss_the_terms_are_there(self):
+        """The call that was compiled is the plain loss's."""
+        base = ddpg()
+        base.compile(backend="eager")
+        assert "loss_l2c2_actor" in L2C2Loss(base)(transitions(4)).keys()
+
     def test_a_hook_is_overridden_only_where_it_was_declared(self):
         """A loss that calls a method as the hook of SharedEvaluation is called, by chance."""
 
