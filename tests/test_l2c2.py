@@ -678,6 +678,20 @@ class TestMonteCarlo:
         assert found.item() == pytest.approx(expected.item(), rel=0.03)
 
 
+def test_every_diagnostic_is_worked_out_once(monkeypatch):
+    """Also what is of both terms, in a forward pass."""
+    loss, worked_out = L2C2Loss(DDPGLoss(deterministic_actor(), qvalue())), []
+    diagnostic = type(loss).reduce_diagnostic
+
+    def counted(self, value, tensordict):
+        worked_out.append(value)
+        return diagnostic(self, value, tensordict)
+
+    monkeypatch.setattr(type(loss), "reduce_diagnostic", counted)
+    terms = loss(transitions(4))
+    assert len(worked_out) == len([key for key in terms.keys() if key.startswith("l2c2_")])
+
+
 class TestPolicyDistances:
     """Means move by 0 and 2, of normals with the standard deviation 1/2."""
 

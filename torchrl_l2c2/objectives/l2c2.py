@@ -312,13 +312,14 @@ class L2C2Loss(RegularizedLoss):
         return self.reduce_diagnostic(value, tensordict)
 
     def _gain_diagnostics(self, near: Neighbors, tensordict: TensorDictBase) -> dict[str, Tensor]:
-        gain = self.l2c2_coeff * self.l2c2_neighborhood.gain(near.distance)
-        # Of a transition that counts nothing it is infinite.
-        finite = near.distance.masked_fill(near.distance.isinf(), 0.0)
-        return {
-            "l2c2_distance": self._diagnostic(finite, near, tensordict),
-            "l2c2_gain": self._diagnostic(gain, near, tensordict),
-        }
+        def make() -> dict[str, Tensor]:
+            gain = self.l2c2_coeff * self.l2c2_neighborhood.gain(near.distance)
+            # Of a transition that counts nothing it is infinite.
+            finite = near.distance.masked_fill(near.distance.isinf(), 0.0)
+            kinds = {"l2c2_distance": finite, "l2c2_gain": gain}
+            return {k: self._diagnostic(v, near, tensordict) for k, v in kinds.items()}
+
+        return self.made_once("l2c2_gains", make)
 
 
 def _value_term(network: str) -> str:
