@@ -61,7 +61,7 @@ def main(frames: int) -> None:
         replay.extend(collected)
         for _ in range(FRAMES_PER_BATCH):
             terms = loss(replay.sample())
-            sum(term for key, term in terms.items() if key.startswith("loss_")).backward()
+            sum(term for key, term in terms.items() if key.startswith("loss")).backward()
             optimizer.step()
             optimizer.zero_grad()
             updater.step()

@@ -57,7 +57,7 @@ def main(frames: int, plain: bool = False) -> None:
             minibatches.extend(collected.reshape(-1))
             for batch in minibatches:
                 terms = loss(batch)
-                sum(term for key, term in terms.items() if key.startswith("loss_")).backward()
+                sum(term for key, term in terms.items() if key.startswith("loss")).backward()
                 torch.nn.utils.clip_grad_norm_(loss.parameters(), 1.0)
                 optimizer.step()
                 optimizer.zero_grad()

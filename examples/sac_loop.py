@@ -60,7 +60,7 @@ def main(frames: int, plain: bool = False) -> None:
         for _ in range(UPDATES_PER_BATCH):
             batch = replay.sample()
             terms = loss(batch)
-            sum(term for key, term in terms.items() if key.startswith("loss_")).backward()
+            sum(term for key, term in terms.items() if key.startswith("loss")).backward()
             optimizer.step()
             optimizer.zero_grad()
             updater.step()

@@ -55,7 +55,7 @@ def main(frames: int) -> None:
                 advantage(collected)
             for batch in collected[torch.randperm(FRAMES_PER_BATCH)].chunk(PARTS):
                 terms = parallel(batch)
-                sum(term for key, term in terms.items() if key.startswith("loss_")).backward()
+                sum(term for key, term in terms.items() if key.startswith("loss")).backward()
                 torch.nn.utils.clip_grad_norm_(loss.parameters(), 1.0)
                 optimizer.step()
                 optimizer.zero_grad()

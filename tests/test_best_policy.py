@@ -252,6 +252,13 @@ def test_a_policy_of_a_checkpoint_explores_as_the_run_does(tmp_path):
     experiment.close()
 
 
+def test_a_policy_is_loaded_without_a_draw_from_the_global_generator(folder):
+    """What a notebook draws does not depend on whether it has loaded one before."""
+    before = torch.get_rng_state()
+    load_policy(folder)
+    assert torch.get_rng_state().equal(before)
+
+
 def test_the_best_policy_is_loaded_where_there_is_one(folder, tmp_path):
     """And missed where there is none."""
     kept = torch.load(folder / "policy_best.pt", weights_only=True)

@@ -8,7 +8,7 @@ import pytest
 from torchrl_l2c2._checks import check_choice, check_positive_int, check_real
 
 
-@pytest.mark.parametrize("value", [True, 1.0, "1", None])
+@pytest.mark.parametrize("value", [True, np.True_, 1.0, "1", None])
 def test_what_is_no_integer_is_a_type_error(value):
     """With the value and its type; a bool is no number."""
     name = type(value).__name__
@@ -19,11 +19,12 @@ def test_what_is_no_integer_is_a_type_error(value):
 def test_integers_start_at_one():
     """Below is a ValueError."""
     check_positive_int("k", 1)
+    check_positive_int("k", np.int64(1))
     with pytest.raises(ValueError, match=r"^k must be at least 1, got 0\.$"):
         check_positive_int("k", 0)
 
 
-@pytest.mark.parametrize("value", [True, "0.5", None, 1j])
+@pytest.mark.parametrize("value", [True, np.True_, "0.5", None, 1j])
 def test_what_is_no_real_number_is_a_type_error(value):
     """Whatever the bounds."""
     with pytest.raises(TypeError, match=r"^x must be a real number, got .* \(\w+\)\.$"):

@@ -182,6 +182,18 @@ def test_l2c2_reads_nested_keys_and_sample_numbers():
     assert (loss.l2c2_hellinger_samples, loss.l2c2_num_samples, loss.l2c2_coeff) == (3, 2, 2.0)
 
 
+def test_a_string_is_one_name():
+    """As in Python, where a list of them is expected."""
+    loss = composed("+loss=l2c2", *SAC, "loss.moved_keys=observation")
+    assert instantiate(with_networks(loss).loss).l2c2_moved_keys == ["observation"]
+    for settings in (
+        ["+transform=neighbor"],
+        ["+transform=observation_noise", "++transform.scale=1"],
+    ):
+        cfg = composed(*settings, "transform.in_keys=position")
+        assert instantiate(cfg.transform).in_keys == ["position"]
+
+
 def test_caps_over_sac_composes():
     """``loss: caps`` over ``loss: sac`` is a SAC loss regularized by CAPS."""
     cfg = with_networks(composed("+loss=caps", *SAC, "loss.sigma=0.3", "loss.mean=action"))

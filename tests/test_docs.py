@@ -56,6 +56,14 @@ def test_blocks_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     run_blocks(page)
 
 
+def test_what_is_summed_is_every_loss() -> None:
+    """DQN and its kin call theirs ``loss``: snippets that are copied do not leave it out."""
+    written = [*FOLDER.glob("*.md"), *ROOT.glob("examples/*.py"), ROOT / "README.md"]
+    sums = [line for path in written for line in path.read_text().splitlines() if "sum(" in line]
+    found = [line for line in sums if "startswith(" in line]
+    assert len(found) > 5 and all('startswith("loss")' in line for line in found)
+
+
 def test_the_readmes_code_does_what_it_says() -> None:
     """Nothing of it is left out, and the loss has the promised terms."""
     page = ROOT / "README.md"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import warnings
 
@@ -677,6 +678,20 @@ class TestMonteCarlo:
         assert found.item() == pytest.approx(expected.item(), rel=0.03)
 
 
+def test_every_diagnostic_is_worked_out_once(monkeypatch):
+    """Also what is of both terms, in a forward pass."""
+    loss, worked_out = L2C2Loss(DDPGLoss(deterministic_actor(), qvalue())), []
+    diagnostic = type(loss).reduce_diagnostic
+
+    def counted(self, value, tensordict):
+        worked_out.append(value)
+        return diagnostic(self, value, tensordict)
+
+    monkeypatch.setattr(type(loss), "reduce_diagnostic", counted)
+    terms = loss(transitions(4))
+    assert len(worked_out) == len([key for key in terms.keys() if key.startswith("l2c2_")])
+
+
 class TestPolicyDistances:
     """Means move by 0 and 2, of normals with the standard deviation 1/2."""
 
@@ -703,6 +718,23 @@ class TestPolicyDistances:
             terms["loss_l2c2_actor"], loss.actor_network.module[0].module.weight
         )
         assert gradient.abs().sum() > 0
+
+    def test_a_module_as_distance_stays_the_callers(self):
+        """The loss has the parameters and the state of the plain one; its term is the module's."""
+
+        class Scaled(nn.Module):
+            def __init__(self):
+                super().__init__()
+                self.scale = nn.Parameter(torch.tensor(3.0))
+
+            def forward(self, p, q):
+                return self.scale * (p.mean - q.mean).square().sum(-1)
+
+        plain, loss = linear_loss(), linear_loss(policy_distance=Scaled())
+        assert loss.state_dict().keys() == plain.state_dict().keys()
+        assert len(list(loss.parameters())) == len(list(plain.parameters()))
+        term = copy.deepcopy(loss).policy_regularizer(linear_batch())["l2c2_policy_distance"]
+        assert term.item() == pytest.approx(3.0 * 2.0**2 / 2)
 
     @pytest.mark.parametrize("distance", ["hellinger", "mean"])
     def test_deterministic_policies_have_their_actions_compared(self, distance):

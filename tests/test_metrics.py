@@ -229,6 +229,15 @@ def test_noise_sensitivity_of_a_linear_policy():
     assert found.item() == pytest.approx(0.5 * 0.04 * weight.square().sum().item(), rel=0.03)
 
 
+def test_noise_sensitivity_refuses_actions_without_a_dimension_of_their_own():
+    """It would sum over the batch, and grow with it."""
+    observations = torch.randn(8, 3)
+    with pytest.raises(ValueError, match=r"\[\*B, A\] .* got \(8,\) of \(8, 3\)"):
+        noise_sensitivity(lambda s: s[:, 0], observations, 0.2)
+    assert noise_sensitivity(lambda s: s[:1], observations[0], 0.2).ndim == 0
+    assert noise_sensitivity(lambda s: s.flatten(1), observations.view(8, 3, 1, 1), 0.2).ndim == 0
+
+
 @pytest.mark.parametrize(
     ("measure", "least"),
     [

@@ -52,6 +52,16 @@ def test_squish_has_swishs_bend_at_zero_and_becomes_a_relu():
     torch.testing.assert_close(Squish(1e-10)(y), y.relu(), rtol=0.0, atol=1e-4)
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_squish_of_large_inputs_in_half_precision(dtype):
+    """Those of single precision, rounded; the slopes are 0 and 1 there."""
+    x = torch.tensor([-1000.0, -256.0, 3.0, 256.0, 60000.0], dtype=dtype, requires_grad=True)
+    found, single = Squish()(x), Squish()(x.float())
+    torch.testing.assert_close(found, single.to(dtype))
+    (slope,) = torch.autograd.grad(found.sum(), x)
+    torch.testing.assert_close(slope[[0, -1]], torch.tensor([0.0, 1.0], dtype=dtype))
+
+
 @pytest.mark.parametrize("b", [0.0, -1.0, math.inf, math.nan])
 def test_squish_refuses_a_bend_out_of_range(b):
     """Naming what is allowed."""
@@ -258,6 +268,8 @@ def test_compiled_they_give_the_same_numbers():
         (lambda: make_actor(3, 1, squish_b=0.0), ValueError, "b must be finite"),
         (lambda: make_actor(3, Unbounded(shape=(2,))), ValueError, "needs finite bounds"),
         (lambda: make_actor(3, Bounded(-1.0, math.inf, (2,))), ValueError, "needs finite bounds"),
+        (lambda: make_actor(3, Bounded(1.0, 1.0, (2,))), ValueError, "lower below the upper"),
+        (lambda: make_actor(3, 1, scale_mapping=3), TypeError, "must be a name, .* got 3"),
         (lambda: make_actor(3, Bounded(-1.0, 1.0, (4, 2))), ValueError, "action_spec_unbatched"),
         (lambda: make_actor(3, Categorical(4)), TypeError, "must be continuous"),
         (lambda: make_actor(3, Composite(a=Unbounded((2,)))), TypeError, "single tensor"),

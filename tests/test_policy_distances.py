@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from losses import composite_actor, transitions
@@ -26,6 +27,14 @@ from torchrl_l2c2.policy_distances import (
 @pytest.fixture(autouse=True)
 def seed():
     torch.manual_seed(0)
+
+
+def test_numpys_number_of_samples_compiles():
+    """As Python's does."""
+    distance = choose_policy_distance("hellinger", np.int64(3))
+    compiled = torch.compile(distance, fullgraph=True, backend="eager")
+    policy = d.Normal(torch.zeros(4), 1.0)
+    assert compiled(policy, policy).equal(torch.zeros(4))
 
 
 LOC = torch.tensor([[0.5, -3.0], [1.0, 2.0]])

@@ -13,7 +13,7 @@ from tests.losses import (
     on_policy,
     qvalue,
 )
-from torchrl_l2c2 import ASAPLoss, CATSLoss, L2C2Loss, PPORPELoss
+from torchrl_l2c2 import ASAPLoss, CATSLoss, L2C2Loss, LCPLoss, PPORPELoss
 from torchrl_l2c2.objectives import evaluation
 
 
@@ -76,6 +76,34 @@ def test_what_is_a_copy_of_the_policy_predicts_it_under_autocast_too(batch):
     added, *_ = evaluate(ASAPLoss(ppo(), previous_key="previous_observation"), batch, autocast=True)
     for kind in ("spatial", "temporal"):
         assert added[f"loss_asap_{kind}"].item() == 0.0
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+@pytest.mark.parametrize("kind", [CATSLoss, ASAPLoss, LCPLoss])
+def test_observations_in_half_precision_are_taken_as_autocast_takes_them(kind, dtype, batch):
+    """At the same states as if they had been stored in single precision."""
+    batch["frames"] = torch.cat((batch["observation"], batch["observation"]), -1)
+    keys = "observation", ("next", "observation"), "frames"
+    halves = batch.copy().update(batch.select(*keys).to(dtype))
+    singles = halves.copy().update(halves.select(*keys).float())
+    loss = kind(ppo())
+    expected = loss.policy_regularizer(singles)
+    with torch.autocast("cpu", dtype=dtype):
+        loss(halves.copy())
+        terms = loss.policy_regularizer(halves)
+    torch.testing.assert_close(terms, expected)
+
+
+def test_it_compiles_under_autocast(batch):
+    """Into one graph, also of observations in half precision."""
+    batch["observation"], batch["next", "observation"] = (
+        batch[key].bfloat16() for key in ("observation", ("next", "observation"))
+    )
+    loss = CATSLoss(ppo())
+    compiled = torch.compile(loss, fullgraph=True, backend="eager")
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found, expected = compiled(batch.copy()), loss(batch.copy())
+    torch.testing.assert_close(found["loss_cats"], expected["loss_cats"])
 
 
 def test_rounded_the_term_would_be_another_number(batch):

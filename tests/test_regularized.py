@@ -267,6 +267,20 @@ class TestTheClass:
         with pytest.raises(TypeError, match=r"both define \['policies_at'\]"):
             L2C2Loss(Clashing(deterministic_actor(), qvalue()))
 
+    @pytest.mark.parametrize("name", ["forward", "policy_at", "policy_terms", "_evaluation"])
+    def test_nor_are_ours_by_an_attribute_of_the_loss(self, name):
+        """Whatever it is, it would be found first, or be lost."""
+        loss = ddpg()
+        setattr(loss, name, nn.Linear(1, 1))
+        with pytest.raises(TypeError, match=rf"has \['{name}'\], which this DDPGLoss has as attr"):
+            L2C2Loss(loss)
+
+    def test_around_a_compiled_loss_the_terms_are_there(self):
+        """The call that was compiled is the plain loss's."""
+        base = ddpg()
+        base.compile(backend="eager")
+        assert "loss_l2c2_actor" in L2C2Loss(base)(transitions(4)).keys()
+
     def test_a_hook_is_overridden_only_where_it_was_declared(self):
         """A loss that calls a method as the hook of SharedEvaluation is called, by chance."""
 
@@ -348,6 +362,21 @@ class TestAttributes:
         with pytest.raises(ValueError, match="has nothing to scale"):
             inner.l2c2_beta = torch.tensor(0.1)
 
+    def test_a_gain_that_was_refused_is_not_kept(self):
+        """Also of ``-=``, which writes before it assigns, and around another regularizer."""
+        inner = L2C2Loss(ddpg())
+        outer = Stillness(inner)
+        outer.l2c2_coeff = 0.5
+        outer.l2c2_coeff += 0.25
+        twin = copy.deepcopy(outer)
+        for loss in (inner, outer, twin):
+            with pytest.raises(ValueError, match="l2c2_coeff must be finite and at least 0"):
+                loss.l2c2_coeff -= 5.0
+            with pytest.raises(TypeError, match="detach it"):
+                loss.l2c2_coeff *= nn.Parameter(torch.tensor(2.0))
+            assert loss.l2c2_coeff.item() == 0.75
+            assert not loss.l2c2_coeff.requires_grad
+
     def test_load_hooks_outlive_the_wrapped_loss(self):
         """Hooks of the plain loss that name their module work when only the new one is left."""
         loss = L2C2Loss(IQLLoss(gaussian_actor(), qvalue(), critic(), num_qvalue_nets=1))
@@ -411,6 +440,15 @@ class TestWhatIsRefused:
         message = r"actor_network needs a floating-point.*'observation'.*int64"
         with pytest.raises(TypeError, match=message):
             loss.policy_regularizer(batch)
+
+    def test_a_name_of_torchrls_own_is_told_to_be_the_reason(self):
+        """An observation that begins with an underscore has the right type."""
+        hidden = Actor(mlp(OBSERVATION, ACTION), in_keys=["_observation"])
+        base, batch = DDPGLoss(hidden, qvalue()), transitions(4)
+        with pytest.raises(TypeError, match=r"reads no observation .*'_'"):
+            L2C2Loss(base).policy_regularizer(batch)
+        with pytest.raises(ValueError, match=r"names \['_observation'\].* begins with '_'"):
+            L2C2Loss(base, moved_keys="_observation")
 
     @pytest.mark.parametrize("pixels", ["actor_network", "qvalue_network"])
     def test_each_network_needs_a_state_of_its_own(self, pixels):

@@ -196,6 +196,13 @@ class TestGradCAPS:
         with pytest.raises(ValueError, match=r"of shape \(2, 6\), got \(2, 9\)"):
             loss.policy_regularizer(batch)
 
+    @pytest.mark.parametrize("kind", [GradCAPSLoss, ASAPLoss])
+    @pytest.mark.parametrize("name", ["frames_key", "previous_key"])
+    def test_names_are_checked_when_the_loss_is_made(self, kind, name):
+        """Not with the first batch."""
+        with pytest.raises(TypeError, match=rf"^{name} must be a string or a tuple .* got 3"):
+            kind(linear_base(), **{name: 3})
+
     def test_a_loss_without_a_policy_is_refused(self):
         """As for the others."""
         base = DQNLoss(action_values(), action_space="one-hot")
@@ -318,6 +325,20 @@ def test_shares_of_gradients_are_never_zero_by_the_mode_or_the_precision():
     half = batch.apply(lambda entry: entry.half() if entry.is_floating_point() else entry)
     halved = gradient_shares(loss.half(), half)["loss_cats"]
     assert share > 0 and halved == pytest.approx(share, rel=0.1)
+
+
+@pytest.mark.parametrize("kind", [CAPSLoss, CATSLoss, GradCAPSLoss, ASAPLoss])
+def test_observations_around_may_be_of_another_precision(kind):
+    """They are compared in that of the state, which the policy takes."""
+    loss, batch = kind(linear_base()), transitions(4)
+    batch["frames"] = torch.cat((batch["observation"], batch["observation"]), -1)
+    around = ["frames", ("next", "observation")]
+    wider = batch.copy().update(batch.select(*around).double())
+    terms = []
+    for each in (batch, wider):
+        torch.manual_seed(0)
+        terms.append(loss.policy_regularizer(each))
+    torch.testing.assert_close(*terms, rtol=0.0, atol=0.0)
 
 
 class TestSR2L:

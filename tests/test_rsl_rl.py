@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import os
 import re
 import subprocess
@@ -19,12 +20,15 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss
 
 from torchrl_l2c2 import CATSLoss, L2C2Loss, Neighborhood, NeighborTransform
+from torchrl_l2c2.gains import gradient_shares
 
 rsl = pytest.importorskip("torchrl_l2c2.rsl_rl", reason="needs the extra rsl-rl")
 
 from rsl_rl.algorithms import PPO  # noqa: E402
 from rsl_rl.models import MLPModel, RNNModel  # noqa: E402
 from rsl_rl.storage import RolloutStorage  # noqa: E402
+
+from torchrl_l2c2.rsl_rl.networks import ActorCriticLoss  # noqa: E402
 
 ENVS, STEPS, ACTIONS = 6, 5, 2
 GROUPS = {"actor": ["policy"], "critic": ["policy", "privileged"]}
@@ -317,6 +321,14 @@ def test_final_observations_may_be_none() -> None:
         for extras in ({"final_obs": None}, {})
     )
     assert absent == without
+
+
+def test_beside_no_terms_of_the_loss_shares_of_gradients_are_infinite() -> None:
+    """rsl_rl computes its own terms elsewhere."""
+    ppo = make(rsl.CATSPPO)
+    batch = observations(1).set("next", observations(2))
+    shares = gradient_shares(CATSLoss(ActorCriticLoss(ppo.actor, ppo.critic)), batch)
+    assert shares == {"loss_cats": math.inf}
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ def gradients(place=lambda loss: loss, rows=slice(None)):
     batch = NeighborTransform(Neighborhood(), generator=torch.Generator().manual_seed(0))(batch)
     placed = place(loss)  # Kept: gradients are averaged as long as it is there.
     terms = placed(batch[rows])
-    sum(term for key, term in terms.items() if key.startswith("loss_")).backward()
+    sum(term for key, term in terms.items() if key.startswith("loss")).backward()
     return [parameter.grad for parameter in loss.parameters()]
 
 

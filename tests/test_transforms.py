@@ -253,8 +253,10 @@ def test_deep_copies_have_their_own_generator():
 )
 def test_neighbors_are_refused_to_environments(attach):
     """In an environment there is no successor yet, and the error says where it belongs."""
+    transform = NeighborTransform(NEAR)
     with pytest.raises(ValueError, match="belongs to a replay buffer"):
-        attach(GymEnv("Pendulum-v1"), NeighborTransform(NEAR))
+        attach(GymEnv("Pendulum-v1"), transform)
+    replay(TensorDictReplayBuffer, transform)  # There it still can be put.
 
 
 @pytest.mark.parametrize(
@@ -283,12 +285,25 @@ def test_integer_states_have_no_neighbors():
         ({"in_keys": []}, ValueError, "at least one entry"),
         ({"in_keys": ["distance"]}, ValueError, "none called 'distance'"),
         ({"in_keys": [("distance", "x")]}, ValueError, "none called 'distance'"),
+        ({"out_key": 3}, TypeError, "out_key must be a string or a tuple of strings, got 3"),
+        *(
+            ({"out_key": key}, ValueError, "out_key must be an entry of its own, got .*observa")
+            for key in ("observation", ("next", "observation"), ("observation", "near"))
+        ),
+        ({"out_key": "next"}, ValueError, "an entry of its own, got 'next'"),
     ],
 )
 def test_wrong_settings_of_neighbors(arguments, error, message):
     """Wrong settings are refused at construction."""
     with pytest.raises(error, match=message):
         NeighborTransform(**{"neighborhood": NEAR, **arguments})
+
+
+@pytest.mark.parametrize("key", [("next", "neighbor"), ("observation_near", "by")])
+def test_other_places_are_free(key):
+    """Beside what is read."""
+    data = NeighborTransform(NEAR, out_key=key)(transitions(4))
+    assert data[key].batch_size == data.batch_size
 
 
 def test_a_loss_that_draws_by_itself_refuses_a_reserved_name_too():
@@ -525,6 +540,10 @@ def test_wrong_environments_are_refused(transforms, error, message):
     with pytest.raises(error, match=message):
         for transform in transforms:
             env.append_transform(transform.clone())
+    other = Compose(StepCounter(), refused := transforms[-1].clone())
+    with pytest.raises(error, match=message):
+        TransformedEnv(GymEnv("Pendulum-v1"), other)
+    assert refused.parent is None
 
 
 def test_drawing_and_placing_is_what_forward_does():

@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any
 
 import torch
+from tensordict import NestedKey, unravel_key
 from torch import Tensor
 from torch.compiler import is_compiling
 
 
 def check_positive_int(name: str, value: Any) -> None:
-    """Refuses all but integers of at least 1; ``True`` is not one.
+    """Refuses all but integers of at least 1, also NumPy's; ``True`` is not one.
 
     Raises:
         TypeError: it is not an integer.
         ValueError: it is below 1.
     """
-    if not isinstance(value, int) or isinstance(value, bool):
+    if not isinstance(value, Integral) or isinstance(value, bool):
         raise TypeError(f"{name} must be an integer, got {value!r} ({type(value).__name__}).")
     if value < 1:
         raise ValueError(f"{name} must be at least 1, got {value!r}.")
@@ -119,6 +120,17 @@ def _range(
         return f"in {brackets[0]}{low:.4g}, {high:.4g}{brackets[1]}"
     bound = f"greater than {low:.4g}" if at_least is None else f"at least {low:.4g}"
     return f"finite and {bound}" if finite else bound
+
+
+def read_key(name: str, key: NestedKey) -> NestedKey:
+    """An entry's name, flat.
+
+    Raises:
+        TypeError: it is none; says what it is of.
+    """
+    if isinstance(key, str) or (isinstance(key, tuple) and key):
+        return unravel_key(key)
+    raise TypeError(f"{name} must be a string or a tuple of strings, got {key!r}.")
 
 
 def check_of_each(shape: Sequence[int], batch: Sequence[int]) -> None:

@@ -309,7 +309,8 @@ def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]
             return (None,) * len(parameters)
         return torch.autograd.grad(value, parameters, allow_unused=True, retain_graph=True)
 
-    own = gradients(sum(terms[key] for key in terms.keys() if is_loss(key) and key not in added))
+    losses = (terms[key] for key in terms.keys() if is_loss(key) and key not in added)
+    own = gradients(sum(losses, torch.zeros(())))  # The loss may have none, as rsl_rl's.
     shares = {}
     for key in added:
         pairs = [(g, o) for g, o in zip(gradients(terms[key]), own, strict=True) if g is not None]

@@ -48,6 +48,8 @@ class Squish(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Applies the activation to every element."""
+        if x.dtype.itemsize < 4:  # The square of 256 is infinite in float16.
+            return self.forward(x.float()).to(x.dtype)
         return 0.5 * x * (1.0 + x * torch.rsqrt(x.square() + self.b))
 
     def extra_repr(self) -> str:
@@ -190,6 +192,10 @@ def make_actor(
         check_positive_int("make_actor: the number of actions", action)
         spec = Bounded(low=-1.0, high=1.0, shape=(action,))
     size = _action_size(spec)
+    if not isinstance(scale_mapping, str):
+        raise TypeError(
+            f"make_actor: scale_mapping must be a name, such as 'exp', got {scale_mapping!r}."
+        )
     try:
         extractor = NormalParamExtractor(scale_mapping)
     except (NotImplementedError, ValueError) as error:
@@ -312,9 +318,10 @@ def _action_size(spec: TensorSpec) -> int:
 
 def _bounds(spec: TensorSpec) -> dict[str, Tensor]:
     low, high = spec.space.low, spec.space.high
-    if not (isinstance(spec, Bounded) and low.isfinite().all() and high.isfinite().all()):
+    finite = isinstance(spec, Bounded) and low.isfinite().all() and high.isfinite().all()
+    if not (finite and (low < high).all()):
         raise ValueError(
-            f"make_actor: squashing needs finite bounds of the action, got {spec}: "
-            "use squash='none'."
+            "make_actor: squashing needs finite bounds of the action, the lower below the upper, "
+            f"got {spec}: use squash='none'."
         )
     return {"low": low, "high": high}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from numbers import Integral
 
 import torch
 from torch import Tensor
@@ -273,7 +274,7 @@ def _check_states(state: Tensor, next_state: Tensor, batch_dims: int) -> None:
             f"state and next_state must have the same shape, got {tuple(state.shape)} and "
             f"{tuple(next_state.shape)}."
         )
-    if not isinstance(batch_dims, int) or not 0 <= batch_dims <= state.ndim:
+    if not isinstance(batch_dims, Integral) or not 0 <= batch_dims <= state.ndim:
         raise ValueError(
             f"batch_dims must lie between 0 and {state.ndim} for a state of shape "
             f"{tuple(state.shape)}, got {batch_dims!r}."

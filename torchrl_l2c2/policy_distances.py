@@ -66,6 +66,7 @@ def choose_policy_distance(
                 "hellinger_samples is for policy_distance='hellinger' alone, got policy_distance="
                 f"{chosen!r}: leave hellinger_samples at None."
             )
+        hellinger_samples = int(hellinger_samples)  # NumPy's do not compile.
     if not isinstance(chosen, str) and callable(chosen):
         return functools.partial(_checked, chosen)
     hint = "Or give a function of two distributions."

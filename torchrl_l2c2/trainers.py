@@ -40,12 +40,12 @@ from torchrl_l2c2.updaters import TSoftUpdate
 
 
 def _make_l2c2_loss(
-    base_loss: LossModule, neighbor_key: Any, moved_keys: list[Any] | None = None, **settings: Any
+    base_loss: LossModule, neighbor_key: Any, moved_keys: Any = None, **settings: Any
 ) -> L2C2Loss:
     return L2C2Loss(
         base_loss,
         neighbor_key=_normalize_hydra_key(neighbor_key),
-        moved_keys=_normalize_hydra_keys(moved_keys),
+        moved_keys=_listed(moved_keys),
         **settings,
     )
 
@@ -71,7 +71,7 @@ def _make_of_frames(
 
 
 def _make_neighbor_transform(
-    in_keys: list[Any] | None,
+    in_keys: Any,
     out_key: Any,
     neighborhood: Any = None,
     seed: int | None = None,
@@ -80,7 +80,7 @@ def _make_neighbor_transform(
 ) -> NeighborTransform:
     return NeighborTransform(
         Neighborhood() if neighborhood is None else neighborhood,
-        in_keys=_normalize_hydra_keys(in_keys),
+        in_keys=_listed(in_keys),
         out_key=_normalize_hydra_key(out_key),
         generator=_generator(seed, device),
         **settings,
@@ -88,13 +88,16 @@ def _make_neighbor_transform(
 
 
 def _make_observation_noise(
-    scale: Any, in_keys: list[Any] | None, seed: int | None = None, device: str = "cpu"
+    scale: Any, in_keys: Any, seed: int | None = None, device: str = "cpu"
 ) -> ObservationNoise:
     # A list arrives as OmegaConf's own, which torch does not take.
     scale = list(scale) if isinstance(scale, ListConfig) else scale
-    return ObservationNoise(
-        scale, in_keys=_normalize_hydra_keys(in_keys), generator=_generator(seed, device)
-    )
+    return ObservationNoise(scale, in_keys=_listed(in_keys), generator=_generator(seed, device))
+
+
+def _listed(keys: Any) -> Any:
+    """Names of entries; a string is one, and not its letters."""
+    return keys if isinstance(keys, str) else _normalize_hydra_keys(keys)
 
 
 def _generator(seed: int | None, device: str) -> torch.Generator | None:

@@ -31,7 +31,8 @@ def load_policy(
     """A run's acting policy and a fresh environment of its task, from its folder alone.
 
     The policy is a TorchRL actor: it reads ``"observation"`` and writes ``"action"``, the mean
-    under ``set_exploration_type(ExplorationType.DETERMINISTIC)`` and a sample otherwise.
+    under ``set_exploration_type(ExplorationType.DETERMINISTIC)`` and a sample otherwise. Torch's
+    global generator is left as it was.
 
     Args:
         folder (str or Path): of a run, finished or not.
@@ -80,8 +81,9 @@ def load_policy(
     _check_origin(config.task.env_id, folder)
     noise = config.task.noise_scale if noise_scale is None else noise_scale
     task = replace(config.task, noise_scale=noise)
-    env = make_env(task, config.seed + TEST_SEED if seed is None else seed, render=render)
-    agent = config.make_agent(env)
+    with torch.random.fork_rng(devices=[]):  # Weights are drawn, before they are read.
+        env = make_env(task, config.seed + TEST_SEED if seed is None else seed, render=render)
+        agent = config.make_agent(env)
     saved = folder / ("policy_best.pt" if best else "policy.pt")
     if saved.exists():
         _load_weights(agent.policy, saved)

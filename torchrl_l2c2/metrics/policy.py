@@ -90,18 +90,19 @@ def noise_sensitivity(
     action's unit squared. It grows with the square of the scale where the policy is linear.
 
     Args:
-        policy (callable): observations ``[*B, F]`` to mean actions ``[*B, A]``.
-        observations (Tensor): where it is measured, shape ``[*B, F]``.
+        policy (callable): observations ``[*B, *F]`` to mean actions ``[*B, A]``.
+        observations (Tensor): where it is measured, shape ``[*B, *F]``.
         scale (float): standard deviation of the noise, in the observation's unit, greater than 0.
 
     Keyword Args:
         generator (torch.Generator, optional): of the noise. Default: PyTorch's global one.
 
     Returns:
-        Tensor: a single number.
+        Tensor: a single number, the mean over ``[*B]``.
 
     Raises:
-        ValueError: the scale is not a finite number greater than 0.
+        ValueError: the scale is not a finite number greater than 0, or actions lack their
+            dimension.
 
     Examples:
         >>> import torch
@@ -120,6 +121,13 @@ def noise_sensitivity(
         device=observations.device,
     )
     change = policy(observations + scale * noise) - policy(observations)
+    batch = change.shape[:-1]
+    if (not batch and observations.ndim > 1) or observations.shape[: len(batch)] != batch:
+        raise ValueError(
+            "noise_sensitivity: actions must be [*B, A] of observations [*B, *F], got "
+            f"{tuple(change.shape)} of {tuple(observations.shape)}: give actions of one number a "
+            "last dimension of 1."
+        )
     return 0.5 * change.square().sum(-1).mean()
 
 

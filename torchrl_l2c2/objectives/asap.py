@@ -8,12 +8,10 @@ from typing import Literal
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.envs.utils import set_exploration_type
 from torchrl.objectives import LossModule
 
 from torchrl_l2c2.distances import squared_error
 from torchrl_l2c2.objectives.grad_caps import GradCAPSLoss
-from torchrl_l2c2.objectives.precision import in_full_precision
 from torchrl_l2c2.objectives.wiring import POLICY_NETWORK
 from torchrl_l2c2.policy_distances import policy_mean
 
@@ -116,15 +114,9 @@ class ASAPLoss(GradCAPSLoss):
 
     def _predicted(self, tensordict: TensorDictBase) -> Tensor:
         """The action ``[*B, A]`` that was predicted at the states before."""
-        predictor = self.asap_predictor
-        rows = tensordict.select(*predictor.in_keys, strict=False).detach()
-        rows.update(self.states_around(tensordict)[0])
-        squashed = self.grad_caps_mean == "action"
-        with set_exploration_type(self.deterministic_sampling_mode), in_full_precision(rows):
-            if not self.has_stochastic_policy():
-                return policy_mean(predictor(rows)[self.policy_action()], squashed=squashed)
-            predicted = predictor.build_dist_from_params(predictor.get_dist_params(rows))
-            return policy_mean(predicted, squashed=squashed)
+        before = self.states_around(tensordict)[:1]
+        predicted = self._evaluation.policy_at(self, tensordict, before, "asap_predictor")
+        return policy_mean(predicted, squashed=self.grad_caps_mean == "action").squeeze(0)
 
 
 def _copy_of_policy(loss: LossModule) -> TensorDictModuleBase:

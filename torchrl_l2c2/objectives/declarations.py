@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from torchrl_l2c2._checks import as_number, check_real
 from torchrl_l2c2.objectives.mixin import LossMixin
@@ -35,21 +37,28 @@ class DeclaredTerms(LossMixin):
     policy_terms: frozenset[str] = frozenset()
     auxiliary_terms: frozenset[str] = frozenset()
     added_terms: frozenset[str] = frozenset()
-    _coefficients: frozenset[str] = frozenset()
+    # Their last values; tensors, as they are shared where the gains are.
+    _coefficients: Mapping[str, Tensor] = MappingProxyType({})
     out_keys: list[str]
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name not in self._coefficients:
             super().__setattr__(name, value)
             return
-        value = as_number(name, value)
-        check_real(name, value, at_least=0)
+        try:
+            number = as_number(name, value)
+            check_real(name, number, at_least=0)
+        except (TypeError, ValueError):
+            if value is self._buffers.get(name):  # ``-=`` has written it by now.
+                value.detach_().copy_(self._coefficients[name])
+            raise
         if name not in self._buffers:
             raise ValueError(
                 f"{name} has nothing to scale: this {type(self).__name__} was made without "
                 "the term. Make it with a gain above 0, which can be set to 0 later."
             )
-        self._buffers[name].fill_(value)
+        self._buffers[name].fill_(number)
+        self._coefficients[name].fill_(number)
 
     def declare_terms(
         self,
@@ -101,7 +110,7 @@ class DeclaredTerms(LossMixin):
         """
         value = as_number(name, value)
         check_real(name, value, at_least=0)
-        self._coefficients = self._coefficients | {name}
+        self._coefficients = {**self._coefficients, name: torch.tensor(float(value))}
         if used:
             gain = torch.tensor(float(value), device=self._default_device)
             self.register_buffer(name, gain, persistent=False)

@@ -16,7 +16,7 @@ from torchrl.envs.utils import set_exploration_type
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import _vmap_func
 
-from torchrl_l2c2.objectives.precision import autocast_at, in_full_precision
+from torchrl_l2c2.objectives.precision import as_parameters, autocast_at, in_full_precision
 from torchrl_l2c2.objectives.wiring import POLICY_NETWORK, Wiring, parameters_of, wiring_of
 
 Policy = Distribution | Tensor
@@ -93,11 +93,18 @@ class EvaluatedNetworks:
         return self._policy(loss, here), self._policy(loss, there)
 
     def policy_at(
-        self, loss: LossModule, tensordict: TensorDictBase, states: TensorDictBase
+        self,
+        loss: LossModule,
+        tensordict: TensorDictBase,
+        states: TensorDictBase,
+        network: str = POLICY_NETWORK,
     ) -> Policy:
-        """The policy at other states alone, ``[K, *B]``, by a pass that nothing else shares."""
+        """The policy at other states alone, ``[K, *B]``, by a pass that nothing else shares.
+
+        Or a network that was copied from it, by its name: a regularizer's own.
+        """
         rows = self._rows(POLICY_NETWORK, tensordict, states, with_batch=False)
-        out = self._evaluate(loss, POLICY_NETWORK, rows)
+        out = self._evaluate(loss, network, rows)
         (there,) = _split(out, 0, [len(states)], tensordict)
         return self._policy(loss, there)
 
@@ -218,14 +225,16 @@ class EvaluatedNetworks:
         return rows.flatten(0, 1) if batch else rows
 
     def _evaluate(self, loss: LossModule, network: str, rows: TensorDictBase) -> TensorDictBase:
-        net, wiring = getattr(loss, network), self.wiring[network]
-        rows = rows.select(*net.in_keys, strict=False)
+        net, wiring = getattr(loss, network), self.wiring.get(network)
         params = parameters_of(loss, network)
-        if wiring.has_buffers:
+        parameters = net.parameters() if params is None else params.values(True, True)
+        rows = as_parameters(rows.select(*net.in_keys, strict=False), parameters)
+        if wiring is not None and wiring.has_buffers:
             # Running statistics are the loss's own: spare copies take the update.
             params = TensorDict.from_module(net) if params is None else params
             params = params.apply(lambda p: p if p.requires_grad else p.clone())
-        run = net.get_dist_params if network == POLICY_NETWORK and wiring.stochastic else net
+        policy = wiring is None or network == POLICY_NETWORK  # or a copy of it, which is not wired
+        run = net.get_dist_params if policy and self.wiring[POLICY_NETWORK].stochastic else net
         with set_exploration_type(loss.deterministic_sampling_mode), in_full_precision(rows):
             if params is None:
                 return run(rows)

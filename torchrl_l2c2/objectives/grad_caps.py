@@ -9,7 +9,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from torchrl_l2c2._checks import check_choice, check_real
+from torchrl_l2c2._checks import check_choice, check_real, read_key
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
 from torchrl_l2c2.objectives.transitions import finite_successor
 from torchrl_l2c2.policy_distances import policy_mean
@@ -88,11 +88,14 @@ class GradCAPSLoss(RegularizedLoss):
         check_choice("mean", mean, ("loc", "action"))
         check_real("epsilon", epsilon, above=0)
         self.grad_caps_epsilon, self.grad_caps_mean = float(epsilon), mean
-        self.grad_caps_frames_key, self.grad_caps_previous_key = frames_key, previous_key
+        self.grad_caps_frames_key = read_key("frames_key", frames_key)
+        self.grad_caps_previous_key = previous_key
+        if previous_key is not None:
+            self.grad_caps_previous_key = read_key("previous_key", previous_key)
         self.register_coefficient("grad_caps_lambda_temporal", lambda_temporal)
         self.declare_policy()
         self.declare_terms(policy=["loss_grad_caps"])
-        self.declare_inputs([frames_key if previous_key is None else previous_key])
+        self.declare_inputs([self.grad_caps_previous_key or self.grad_caps_frames_key])
 
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
         terms = super().policy_regularizer(tensordict)
@@ -123,7 +126,7 @@ class GradCAPSLoss(RegularizedLoss):
                 "CatTensors."
             )
         ((key, (state, successor)),) = transitions.items()
-        before = self._before(tensordict, key, state).detach()
+        before = self._before(tensordict, key, state).detach().to(state.dtype)
         states = torch.stack((before, finite_successor(state, successor)))
         return TensorDict({key: states}, batch_size=[2, *tensordict.batch_size])
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.distributions import Categorical
 from torchrl.objectives import DistributionalDQNLoss, LossModule
 
-from torchrl_l2c2._checks import check_choice, check_positive_int, check_real
+from torchrl_l2c2._checks import check_choice, check_positive_int, check_real, read_key
 from torchrl_l2c2.distances import squared_error, squared_hellinger
 from torchrl_l2c2.neighborhood import Neighborhood
 from torchrl_l2c2.objectives.evaluation import at_rows
@@ -21,7 +21,6 @@ from torchrl_l2c2.objectives.neighbors import (
     check_moved,
     draw_rows,
     l2c2_penalty,
-    read_key,
     read_moved_keys,
     read_neighbors,
     warn_of_other_neighbors,
@@ -118,7 +117,8 @@ class L2C2Loss(RegularizedLoss):
             dimensions; ``"kl"`` (:func:`~torchrl_l2c2.policy_distances.kl_divergence`), of the
             policy at :math:`s` from the other, is relative and unbounded. Each wants its own gains.
             A function takes two distributions ``[K, *B]`` and returns ``[K, *B]``; neither it nor
-            ``"kl"`` takes deterministic policies. Defaults to ``"hellinger"``.
+            ``"kl"`` takes deterministic policies. A module's parameters are not the loss's.
+            Defaults to ``"hellinger"``.
         hellinger_samples (int, optional): actions drawn from each policy for the paper's Monte
             Carlo estimate of :math:`d_\pi`, at least 1. Defaults to ``None``, its closed form.
         neighbor_key (NestedKey): the entry that ``NeighborTransform`` writes. Defaults to
@@ -183,10 +183,9 @@ class L2C2Loss(RegularizedLoss):
                 "largest is the mean."
             )
         check_real("fraction", fraction, above=0, at_most=1)
-        self.l2c2_policy_distance = policy_distance
         self._l2c2_distance = choose_policy_distance(policy_distance, hellinger_samples)
         self.l2c2_neighborhood = neighborhood
-        self.l2c2_num_samples = num_samples
+        self.l2c2_num_samples = int(num_samples)
         self.l2c2_over_neighbors: Literal["mean", "max"] = over_neighbors
         self.l2c2_fraction = float(fraction)
         self.l2c2_hellinger_samples = hellinger_samples
@@ -313,13 +312,14 @@ class L2C2Loss(RegularizedLoss):
         return self.reduce_diagnostic(value, tensordict)
 
     def _gain_diagnostics(self, near: Neighbors, tensordict: TensorDictBase) -> dict[str, Tensor]:
-        gain = self.l2c2_coeff * self.l2c2_neighborhood.gain(near.distance)
-        # Of a transition that counts nothing it is infinite.
-        finite = near.distance.masked_fill(near.distance.isinf(), 0.0)
-        return {
-            "l2c2_distance": self._diagnostic(finite, near, tensordict),
-            "l2c2_gain": self._diagnostic(gain, near, tensordict),
-        }
+        def make() -> dict[str, Tensor]:
+            gain = self.l2c2_coeff * self.l2c2_neighborhood.gain(near.distance)
+            # Of a transition that counts nothing it is infinite.
+            finite = near.distance.masked_fill(near.distance.isinf(), 0.0)
+            kinds = {"l2c2_distance": finite, "l2c2_gain": gain}
+            return {k: self._diagnostic(v, near, tensordict) for k, v in kinds.items()}
+
+        return self.made_once("l2c2_gains", make)
 
 
 def _value_term(network: str) -> str:

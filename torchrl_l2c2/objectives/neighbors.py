@@ -9,10 +9,10 @@ from math import isclose
 from typing import Literal, NamedTuple
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
-from torchrl_l2c2._checks import check_of_each
+from torchrl_l2c2._checks import check_of_each, read_key
 from torchrl_l2c2.neighborhood import Neighborhood
 
 
@@ -105,17 +105,6 @@ def read_neighbors(
     return TensorDict(entries, batch_size=distance.shape), distance, drawn
 
 
-def read_key(name: str, key: NestedKey) -> NestedKey:
-    """An entry's name, flat.
-
-    Raises:
-        TypeError: it is none; says what it is of.
-    """
-    if isinstance(key, str) or (isinstance(key, tuple) and key):
-        return unravel_key(key)
-    raise TypeError(f"{name} must be a string or a tuple of strings, got {key!r}.")
-
-
 def read_moved_keys(
     moved_keys: str | Sequence[NestedKey], read: Sequence[NestedKey]
 ) -> list[NestedKey]:
@@ -140,7 +129,10 @@ def read_moved_keys(
         )
     if unread := [key for key in keys if key not in read]:
         there = sorted(set(read), key=str)
-        raise ValueError(f"moved_keys names {unread}, and the networks read {there}.")
+        raise ValueError(
+            f"moved_keys names {unread}, and the networks read {there}; what begins with '_' is "
+            "TorchRL's own and no observation."
+        )
     return keys
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from contextlib import AbstractContextManager, nullcontext
 
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 
 
 def autocast_at(tensordict: TensorDictBase) -> str | None:
@@ -23,3 +25,14 @@ def in_full_precision(tensordict: TensorDictBase) -> AbstractContextManager[obje
     """
     kind = autocast_at(tensordict)
     return nullcontext() if kind is None else torch.autocast(kind, enabled=False)
+
+
+def as_parameters(rows: TensorDictBase, parameters: Iterable[Tensor]) -> TensorDictBase:
+    """Inputs in the precision of the parameters, where autocast would have brought both to one."""
+    if autocast_at(rows) is None:
+        return rows
+    # A list: a generator that is left halfway does not compile.
+    dtypes = [p.dtype for p in parameters if p.is_floating_point()]
+    # Autocast leaves double precision alone, too.
+    wanted = {torch.float16, torch.bfloat16, torch.float32}
+    return rows.apply(lambda v: v.to(dtypes[0]) if dtypes and v.dtype in wanted else v)

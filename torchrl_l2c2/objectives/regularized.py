@@ -35,7 +35,7 @@ class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
     before, and its ``state_dict`` has the keys of the plain loss's (but for networks of a
     regularizer's own: :class:`ASAPLoss`). It holds the networks,
     parameters and buffers of ``loss`` themselves, not copies, and ``loss`` stays the plain loss.
-    From then on, move or cast the regularized one.
+    From then on, move, cast or compile the regularized one.
 
     ``forward`` returns the loss's own terms, unchanged (compiled: to rounding), and the
     regularizer's. Loops that call ``actor_loss`` and ``value_loss`` themselves add
@@ -93,6 +93,7 @@ class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
     """
 
     _inputs: tuple[NestedKey, ...] = ()
+    _evaluation = EvaluatedNetworks()  # Every loss has its own, made with it.
 
     def __new__(cls, base_loss: LossModule, *args: Any, **kwargs: Any) -> RegularizedLoss:
         self = super().__new__(cls, base_loss)
@@ -194,10 +195,6 @@ class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
     def has_stochastic_policy(self) -> bool:
         """Whether the policy, a declared network, is a distribution; otherwise it is an action."""
         return self._evaluation.wiring[POLICY_NETWORK].stochastic
-
-    def policy_action(self) -> NestedKey:
-        """The entry that is the action, where the policy, a declared network, is deterministic."""
-        return self._evaluation.wiring[POLICY_NETWORK].output
 
     def is_ensemble(self, network: str) -> bool:
         """Whether the loss has expanded a network's parameters to those of several."""

@@ -31,8 +31,8 @@ class SpecializedLoss(LossMixin):
         base_loss (LossModule): the loss.
 
     Raises:
-        TypeError: it is no loss, has been wrapped by this class before, or has methods of its own
-            that this class would hide.
+        TypeError: it is no loss, has been wrapped by this class before, or has methods or
+            attributes of its own with names of this class's.
 
     Examples:
         >>> import torch
@@ -75,6 +75,7 @@ class SpecializedLoss(LossMixin):
         specialized = cls if cls._parts else cls.__class_getitem__(type(base_loss))
         if type(base_loss) not in specialized.__mro__:
             raise TypeError(f"{cls.__name__} cannot wrap a {type(base_loss).__name__}.")
+        _check_no_attribute_hides(specialized._parts[0], base_loss)
         self = object.__new__(specialized)
         _adopt(self, base_loss)
         return self
@@ -125,6 +126,18 @@ def _check_no_clash(extension: type[SpecializedLoss], base: type[LossModule]) ->
         )
 
 
+def _check_no_attribute_hides(extension: type, base_loss: LossModule) -> None:
+    """Refuses a loss whose own attributes would take the place of what the class has."""
+    ours = _names(set(extension.__mro__) - set(type(base_loss).__mro__))
+    registries = (getattr(base_loss, name) for name in ("_parameters", "_buffers", "_modules"))
+    theirs = set(vars(base_loss)).union(*registries)
+    if clash := sorted(name for name in ours & theirs if not name.startswith("__")):
+        raise TypeError(
+            f"{extension.__name__} has {clash}, which this {type(base_loss).__name__} has as "
+            "attributes of its own: rename them in the loss."
+        )
+
+
 def _names(classes: set[type]) -> set[str]:
     return {name for cls in classes for name in vars(cls)}
 
@@ -134,6 +147,7 @@ def _adopt(self: SpecializedLoss, base_loss: LossModule) -> None:
     state = self.__dict__
     for name, value in vars(base_loss).items():
         state[name] = copy.copy(value) if name in _REGISTRIES else value
+    state.pop("_compiled_call_impl", None)  # By loss.compile(): a call of the plain loss.
     # Renaming keys here must not rename them there.
     state["_tensor_keys"] = copy.copy(base_loss.tensor_keys)
     if "_value_estimator" in self._modules:

@@ -90,7 +90,7 @@ class SR2LLoss(RegularizedLoss):
     ) -> None:
         check_real("epsilon", epsilon, above=0)
         check_positive_int("steps", steps)
-        self.sr2l_epsilon, self.sr2l_steps = float(epsilon), steps
+        self.sr2l_epsilon, self.sr2l_steps = float(epsilon), int(steps)
         self.register_coefficient("sr2l_coeff", coeff)
         self.declare_policy()
         if policy_distance == "jeffreys":

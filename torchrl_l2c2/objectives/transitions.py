@@ -111,6 +111,11 @@ def find_states(
         TypeError: none of them is floating point.
     """
     keys = list(keys)
+    if not keys:
+        raise TypeError(
+            f"{network} reads no observation to be regularized: actions are none, nor are entries "
+            "whose name begins with '_', which are TorchRL's own. Rename the observation."
+        )
     tensordict = tensordict.select(*keys, strict=False).detach()
     found = {key: tensordict.get(key, None) for key in keys}
     floating = {key: state for key, state in found.items() if _is_floating_point(state)}
@@ -118,14 +123,17 @@ def find_states(
         kinds = {key: getattr(s, "dtype", type(s).__name__) for key, s in found.items()}
         raise TypeError(
             f"{network} needs a floating-point observation among its inputs to be regularized, "
-            f"got {kinds}: cast it in the environment, the collector or the replay buffer. A "
-            "network that reads no observation has nothing to regularize."
+            f"got {kinds}: cast it in the environment, the collector or the replay buffer."
         )
     return floating
 
 
 def finite_successor(state: Tensor, successor: Tensor) -> Tensor:
-    """The successor, with the state's own coordinates where it is not finite, as at some ends."""
+    """The successor, with the state's own coordinates where it is not finite, as at some ends.
+
+    In the state's precision, which the network takes.
+    """
+    successor = successor.to(state.dtype)
     return torch.where(successor.isfinite(), successor, state)
 
 

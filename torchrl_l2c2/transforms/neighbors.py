@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import Tensor
+from torchrl.envs import EnvBase
 
-from torchrl_l2c2._checks import check_positive_int
+from torchrl_l2c2._checks import check_positive_int, read_key
 from torchrl_l2c2.neighborhood import Neighborhood
 from torchrl_l2c2.transforms.random import RandomTransform, listed
 
@@ -97,6 +97,17 @@ def _check_names(keys: Sequence[NestedKey]) -> None:
         )
 
 
+def _check_apart(written: NestedKey, in_keys: Sequence[NestedKey]) -> None:
+    """Refuses to write over what is read, into it, or over what holds it."""
+    read = [key for in_key in in_keys for key in (in_key, unravel_key(("next", in_key)))]
+    paths = [(key,) if isinstance(key, str) else key for key in (written, *read)]
+    if any(all(a == b for a, b in zip(paths[0], path, strict=False)) for path in paths[1:]):
+        raise ValueError(
+            f"out_key must be an entry of its own, got {written!r}, where {read} are read: choose "
+            "another, such as 'neighbor'."
+        )
+
+
 def _transitions(tensordict: TensorDictBase, in_keys: Sequence[NestedKey]) -> Transitions:
     transitions = {}
     for key in in_keys:
@@ -146,10 +157,11 @@ class NeighborTransform(RandomTransform):
             reach transforms: one that prefetches needs a generator here, and a ``prefetch`` of 1.
 
     Raises:
-        TypeError: if ``neighborhood``, ``num_samples`` or ``generator`` is of another type, or, in
-            use, if an entry is not floating point.
-        ValueError: if ``num_samples`` is not positive, a key is reserved, or the transform is
-            appended to an environment, which does not know :math:`s'` when it shows :math:`s`.
+        TypeError: if ``neighborhood``, ``out_key``, ``num_samples`` or ``generator`` is of another
+            type, or, in use, if an entry is not floating point.
+        ValueError: if ``num_samples`` is not positive, a key is reserved, ``out_key`` is among
+            what is read, or the transform is appended to an environment, which does not know
+            :math:`s'` when it shows :math:`s`.
         KeyError: in use, if an entry or its successor is missing.
 
     Examples:
@@ -181,12 +193,13 @@ class NeighborTransform(RandomTransform):
         check_positive_int("num_samples", num_samples)
         super().__init__(
             in_keys=["observation"] if in_keys is None else in_keys,
-            out_keys=[out_key],
+            out_keys=[read_key("out_key", out_key)],
             generator=generator,
         )
         _check_names(self.in_keys)
+        _check_apart(self.out_key, self.in_keys)
         self.neighborhood = neighborhood
-        self.num_samples = num_samples
+        self.num_samples = int(num_samples)
 
     @property
     def out_key(self) -> NestedKey:
@@ -211,13 +224,11 @@ class NeighborTransform(RandomTransform):
         neighbors = _place(tensordict, transitions, self.neighborhood, uniform)
         return tensordict.set(self.out_key, neighbors)
 
-    def set_container(self, container: Any) -> None:
-        super().set_container(container)
-        if self.parent is not None:
-            raise ValueError(
-                "NeighborTransform belongs to a replay buffer, not to an environment: neighbors "
-                "need the successor of the state. Append it to the buffer with append_transform."
-            )
+    def _check_environment(self, env: EnvBase) -> None:
+        raise ValueError(
+            "NeighborTransform belongs to a replay buffer, not to an environment: neighbors need "
+            "the successor of the state. Append it to the buffer with append_transform."
+        )
 
     def __repr__(self) -> str:
         return (

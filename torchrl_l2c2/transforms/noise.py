@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, Unbounded
+from torchrl.envs import EnvBase
 
 from torchrl_l2c2._checks import check_real
 from torchrl_l2c2.transforms.random import RandomTransform, listed
@@ -92,11 +92,9 @@ class ObservationNoise(RandomTransform):
     ) -> TensorDictBase:
         return self._call(tensordict_reset)
 
-    def set_container(self, container: Any) -> None:
-        super().set_container(container)
+    def _check_environment(self, env: EnvBase) -> None:
         # TorchRL works specs out when they are first asked for, which may be after a step.
-        if self.parent is not None:
-            self.transform_observation_spec(self.parent.observation_spec.clone())
+        self.transform_observation_spec(env.observation_spec.clone())
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         for key in self.in_keys:

@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite
-from torchrl.envs import Transform
+from torchrl.envs import EnvBase, Transform
 
 
 class RandomTransform(Transform):
@@ -22,6 +22,19 @@ class RandomTransform(Transform):
             )
         super().__init__(in_keys=in_keys, out_keys=out_keys)
         self.generator = generator
+
+    def set_container(self, container: Any) -> None:
+        super().set_container(container)
+        parent = self.parent
+        if parent is not None:
+            try:
+                self._check_environment(parent)
+            except Exception:
+                self.reset_parent()  # To be put elsewhere.
+                raise
+
+    def _check_environment(self, env: EnvBase) -> None:
+        """Refuses an environment that cannot take the transform."""
 
     def get_extra_state(self) -> Tensor:
         # Not None: some ways of saving take tensors only.
