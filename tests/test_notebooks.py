@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import runpy
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import nbformat
 import pytest
+from jupyter_client import KernelManager
 from nbclient import NotebookClient
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
@@ -25,16 +27,39 @@ def outputs(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
     return [output for cell in notebook.cells for output in cell.get("outputs", [])]
 
 
-def run(notebook: nbformat.NotebookNode, monkeypatch: pytest.MonkeyPatch, timeout: float) -> None:
-    """In a fresh kernel, so many seconds a cell at most; an error of a cell is one here."""
+@pytest.fixture(scope="module")
+def kernel() -> Iterator[KernelManager]:
+    """One for all, as most of what each would do is to import PyTorch."""
+    manager = KernelManager(kernel_name="python3")
+    yield manager
+    if manager.has_kernel:
+        manager.shutdown_kernel(now=True)
+
+
+def run(
+    notebook: nbformat.NotebookNode,
+    monkeypatch: pytest.MonkeyPatch,
+    timeout: float,
+    kernel: KernelManager | None = None,
+) -> None:
+    """So many seconds a cell at most; an error of a cell is one here.
+
+    Without a kernel in a new one.
+    """
     # A backend chosen outside would keep the pictures out of the notebook.
     monkeypatch.delenv("MPLBACKEND", raising=False)
     folder = {"metadata": {"path": str(FOLDER)}}
-    client = NotebookClient(notebook, timeout=timeout, kernel_name="python3", resources=folder)
+    shared = {} if kernel is None else {"km": kernel}
+    client = NotebookClient(
+        notebook, timeout=timeout, kernel_name="python3", resources=folder, **shared
+    )
     # Nobody looks at the widgets, and answering them now and then leaves the client waiting for a
     # kernel that has long finished.
     client.comm_open_handlers = {}
+    # No notebook has the names of another.
+    notebook.cells.insert(0, nbformat.v4.new_code_cell("%reset -f"))
     client.execute()
+    del notebook.cells[0]
 
 
 def pictures(cell: nbformat.NotebookNode) -> int:
@@ -55,25 +80,25 @@ def test_stored_without_outputs(notebook: nbformat.NotebookNode) -> None:
 
 
 def test_what_has_sliders_is_a_picture_first(
-    notebook: nbformat.NotebookNode, monkeypatch: pytest.MonkeyPatch
+    notebook: nbformat.NotebookNode, monkeypatch: pytest.MonkeyPatch, kernel: KernelManager
 ) -> None:
     """In the short form: of cells that say so, the source in their metadata."""
     for cell in notebook.cells:
         cell.source = cell.metadata.get("short", cell.source)
-    run(notebook, monkeypatch, timeout=120)
+    run(notebook, monkeypatch, 120, kernel)
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
     with_sliders = [n for n, cell in enumerate(code) if "interact(" in cell.source][1:]
     assert with_sliders and all(pictures(code[n - 1]) for n in with_sliders)
 
 
 def test_the_pages_of_results_are_shown_with_their_pictures(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, kernel: KernelManager
 ) -> None:
     """As many as the pages name; the other cells are left out."""
     notebook = nbformat.read(FOLDER / "results.ipynb", as_version=4)
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
     notebook.cells = [code[0], code[-1]]
-    run(notebook, monkeypatch, timeout=120)
+    run(notebook, monkeypatch, 120, kernel)
     pages = "".join(page.read_text() for page in (FOLDER.parent / "results").glob("*.md"))
     shown = ["image/svg+xml" in output.get("data", {}) for output in outputs(notebook)]
     assert sum(shown) == pages.count("![") > 0

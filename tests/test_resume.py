@@ -5,10 +5,8 @@ import csv
 import hashlib
 import importlib.metadata
 import json
-import os
 import re
 import signal
-import subprocess
 import sys
 import time
 import warnings
@@ -17,6 +15,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from processes import start_train
 
 from torchrl_l2c2.experiment import (
     AdamConfig,
@@ -496,20 +495,13 @@ def test_an_error_that_there_is_no_room_to_log_is_told(tmp_path):
 
 
 def start(folder, episodes, *extra, log=None):
-    command = [
-        sys.executable, str(ROOT / "train.py"), "compile=false", f"task.episodes={episodes}",
-        "task.max_steps=50", "algorithm.updates=5", "test_episodes=1", "checkpoint_interval=0",
-        f"hydra.run.dir={folder}", *extra,
-    ]  # fmt: skip
-    # Into a file: a pipe that nobody reads is full after some hundred lines of progress.
-    with open(messages(folder.with_name(log or folder.name)), "w") as output:
-        return subprocess.Popen(
-            command,
-            cwd=folder.parent,
-            stdout=output,
-            stderr=output,
-            env={**os.environ, "OMP_NUM_THREADS": "1"},
-        )
+    settings = (
+        "compile=false", f"task.episodes={episodes}", "task.max_steps=50", "algorithm.updates=5",
+        "test_episodes=1", "checkpoint_interval=0", f"hydra.run.dir={folder}", *extra,
+    )  # fmt: skip
+    output = messages(folder.with_name(log or folder.name))
+    output.write_text("")
+    return start_train(*settings, output=output, cwd=folder.parent)
 
 
 def messages(folder):
@@ -540,7 +532,7 @@ def wait_for(condition, process, pause=0.01):
 )
 def test_killed_processes_end_with_the_numbers_of_the_one_that_was_not(tmp_path, kills):
     """SIGKILL between and within episodes, and while a checkpoint is being written."""
-    episodes = 10 * (kills + 2)
+    episodes = 8 * (kills + 1)
     undisturbed = start(tmp_path / "undisturbed", episodes)
     assert undisturbed.wait(600) == 0, messages(tmp_path / "undisturbed").read_text()
     folder = tmp_path / "killed"

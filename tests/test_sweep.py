@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from omegaconf import OmegaConf
+from processes import start_train
 
 from torchrl_l2c2.experiment.checkpoints import list_checkpoints, load_checkpoint
 from torchrl_l2c2.experiment.command import check_launcher, check_sweep
@@ -28,15 +29,9 @@ LAUNCHERS = {"basic": [], "joblib": ["hydra/launcher=joblib", "hydra.launcher.n_
 def start(folder, *overrides, log="said"):
     """The command in a session of its own, as a terminal has one."""
     folder.mkdir(exist_ok=True)
-    # Into a file: a pipe that nobody reads is full after some hundred lines of progress.
-    with open(folder / log, "w") as output:
-        return subprocess.Popen(
-            [sys.executable, ROOT / "train.py", *overrides, *SETTINGS, f"outputs={folder / 'o'}"],
-            stdout=output,
-            stderr=output,
-            start_new_session=True,
-            env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)},
-        )
+    (folder / log).write_text("")
+    settings = (*overrides, *SETTINGS, f"outputs={folder / 'o'}")
+    return start_train(*settings, output=folder / log, session=True)
 
 
 def said(folder, log="said"):

@@ -44,14 +44,16 @@ ALGORITHMS = {
     "PPO, entropy of a normal": replace(FIXED, entropy_coeff=0.01),
     "PPO, normalized": replace(FIXED, normalize_observations=True, normalize_rewards=True),
 }
+# What other forms of L2C2 have is among these.
+RIVALS = ("caps", "cats", "grad_caps", "asap", "sr2l", "lcp")
 METHODS = {
-    **REGULARIZERS,
+    **{name: REGULARIZERS[name] for name in ("none", "l2c2", "l2c2_mean", "l2c2_ramp", *RIVALS)},
     "half of the batch": L2C2Config(fraction=0.5),
     "the worst of four": L2C2Config(num_samples=4, over_neighbors="max"),
     "Tchebycheff": L2C2Config(tchebycheff_mu=0.1),
 }
-PAIRS = [(name, method) for name in ALGORITHMS for method in ("none", "l2c2")]
-PAIRS += [("PPO", method) for method in METHODS if method not in ("none", "l2c2")]
+PAIRS = [(name, "l2c2") for name in ALGORITHMS]
+PAIRS += [("PPO", method) for method in METHODS if method != "l2c2"]
 
 
 def train(algorithm, regularizer, compile):
