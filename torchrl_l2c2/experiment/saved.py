@@ -151,8 +151,7 @@ def differing(saved: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, tup
 
 
 def of_length(config: ExperimentConfig) -> list[str]:
-    """The settings that go by how long a training is to be, so that a longer one's beginning is
-    not a shorter one."""
+    """The settings by which a longer training begins otherwise than a shorter one."""
     gain_of = str(getattr(config.regularizer, "gain_of", None))
     going = {
         f"regularizer.gain_of={gain_of}": gain_of.startswith("test_"),
