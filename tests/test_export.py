@@ -180,7 +180,11 @@ NESTED = OrderedDict(b=ANGLE, a=gymnasium.spaces.Dict(label=gymnasium.spaces.Dis
         (gymnasium.spaces.Box(-9, 9, (2,), np.float64), {}),
         (gymnasium.spaces.Dict(NESTED), {"flatten": True}),
         (gymnasium.spaces.Box(10, 250, (9, 8, 3), np.uint8), {"images": True}),
-        (gymnasium.spaces.Box(0, 255, (3, 9, 8), np.uint8), {"images": True}),
+        pytest.param(
+            gymnasium.spaces.Box(0, 255, (3, 9, 8), np.uint8),
+            {"images": True},
+            marks=pytest.mark.slow,
+        ),
         (gymnasium.spaces.Box(0, 255, (9, 8), np.uint8), {"images": True}),
     ],
     ids=["vector", "nested", "channels last", "channels first", "no channels"],

@@ -776,7 +776,9 @@ class TestPolicyDistances:
         with pytest.raises(TypeError, match=r"nothing is drawn, got hellinger_samples=8"):
             L2C2Loss(base, hellinger_samples=8)
 
-    @pytest.mark.parametrize("distance", ["mean", "mse", "kl"])
+    @pytest.mark.parametrize(
+        "distance", ["mse", *(pytest.param(d, marks=pytest.mark.slow) for d in ("mean", "kl"))]
+    )
     def test_they_compile_into_one_graph(self, distance):
         """With the eager numbers, squashed policies included."""
         torch.manual_seed(0)
@@ -787,7 +789,7 @@ class TestPolicyDistances:
         compiled = torch.compile(loss.policy_regularizer, fullgraph=True, backend="eager")
         torch.testing.assert_close(compiled(batch)["loss_l2c2_actor"], expected)
 
-    @pytest.mark.parametrize("fraction", [1.0, 0.5])
+    @pytest.mark.parametrize("fraction", [pytest.param(1.0, marks=pytest.mark.slow), 0.5])
     def test_with_its_own_neighbors_it_compiles_for_batches_of_any_size(self, fraction):
         """With a dynamic size from the second one on."""
         base = SACLoss(gaussian_actor(), qvalue(), action_spec=BOUNDS)

@@ -262,7 +262,9 @@ def test_a_predictor_beside_the_policy_hides_no_faint_regularizer():
     assert "loss_asap_spatial" in message and "loss_asap_temporal" not in message
 
 
-@pytest.mark.parametrize("name", ["ppo_rpe", "sac", "ppo"])
+@pytest.mark.parametrize(
+    "name", ["ppo", *(pytest.param(name, marks=pytest.mark.slow) for name in ("ppo_rpe", "sac"))]
+)
 def test_looking_for_a_faint_regularizer_changes_no_number(monkeypatch, name):
     """Nor any random stream: every parameter is what it is without."""
 
