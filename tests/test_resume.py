@@ -9,6 +9,7 @@ import re
 import signal
 import sys
 import time
+import types
 import warnings
 from dataclasses import replace
 from functools import partial
@@ -323,6 +324,10 @@ def test_a_run_brings_no_code(tmp_path, monkeypatch, code, run, refused):
     with pytest.raises(ValueError, match="comes with the run" if refused else "Gymnasium"):
         load_policy(tmp_path / run)
     assert (tmp_path / "executed").exists() is not refused
+    # A notebook's own, which is imported and has no specification.
+    monkeypatch.setitem(sys.modules, "pack", types.ModuleType("pack"))
+    with pytest.raises(ValueError, match="Gymnasium"):
+        load_policy(tmp_path / run)
 
 
 def of_other_versions(folder, **changed):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import io
 import math
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -102,9 +103,11 @@ def load_policy(
 def _check_origin(env_id: str, folder: Path) -> None:
     """Refuses a task whose module is in the run's folder, or in a package around it.
 
-    A run's settings may be somebody else's, and importing executes.
+    A run's settings may be somebody else's, and importing executes; not what is imported already,
+    as a script's or a notebook's own task is.
     """
-    name = env_id.rpartition(":")[0].partition(".")[0]
+    module = env_id.rpartition(":")[0]
+    name = "" if module in sys.modules else module.partition(".")[0]
     # Of what is not within another no finder imports anything.
     spec = importlib.util.find_spec(name) if name else None
     places = spec and (spec.submodule_search_locations or filter(None, [spec.origin]))
