@@ -121,7 +121,7 @@ PAPER_TASKS: dict[str, TaskConfig] = {
     "swingup": TaskConfig(max_steps=1000, solved_at=800.0),
     "reacher": TaskConfig("reacher", _bullet("Reacher"), 0.01, 4500, 150, 18.0),
     "hopper": TaskConfig("hopper", _bullet("Hopper"), 0.001, 750, 1000, 2500.0),
-    "ant": TaskConfig("ant", _bullet("Ant"), 0.001, 1500, 1000, 2500.0),
+    "ant": TaskConfig("ant", _bullet("Ant"), 0.001, 750, 1000, 2500.0),
 }
 # Those of the methods after it, without noise; conf/preset/rl_zoo/ says how long they train.
 FIELD_TASKS: dict[str, TaskConfig] = {
