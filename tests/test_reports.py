@@ -55,9 +55,10 @@ from torchrl_l2c2.experiment.reports.measures import measures_table
 from torchrl_l2c2.experiment.reports.page import (
     END,
     START,
-    field_text,
+    START_TABLE,
+    field_results,
     fill,
-    paper_text,
+    paper_results,
     shown_groups,
 )
 from torchrl_l2c2.experiment.reports.pairwise import pairwise_tables
@@ -217,7 +218,7 @@ class TestPaperTable:
         assert plain[3:] == ["15.00 (7.07)", plain[4], "", "0.500 (0.000)", plain[7], ""]
         assert (smooth[3], smooth[6]) == ("20.00 (7.07)", "0.500 (0.141)")
         assert (smooth[5].split()[0], smooth[8].split()[0]) == ("0.75", "0.50")
-        assert deployed_table(groups).markdown() in paper_text(records)
+        assert deployed_table(groups).markdown() in paper_results(records).details
         untested = [replace(record, **dict.fromkeys(figures, math.nan)) for record in records]
         assert deployed_table(group_records(untested)) is None
 
@@ -260,7 +261,7 @@ class TestFasterTargets:
             "L2C2, tau=0.5": ("255.0", "376.0", "1.00 [1.00, 1.00]"),
             "L2C2, beta=0, tau=0.5": ("155.0", "284.0", ""),
         }
-        assert table.markdown() in paper_text(records)
+        assert table.markdown() in paper_results(records).details
         # And Table III is not of them.
         beside = paper_table(group_records(records))
         published = {row[1]: row[4] for row in beside.rows}
@@ -1156,7 +1157,7 @@ def test_the_fields_pages_are_those_of_their_records(name):
     page = ROOT / "results" / f"{name}.md"
     records, text = read_records(page.with_suffix(".csv")), page.read_text()
     first = f"{against_table(records, OURS).markdown()}\n\n" if name == "hopper" else ""
-    assert fill(text, first + field_text(records, f"{name}.svg")) == text
+    assert fill(text, first + field_results(records).text(f"{name}.svg")) == text
     shown = [record for group in field_groups(records) for record in group.records]
     assert f"records {digest(shown)}<" in page.with_suffix(".svg").read_text()
 
@@ -1174,7 +1175,7 @@ def test_the_page_of_one_setting_is_that_of_its_records():
     page = ROOT / "results" / "one_setting.md"
     text, records = page.read_text(), one_setting()
     first = against_table(records, OURS).markdown()
-    assert fill(text, f"{first}\n\n{field_text(records, 'one_setting.svg')}") == text
+    assert fill(text, f"{first}\n\n{field_results(records).text('one_setting.svg')}") == text
 
 
 def test_what_is_said_of_the_rivals_is_of_the_records():
@@ -1339,24 +1340,30 @@ class TestReadme:
         assert headline(label) in (ROOT / "README.md").read_text()
 
     def test_its_results_are_those_of_the_records(self):
-        """python -m torchrl_l2c2.experiment.reports --from results/runs.csv --page README.md"""
+        """And those of the page of all of them, as the command at its top writes both."""
         recorded = read_records(ROOT / "results" / "runs.csv")
-        text = (ROOT / "README.md").read_text()
-        assert fill(text, paper_text(recorded)) == text
+        results, readme = paper_results(recorded), (ROOT / "README.md").read_text()
+        assert fill(readme, results.table, START_TABLE) == readme
+        page = ROOT / "results" / "paper.md"
+        assert fill(page.read_text(), results.text("paper.svg")) == page.read_text()
         shown = [r for group in shown_groups(recorded) for r in group.records]
-        assert f"records {digest(shown)}<" in (ROOT / "docs" / "results.svg").read_text()
+        assert f"records {digest(shown)}<" in page.with_suffix(".svg").read_text()
 
     def test_the_command_fills_it_in(self, records, tmp_path):
-        """Between the marks, whatever stood there; with the picture beside it."""
-        (tmp_path / "docs").mkdir()
-        readme, file = tmp_path / "README.md", tmp_path / "runs.csv"
-        readme.write_text(f"before\n{START}\nold\n{END}\nafter\n")
+        """Between the marks, whatever stood there; details and picture where the mark says so."""
+        readme, page = tmp_path / "README.md", tmp_path / "paper.md"
+        file = tmp_path / "runs.csv"
+        readme.write_text(f"before\n{START_TABLE}\nold\n{END}\nafter\n")
+        page.write_text(f"before\n{START}\nold\n{END}\nafter\n")
         write_records(file, records)
-        main(["--from", str(file), "--page", str(readme)])
-        text = readme.read_text()
-        assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
-        assert "| swingup | L2C2 | 0-4 | 202.0 (1.6)† | 693.8 (123.8) | 232.0 (1.6) |" in text
-        assert (tmp_path / "docs" / "results.svg").exists()
+        main(["--from", str(file), "--page", str(readme), str(page)])
+        texts = [readme.read_text(), page.read_text()]
+        for text in texts:
+            assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
+            assert "| swingup | L2C2 | 0-4 | 202.0 (1.6)† | 693.8 (123.8) | 232.0 (1.6) |" in text
+        assert ["interquartile" in text for text in texts] == [False, True]
+        assert ["](paper.svg)" in text for text in texts] == [False, True]
+        assert [each.name for each in tmp_path.glob("*.svg")] == ["paper.svg"]
         # Where a task has runs as long as it is trained by default, they stand for it.
         usual = replace(records[0], length=f"{TASKS['swingup'].episodes} episodes")
         write_records(file, [*records, usual])
@@ -1381,7 +1388,6 @@ class TestReadme:
 
     def test_results_are_not_lost_for_those_of_other_tasks(self, records, tmp_path):
         """Nothing is written then; what a file of records had before counts too."""
-        (tmp_path / "docs").mkdir()
         readme, file, given = tmp_path / "README.md", tmp_path / "runs.csv", tmp_path / "given.csv"
         before = f"{START}\nold\n{END}\n"
         readme.write_text(before)
@@ -1400,7 +1406,14 @@ class TestReadme:
         with pytest.raises(SystemExit, match="error: none of 1 records"):
             main(command)
         assert readme.read_text() == before and not file.exists()
-        assert not (tmp_path / "docs" / "results.svg").exists()
+        assert not [*tmp_path.glob("*.svg")]
+        # Nor where another page has no marks.
+        other = tmp_path / "other.md"
+        other.write_text("no marks")
+        write_records(given, records)
+        with pytest.raises(SystemExit, match="error: the text must have"):
+            main(["--from", str(given), "--page", str(readme), str(other)])
+        assert readme.read_text() == before
         write_records(file, records)
         main(command)
         assert "| swingup | L2C2 | 0-4 |" in readme.read_text()
@@ -1410,6 +1423,8 @@ class TestReadme:
         """Rather than changed somewhere."""
         with pytest.raises(ValueError, match="once each"):
             fill(f"{END} and {START}", "results")
+        with pytest.raises(ValueError, match=r"must have .* of the table alone"):
+            fill(f"{START_TABLE} and nothing else", "results", START_TABLE)
 
     def test_a_file_that_is_not_there_is_told(self, records, tmp_path):
         """With what it would need."""

@@ -12,7 +12,7 @@ from pathlib import Path
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.reports.against import against_table
 from torchrl_l2c2.experiment.reports.groups import group_records
-from torchrl_l2c2.experiment.reports.page import fill_page
+from torchrl_l2c2.experiment.reports.page import fill_pages
 from torchrl_l2c2.experiment.reports.records import Record, merge, read_records, write_records
 from torchrl_l2c2.experiment.reports.report import write_report
 from torchrl_l2c2.experiment.reports.results import printed_tables
@@ -29,7 +29,7 @@ EXAMPLES = """\
 examples:
   python -m torchrl_l2c2.experiment.reports outputs
   python -m torchrl_l2c2.experiment.reports outputs --csv results/runs.csv
-  python -m torchrl_l2c2.experiment.reports --from results/runs.csv --page README.md
+  python -m torchrl_l2c2.experiment.reports --from results/runs.csv --page results/paper.md
   python -m torchrl_l2c2.experiment.reports outputs --length 200 300 --score
 """
 
@@ -101,8 +101,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     add(
         "--page",
+        nargs="+",
         metavar="FILE",
-        help="make the results between this file's marks anew, of all records of --csv or --from",
+        help="make the results between these files' marks anew, of all records of --csv or --from",
     )
     return parser
 
@@ -117,8 +118,8 @@ def _report(chosen: argparse.Namespace) -> None:
     written = []
     # Before the records, as it may be refused.
     if chosen.page:
-        fill_page(chosen.page, kept, against)
-        written.append(f"results: {chosen.page}")
+        fill_pages(chosen.page, kept, against)
+        written.append(f"results: {', '.join(chosen.page)}")
     if chosen.csv:
         write_records(chosen.csv, kept)
         written.append(f"records: {chosen.csv}")

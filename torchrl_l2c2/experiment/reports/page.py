@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-from torchrl_l2c2.experiment.files import make_folder_of, write_atomically
+from torchrl_l2c2.experiment.files import write_atomically
 from torchrl_l2c2.experiment.reports.choice import choice_table
 from torchrl_l2c2.experiment.reports.comparison import statistics_table
 from torchrl_l2c2.experiment.reports.faster_targets import faster_targets_table
@@ -22,77 +24,105 @@ from torchrl_l2c2.experiment.saved import BUDGETS
 from torchrl_l2c2.experiment.tasks import TASKS
 
 START, END = "<!-- results: start -->", "<!-- results: end -->"
-PICTURE = Path("docs") / "results.svg"
+# In the place of START: the first table alone, without picture and details.
+START_TABLE = "<!-- results: start of the table alone -->"
 
 
-def paper_text(records: Sequence[Record]) -> str | None:
-    """The paper's table with its picture, :data:`PICTURE`, and what it has beside it.
+@dataclass(frozen=True)
+class Results:
+    """What a page has of records.
+
+    Attributes:
+        table (str): the first table.
+        details (tuple of str): what stands beside it.
+        shown (str): what the picture shows.
+        draw (callable): draws the picture into a file.
+    """
+
+    table: str
+    details: tuple[str, ...]
+    shown: str
+    draw: Callable[[Path], None]
+
+    def text(self, picture: str) -> str:
+        """All of it, with a picture of that name."""
+        return "\n\n".join([f"![{self.shown}]({picture})", self.table, *self.details])
+
+
+def paper_results(records: Sequence[Record]) -> Results | None:
+    """The paper's table with its picture, and what it has beside it.
 
     Where a task has runs of its default length and settings, others are not told: they compare
     lengths and readings of the paper. Regularizers' settings may be others.
 
     Returns:
-        str or None: nothing without a record of the paper's tasks with its algorithm.
+        Results or None: nothing without a record of the paper's tasks with its algorithm.
     """
     groups = shown_groups(records)
     table = paper_table(groups)
     if table is None:
         return None
-    picture = f"![Return against action variation of every method]({PICTURE.as_posix()})"
     faster = faster_targets_table([r for r in records if is_as_usual(r, TAU)])
     beside = (deployed_table(groups), statistics_table("late_sampled", groups), faster)
-    more = [each.markdown() for each in beside if each]
-    return "\n\n".join([picture, table.markdown(), *settings_notes(groups), *more])
+    details = (*settings_notes(groups), *(each.markdown() for each in beside if each))
+    return Results(
+        table.markdown(),
+        details,
+        "Return against action variation of every method",
+        partial(draw_plane, groups, "late_sampled"),
+    )
 
 
-def field_text(records: Sequence[Record], picture: str) -> str | None:
-    """The field's table with a picture of that name, and the methods beside one another.
+def field_results(records: Sequence[Record]) -> Results | None:
+    """The field's table with its picture, and the methods beside one another.
 
     Returns:
-        str or None: nothing without a record of a task that has a published row.
+        Results or None: nothing without a record of a task that has a published row.
     """
     table = field_table(records)
     if table is None:
         return None
-    drawn = f"![Return against Sm of every method, beside what was published]({picture})"
-    tables = [table, *filter(None, [choice_table(records)]), *pairwise_tables(records)]
-    return "\n\n".join([drawn, *(each.markdown() for each in tables)])
+    beside = [*filter(None, [choice_table(records)]), *pairwise_tables(records)]
+    return Results(
+        table.markdown(),
+        tuple(each.markdown() for each in beside),
+        "Return against Sm of every method, beside what was published",
+        partial(draw_plane, field_groups(records), "last_mean", measure="sm_asap"),
+    )
 
 
-def fill(text: str, results: str) -> str:
+def fill(text: str, results: str, start: str = START) -> str:
     """A page's text with these results between its marks.
 
     Raises:
         ValueError: the marks are not there, once each and in order.
     """
-    pattern = re.compile(f"{re.escape(START)}.*?{re.escape(END)}", re.S)
-    if (text.count(START), text.count(END), len(pattern.findall(text))) != (1, 1, 1):
-        raise ValueError(f"the text must have {START} and behind it {END}, once each.")
-    made = f"{START}\n{results}\n{END}"
+    pattern = re.compile(f"{re.escape(start)}.*?{re.escape(END)}", re.S)
+    if (text.count(start), text.count(END), len(pattern.findall(text))) != (1, 1, 1):
+        raise ValueError(f"the text must have {start} and behind it {END}, once each.")
+    made = f"{start}\n{results}\n{END}"
     return pattern.sub(lambda _: made, text)
 
 
-def fill_page(path: str | Path, records: Sequence[Record], first: Sequence[Table] = ()) -> None:
-    """Makes a page's results anew, and their picture.
+def fill_pages(
+    paths: Sequence[str | Path], records: Sequence[Record], first: Sequence[Table] = ()
+) -> None:
+    """Makes pages' results anew, and their pictures, of each page's own name beside it.
 
-    The paper's table where there are records of its tasks, with its picture in the ``docs`` folder
-    beside the page; else the field's, with a picture of the page's own name beside it.
+    The paper's results where there are records of its tasks, else the field's; between
+    :data:`START_TABLE` and :data:`END` the first table alone.
 
     Args:
-        path (str or Path): of the page.
-        records (sequence of Record): what it is of.
-        first (sequence of Table): what stands before them.
+        paths (sequence of str or Path): of the pages.
+        records (sequence of Record): what they are of.
+        first (sequence of Table): what stands before the results that are not the table alone.
 
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: as :func:`fill`, or the records give neither table; nothing is written then.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no file {str(path)!r} with {START} and {END} to fill.")
-    picture = path.with_suffix(".svg")
-    of_paper, of_field = paper_text(records), field_text(records, picture.name)
-    results = of_paper or of_field
+    pages = {path: _read_page(path) for path in map(Path, paths)}
+    results = paper_results(records) or field_results(records)
     if results is None:
         tasks = ", ".join(dict.fromkeys(task for task, _ in PAPER))
         raise ValueError(
@@ -100,15 +130,22 @@ def fill_page(path: str | Path, records: Sequence[Record], first: Sequence[Table
             "of the field's table, of which a page's results are: name a file that has some, by "
             "--from or --csv."
         )
-    results = "\n\n".join([*(table.markdown() for table in first), results])
-    text = fill(path.read_text(), results)
-    if of_paper:
-        picture = path.parent / PICTURE
-        make_folder_of(picture)
-        draw_plane(shown_groups(records), "late_sampled", picture)
-    else:
-        draw_plane(field_groups(records), "last_mean", picture, "sm_asap")
-    write_atomically(path, text.encode())
+    filled = {}
+    for path, text in pages.items():
+        whole = results.text(path.with_suffix(".svg").name)
+        whole = "\n\n".join([*(table.markdown() for table in first), whole])
+        brief = START_TABLE in text
+        filled[path] = fill(text, results.table, START_TABLE) if brief else fill(text, whole)
+    for path, text in filled.items():
+        if START_TABLE not in text:
+            results.draw(path.with_suffix(".svg"))
+        write_atomically(path, text.encode())
+
+
+def _read_page(path: Path) -> str:
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no file {str(path)!r} with {START} and {END} to fill.")
+    return path.read_text()
 
 
 def shown_groups(records: Sequence[Record]) -> list[Group]:
