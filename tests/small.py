@@ -17,7 +17,7 @@ from torchrl_l2c2.experiment import (
 from torchrl_l2c2.experiment.config import GROUPS
 
 ALGORITHMS = {
-    "ppo_rpe": PPORPEConfig(hidden=(8,)),
+    "ppo_rpe": PPORPEConfig(hidden=(8,), replay_ratio=2.0),
     "sac": SACConfig(random_frames=10, hidden=(8,)),
     "td3": TD3Config(random_frames=10, hidden=(8,)),
     "ppo": PPOConfig(frames=30, epochs=2, hidden=(8,)),

@@ -14,6 +14,7 @@ from torchrl.envs import GymEnv
 from torchrl_l2c2.experiment import (
     Experiment,
     ExperimentConfig,
+    PPORPEConfig,
     TaskConfig,
     diagnose,
     evaluate,
@@ -30,11 +31,12 @@ from torchrl_l2c2.experiment.regularizers import REGULARIZERS
 LOADS = {evaluate: "load_policy", diagnose: "diagnose_run", video: "play_pictures"}
 
 TASK = TaskConfig("pendulum", "Pendulum-v1", episodes=6, max_steps=40)
+FEW_UPDATES = {"task": TASK, "algorithm": PPORPEConfig(replay_ratio=1.0), "compile": False}
 
 
 def run(folder, **settings):
-    chosen = {"task": TASK, "compile": False, "test_episodes": 2, "checkpoint_interval": 0.0}
-    experiment = Experiment(ExperimentConfig(**chosen | settings), folder)
+    chosen = {"test_episodes": 2, "checkpoint_interval": 0.0} | settings
+    experiment = Experiment(ExperimentConfig(**FEW_UPDATES | chosen), folder)
     experiment.train()
     experiment.finish(experiment.test())
     experiment.close()
@@ -76,7 +78,7 @@ def test_tests_during_training_are_continued_with_the_run(tmp_path):
 def test_a_run_in_another_folder_takes_its_best_policy_along(tmp_path):
     """Even where no later one is better, or tested."""
     run(tmp_path / "old", evaluate_every=2, task=replace(TASK, episodes=2))
-    config = ExperimentConfig(task=TASK, compile=False)
+    config = ExperimentConfig(**FEW_UPDATES)
     Experiment(config, tmp_path / "new", resume=tmp_path / "old").close()
     for name in ("evaluations.json", "policy_best.pt"):
         brought = (tmp_path / "new" / name).read_bytes()
@@ -85,7 +87,7 @@ def test_a_run_in_another_folder_takes_its_best_policy_along(tmp_path):
 
 def test_a_run_without_tests_plays_none():
     """And a test of none is asked for in vain."""
-    experiment = Experiment(ExperimentConfig(task=TASK, compile=False, test_episodes=0))
+    experiment = Experiment(ExperimentConfig(**FEW_UPDATES, test_episodes=0))
     with pytest.raises(ValueError, match="episodes must be at least 1, got 0"):
         experiment.test()
 
@@ -115,7 +117,7 @@ def test_evaluate_plays_as_it_is_told(folder):
 
 def test_without_a_seed_evaluate_plays_the_runs_own_test(folder):
     """Its samples, too."""
-    own = Experiment(ExperimentConfig(task=TASK, compile=False), resume=folder)
+    own = Experiment(ExperimentConfig(**FEW_UPDATES), resume=folder)
     for arguments, sampled in (([], False), (["--sampled"], True)):
         returns = own.test(3, sampled=sampled).returns
         assert evaluated(folder, *arguments)["episodes"]["returns"] == returns

@@ -380,7 +380,7 @@ def run(tmp_path_factory):
 def trained(folder, env_id="Pendulum-v1"):
     config = ExperimentConfig(
         task=TaskConfig("task", env_id, episodes=4, max_steps=40, noise_scale=0.05),
-        algorithm=PPORPEConfig(hidden=(8,)),
+        algorithm=PPORPEConfig(hidden=(8,), replay_ratio=2.0),
         regularizer=L2C2Config(sigma=0.5),
         compile=False,
         late_share=0.0,
@@ -419,7 +419,8 @@ class TestRun:
         for target in (0.01, 1.0):
             regularizer = L2C2Config(gain="gradient", gain_target=target)
             task = TaskConfig("pendulum", "Pendulum-v1", episodes=3, max_steps=60)
-            config = ExperimentConfig(task=task, regularizer=regularizer, compile=False)
+            few = PPORPEConfig(hidden=(8,), replay_ratio=2.0)
+            config = ExperimentConfig(task, few, regularizer, compile=False)
             experiment = Experiment(config, tmp_path / str(target))
             experiment.train()
             experiment.finish(experiment.test(1))

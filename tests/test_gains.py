@@ -171,7 +171,7 @@ def small(regularizer=None, **settings):
     return ExperimentConfig(
         **{
             "task": TASK,
-            "algorithm": PPORPEConfig(hidden=(8,)),
+            "algorithm": PPORPEConfig(hidden=(8,), replay_ratio=2.0),
             "regularizer": regularizer or L2C2Config(),
             "replay": UniformReplayConfig(batch_size=8),
             "optimizer": AdamConfig(),

@@ -21,6 +21,7 @@ from torchrl_l2c2.experiment import (
     ExperimentConfig,
     L2C2Config,
     NoRegularizerConfig,
+    PPORPEConfig,
     SACConfig,
     TaskConfig,
     TD3Config,
@@ -238,7 +239,7 @@ def many_updates(name, regularizer):
     algorithm = replace(ALGORITHMS[name], **({"epochs": 15} if name == "ppo" else {}))
     task = replace(PENDULUM, episodes=3)
     if name == "ppo_rpe":
-        algorithm = replace(algorithm, updates=40)
+        algorithm = PPORPEConfig(hidden=(8,), updates=40)
     return make(name, task=task, algorithm=algorithm, regularizer=regularizer)
 
 
