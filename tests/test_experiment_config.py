@@ -218,7 +218,16 @@ def test_baselines_settings_of_hopper_are_those_of_stable_baselines_normalized()
     assert [getattr(config, name) for name in tests] == [getattr(zoo, name) for name in tests]
 
 
-@pytest.mark.parametrize("preset", ["rl_zoo", "baselines"])
+@pytest.mark.parametrize(("task", "algorithm"), ZOO)
+def test_the_fields_table_has_the_zoos_settings_where_these_learn(task, algorithm):
+    """And Baselines' where they stand still."""
+    chosen = [f"task={task}", f"algorithm={algorithm}"]
+    stands = (task, algorithm) == ("hopper_v5", "ppo")
+    expected = composed(f"preset={'baselines' if stands else 'rl_zoo'}", *chosen)
+    assert composed("experiment=field_table", *chosen) == expected
+
+
+@pytest.mark.parametrize("preset", ["rl_zoo", "baselines", "field"])
 def test_a_preset_without_settings_of_a_task_is_refused(preset):
     """And not left at the defaults."""
     with pytest.raises(SettingError, match="preset must have settings of task=swingup with algo"):

@@ -30,6 +30,9 @@ PACKAGE = Path(__file__).parents[1]
 # Beside the package in a clone, within it when installed.
 CONF = next(folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if folder.is_dir())
 
+# What a method is chosen by.
+ALSO_CALLED = {"method": "regularizer", "loss": "regularizer"}
+
 
 def register() -> None:
     """Gives Hydra every choice of every group, from the settings' own defaults.
@@ -158,6 +161,8 @@ def unknown_setting(name: str) -> str:
         'algorithm.num_envs is a setting of algorithm=ppo alone.'
         >>> unknown_setting("sigma")
         'sigma is not a setting; did you mean regularizer.sigma? --help lists every setting.'
+        >>> unknown_setting("methods")
+        'methods is not a setting; did you mean regularizer? --help lists every setting.'
     """
     group, _, setting = name.partition(".")
     settings = {
@@ -170,6 +175,7 @@ def unknown_setting(name: str) -> str:
     known = {*STEERING, *(field.name for field in dataclasses.fields(ExperimentConfig))}
     known |= {f"{of[0]}.{each}" for of, names in settings.items() for each in names}
     near = sorted(each for each in known if each.endswith(f".{name}"))
+    near = near or [ALSO_CALLED[each] for each in [name.removesuffix("s")] if each in ALSO_CALLED]
     near = near or get_close_matches(name, sorted(known), 1)
     meant = f"; did you mean {near[0]}?" if near else "."
     return f"{name} is not a setting{meant} --help lists every setting."
