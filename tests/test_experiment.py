@@ -604,7 +604,8 @@ def test_in_a_sweep_a_failed_job_is_told_and_the_others_go_on(tmp_path):
     assert "sigma must be greater than 0, got -1" in failed.stderr
     (run,) = read_runs(tmp_path)
     written = (run.folder / "evaluation.json").stat().st_mtime_ns
-    run_train(*overrides, folder=tmp_path, check=False)
+    again = run_train(*overrides, folder=tmp_path, check=False)
+    assert "sigma must be greater than 0, got -1" in again.stderr  # What failed is tried again.
     assert (run.folder / "evaluation.json").stat().st_mtime_ns == written
 
 

@@ -1060,7 +1060,7 @@ class TestReport:
         main(["--from", file])
         assert capsys.readouterr().out.strip() == tables
         main(["--from", file, "--score"])
-        assert capsys.readouterr().out.count("| reacher | task.episodes=20 | 0-4 |") == 2
+        assert capsys.readouterr().out.count("| reacher | the defaults | 20 episodes | 0-4 |") == 2
         assert not (forty / "report").exists()
         parts = [str(tmp_path / f"{task}.csv") for task in ("swingup", "reacher")]
         for part in parts:
@@ -1083,10 +1083,10 @@ class TestReport:
         main([swingup, "--length", "20", "10", "--score"])
         scores = [line.split(" | ") for line in capsys.readouterr().out.splitlines()]
         # Those that were trained for 20 have all of their figures.
-        assert [(row[1], row[4]) for row in scores if row[0] == "| swingup"] == [
-            ("task.episodes=10", "sampled actions"),
-            ("task.episodes=20", "mean actions"),
-            ("task.episodes=20", "sampled actions"),
+        assert [(row[2], row[5]) for row in scores if row[0] == "| swingup"] == [
+            ("10 episodes", "sampled actions"),
+            ("20 episodes", "mean actions"),
+            ("20 episodes", "sampled actions"),
         ]
         main([swingup, "--length", "10", "30", "--output", str(tmp_path)])
         printed = capsys.readouterr().out

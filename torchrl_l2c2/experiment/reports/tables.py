@@ -19,6 +19,7 @@ from torchrl_l2c2.experiment.reports.names import method_name
 from torchrl_l2c2.experiment.reports.records import QUANTITIES, TESTS, Record
 from torchrl_l2c2.experiment.reports.score import COMPARED, Reading
 from torchrl_l2c2.experiment.reports.statistics import mean_and_deviation
+from torchrl_l2c2.experiment.saved import BUDGETS
 
 LEGEND = (
     "Means over seeds, standard deviations over seeds in brackets. "
@@ -139,13 +140,15 @@ def runs_table(records: Sequence[Record]) -> Table:
 
 def score_table(readings: Sequence[Reading]) -> Table:
     """The score of every reading, by late policies with mean and with sampled actions."""
-    columns = ["task", "reading", "seeds", "updates", "actions", "score"]
+    columns = ["task", "reading", "length", "seeds", "updates", "actions", "score"]
     columns += [
         f"{method_name(method)}: {name}" for method in COMPARED for name in QUANTITIES.values()
     ]
     rows = []
     for reading in readings:
         first = reading.vanilla.first
+        others = {k: v for k, v in first.other_settings.items() if k not in BUDGETS}
+        named = " ".join(f"{name}={value}" for name, value in others.items()) or "the defaults"
         seeds = list(dict.fromkeys(number_range(g.seeds) for g in (reading.vanilla, reading.caps)))
         for test in ("late_mean", "late_sampled"):
             cells = reading.cells(test)
@@ -153,7 +156,7 @@ def score_table(readings: Sequence[Reading]) -> Table:
                 continue
             rows.append(
                 [
-                    *(first.task, first.differences or "the defaults", "; ".join(seeds)),
+                    *(first.task, named, first.length, "; ".join(seeds)),
                     *(f"{reading.updates:.0f}", TESTS[test].split(", ")[1]),
                     or_dash(reading.score(test), ".2f"),
                     *(or_dash(cells[m, q], ".2f") for m in COMPARED for q in QUANTITIES),
