@@ -32,7 +32,7 @@ def folder(tmp_path):
 def test_a_row_has_what_was_asked_for_what_came_and_what_it_cost(folder):
     """Late policies with samples: .045 of .05 is a tenth less; the last one's mean is 20 more."""
     table = gain_targets_table([run.record for run in read_runs(folder)])
-    assert table.columns[4:7] == ["asked for", "followed", "off by"]
+    assert table.columns[4:7] == ["target", "followed", "off by"]
     assert [row[2:7] for row in table.rows] == [
         ["L2C2, gain_target=0.02", "0", "0.020", "0.020", "+0%"],
         ["L2C2, gain_target=0.05", "0, 1", "0.050", "0.045 (0.007)", "-10%"],
@@ -55,6 +55,6 @@ def test_without_such_a_gain_there_is_no_table(folder):
 def test_the_end_of_a_sweep_and_a_report_tell_it(folder, capsys):
     """Whoever asks for an action variation sees whether it came."""
     main([str(folder), "--output", str(folder / "report")])
-    title = "**Action variations that were asked for**"
+    title = "**Targets of the action variation**"
     assert title in capsys.readouterr().out
     assert title in (folder / "report" / "report.md").read_text()

@@ -11,10 +11,10 @@ from torchrl_l2c2.experiment.reports.records import Record
 from torchrl_l2c2.experiment.reports.tables import Table, number, number_range, of_runs
 
 LEGEND = (
-    "Means over seeds of the last policy's test episodes with its mean actions. P: how probable it "
-    "is that a run of {name} is better than one of the other method, of all pairs of runs, ties "
-    "halved, with the 95% interval of the stratified bootstrap; one that holds .50 does not tell "
-    "the two apart."
+    "Means over seeds of the last policy's test episodes, with its mean actions. P: the "
+    "probability that a run of {name} is better than a run of the other method (all pairs of "
+    "runs, ties count half), with its 95% interval of the stratified bootstrap; an interval that "
+    "contains .50 does not separate the two."
 )
 
 

@@ -15,11 +15,12 @@ from torchrl_l2c2.experiment.reports.records import Record
 from torchrl_l2c2.experiment.reports.tables import Table, number_range, or_dash
 
 LEGEND = (
-    "Beside vanilla's runs of the same seeds and other settings, smoothest first; tests of the "
-    "last policy with its mean actions. Return: the difference of the means over seeds, in parts "
-    "of vanilla's size, mean over tasks. Sm: the ratio of the means over seeds, geometric mean "
-    "over tasks; 1 is no smoother. P: how probable it is that a run is better than one of vanilla, "
-    "of all pairs of runs, ties halved, mean over tasks."
+    "Compared with vanilla's runs of the same seeds and other settings, smoothest first; the "
+    "last policy's test episodes, with its mean actions. Return: the difference of the means "
+    "over seeds, relative to the size of vanilla's, averaged over tasks. Sm: the ratio of the "
+    "means over seeds, geometric mean over tasks; 1 is no smoother. P: the probability that a "
+    "run is better than a run of vanilla (all pairs of runs, ties count half), averaged over "
+    "tasks."
 )
 
 

@@ -119,9 +119,9 @@ def statistics_table(test: str, groups: Sequence[Group]) -> Table:
     rows = [_statistics_row(test, group, baseline_of(group, groups)) for group in groups]
     rows += _across_tasks(test, groups)
     notes = [
-        "95% intervals of the stratified bootstrap in brackets (Agarwal et al. 2021). "
-        "P: how probable it is that a run is better than one of vanilla with the same other "
-        "settings, ties halved."
+        "95% intervals of the stratified bootstrap in brackets (Agarwal et al. 2021). P: the "
+        "probability that a run is better than a run of vanilla with the same other settings "
+        "(ties count half)."
     ]
     return Table(f"Statistics: {TESTS[test]}", columns, rows, notes)
 

@@ -13,10 +13,10 @@ from torchrl_l2c2.experiment.reports.tables import Table, number, number_range, 
 
 TASK, WITHOUT = "swingup", "l2c2_policy"
 LEGEND = (
-    "Means, standard deviations over seeds in brackets, of late policies with sampled actions, and "
-    "of the last policy; of tau .5 the paper has the returns alone. P: how probable it is that a "
-    "run of L2C2 returns more than one without the value term (beta=0) at the same tau, ties "
-    "halved, with the 95% interval of the stratified bootstrap."
+    "Means over seeds, standard deviations in brackets, of the late policies with sampled "
+    "actions, and of the last policy; for tau .5 the paper has the returns alone. P: the "
+    "probability that a run of L2C2 returns more than a run without the value term (beta=0) at "
+    "the same tau (ties count half), with its 95% interval of the stratified bootstrap."
 )
 
 

@@ -57,13 +57,13 @@ FIELD_MEASURES = {"return": "return", "sm_asap": "Sm", "action_variation": "acti
 # How probable a method's run is better by each than one of vanilla.
 BETTER = {"return": "P(returns more)", "sm_asap": "P(smaller Sm)"}
 LEGEND = (
-    "Means over seeds of the last policy's test episodes with its mean actions, 95% intervals of "
-    "the bootstrap over seeds in brackets. Sm as the published one: `(2 / N) sum_i f_i |FFT_i|` at "
-    "one action per unit of time, the mean over the action's dimensions; it grows with the length "
-    "N of an episode, the action variation does not. P: how probable it is that a run is better "
-    "than one of vanilla with the same other settings, ties halved. Published: CATS (arXiv "
-    "2610.07910), ten seeds by ten episodes; its L2C2 is that of ASAP's code, which does not "
-    "follow the paper's equations."
+    "Means over seeds of the last policy's test episodes, with its mean actions; 95% intervals "
+    "of the bootstrap over seeds in brackets. Sm as in the published table: `(2 / N) sum_i f_i "
+    "|FFT_i|` at one action per unit of time, averaged over the action's dimensions; unlike the "
+    "action variation it grows with the length N of an episode. P: the probability that a run is "
+    "better than a run of vanilla with the same other settings (ties count half). Published: "
+    "CATS (arXiv 2610.07910), ten seeds by ten episodes; its L2C2 is that of ASAP's code, which "
+    "does not follow the paper's equations."
 )
 
 

@@ -1,4 +1,4 @@
-"""Gains that follow a target: what was asked for, what came of it, and what it cost."""
+"""Gains that follow a target: the target, what came of it, and what it cost."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from torchrl_l2c2.experiment.reports.tables import Table, number, number_range, 
 # A target is followed in training's own episodes, and is to hold of a policy that is deployed.
 FOLLOWED, DEPLOYED = "late_sampled", "last_mean"
 LEGEND = (
-    "Means over seeds, standard deviations over seeds in brackets. Followed: of training's own "
-    "episodes, with sampled actions, in its last tenth or late_share, by which the gain was set; "
-    "off by: the mean's distance from what was asked for, in parts of that. Then the test of the "
-    "last policy with its mean actions. Below the runs that were asked for something those of "
-    "vanilla with the same other settings."
+    "Means over seeds, standard deviations in brackets. Followed: the action variation of "
+    "training's own episodes, with sampled actions, in its last tenth or late_share, by which "
+    "the gain was set; off by: the distance of its mean from the target, relative to the target. "
+    "Then the last policy's test, with its mean actions. Below the runs with a target are those "
+    "of vanilla with the same other settings."
 )
 
 
@@ -43,9 +43,9 @@ def gain_targets_table(records: Sequence[Record]) -> Table | None:
         for together in by_task(named)
         for group in sorted(together, key=lambda group: group.first.method == "none")
     ]
-    columns = ["task", "algorithm", "method", "seeds", "asked for", "followed", "off by", "return"]
+    columns = ["task", "algorithm", "method", "seeds", "target", "followed", "off by", "return"]
     columns += ["policy scale", "last policy: action variation", "return"]
-    return Table("Action variations that were asked for", columns, rows, [LEGEND])
+    return Table("Targets of the action variation", columns, rows, [LEGEND])
 
 
 def _asked(record: Record) -> float | None:

@@ -14,9 +14,9 @@ from torchrl_l2c2.experiment.reports.tables import Table, of_runs
 
 MOST = 12  # Methods of a table: more are what a search tried, and are told by their plane.
 LEGEND = (
-    "How probable it is that a run of the row is better than one of the column, of all pairs of "
-    "runs on a task, ties halved, mean over tasks; 95% intervals of the stratified bootstrap in "
-    "brackets. An interval that holds .50 does not tell the two apart."
+    "The probability that a run of the row is better than a run of the column (all pairs of runs "
+    "on a task, ties count half), averaged over tasks; 95% intervals of the stratified bootstrap "
+    "in brackets. An interval that contains .50 does not separate the two."
 )
 
 

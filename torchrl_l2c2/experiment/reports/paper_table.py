@@ -15,19 +15,20 @@ from torchrl_l2c2.experiment.reports.records import QUANTITIES
 from torchrl_l2c2.experiment.reports.tables import Table, number, number_range, pooled
 
 LEGEND = (
-    "Means, standard deviations over seeds in brackets; the paper's are of 18 seeds. Actions are "
-    "sampled, as in training, and the action variation is that of the policy's mean: smaller is "
-    "smoother. The first column of each is of the late policies, training's own episodes of its "
-    "last tenth or late_share, marked † where it lies further from the paper's than the paper's "
-    "deviation, and P of the same: how probable it is that a run is better than one of vanilla "
-    "with the same other settings, ties halved, with the 95% interval of the stratified bootstrap; "
-    "of several tasks it is the mean of theirs. "
-    "The policy scale is that of the late policies; the Hellinger distance is relative to it, so "
-    "that a wider policy may change more."
+    "Means over seeds, standard deviations in brackets; the paper's are over 18 seeds. Actions "
+    "are sampled, as in training; the action variation is that of the policy's mean, smaller is "
+    "smoother. The first column of each is of the late policies (training's own episodes in its "
+    "last tenth or late_share); † marks means further from the paper's than the paper's "
+    "deviation. P is of the same: the probability that a run is better than a run of vanilla "
+    "with the same other settings (ties count half), with its 95% interval of the stratified "
+    "bootstrap; over several tasks it is the mean of theirs. The policy scale is that of the "
+    "late policies: the Hellinger distance is relative to it, so that a wider policy may change "
+    "more."
 )
 DEPLOYED_LEGEND = (
-    "The same runs with mean actions, as a policy is used once it is trained: late policies, a "
-    "test episode of each, and those of the last policy (100 by default). P is of late policies."
+    "The same runs with mean actions, as a trained policy is used: the late policies in a test "
+    "episode each, and the last policy in its test episodes (100 by default). P is of the late "
+    "policies."
 )
 # Late policies in the first column, as they are steadier than the paper's test of the last one.
 FIRST, SECOND = "late_sampled", "last_sampled"
