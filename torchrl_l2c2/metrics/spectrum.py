@@ -110,28 +110,26 @@ def spectral_smoothness(actions: Tensor, form: Literal["caps", "asap"] = "caps")
     return (amplitudes * weights.unsqueeze(-1)).mean((-2, -1))
 
 
-def roughness(actions: Tensor, sampling_rate: float = 1.0) -> Tensor:
+def roughness(actions: Tensor) -> Tensor:
     r"""The mean frequency of an episode's actions, weighted by amplitude, as a share of the rate.
 
     .. math::
-        \frac{\sum_{i \ge 1} M_i f_i}{f_s \sum_{i \ge 1} M_i}
+        \frac{\sum_{i \ge 1} M_i f_i}{\sum_{i \ge 1} M_i}
 
-    with :math:`M_i` and :math:`f_i` of :func:`amplitude_spectrum`, up to half the rate; the mean
-    over the action's dimensions. Between 0 and .5: white noise has .25, an action that flips from
-    step to step .5, whatever the amplitude and nearly whatever the length. It says how fast an
-    action moves and not how much. The constant part is left out.
+    with :math:`M_i` and :math:`f_i` of :func:`amplitude_spectrum` at a rate of 1; the mean over the
+    action's dimensions. Between 0 and .5: white noise has .25, an action that flips from step to
+    step .5, whatever the amplitude and nearly whatever the length. It says how fast an action moves
+    and not how much. The constant part is left out.
 
     Args:
         actions (Tensor): of whole episodes, shape ``[*B, T, A]`` with at least four steps.
-        sampling_rate (float): actions per second, greater than 0; the result is the same for each.
-            Default 1.
 
     Returns:
         Tensor: of each episode, shape ``[*B]``; NaN where a dimension never changes.
 
     Raises:
         TypeError: the actions are no floating-point tensor.
-        ValueError: an episode has fewer than four steps, or the rate is not greater than 0.
+        ValueError: an episode has fewer than four steps.
 
     Examples:
         >>> import torch
@@ -145,6 +143,6 @@ def roughness(actions: Tensor, sampling_rate: float = 1.0) -> Tensor:
     check_episodes("roughness", actions, 4)
     # The constant part is taken off first: its rounding errors would move where nothing does.
     moved = actions - actions[..., :1, :]
-    frequencies, amplitudes = amplitude_spectrum(moved, sampling_rate)
+    frequencies, amplitudes = amplitude_spectrum(moved)
     moving, weights = amplitudes[..., 1:, :], frequencies[1:].unsqueeze(-1)
-    return ((moving * weights).sum(-2) / (sampling_rate * moving.sum(-2))).mean(-1)
+    return ((moving * weights).sum(-2) / moving.sum(-2)).mean(-1)
