@@ -55,8 +55,10 @@ def amplitude_spectrum(actions: Tensor, sampling_rate: float = 1.0) -> tuple[Ten
     amplitudes[..., 0, :] /= 2.0
     if steps % 2 == 0:
         amplitudes[..., -1, :] /= 2.0
-    frequencies = torch.arange(steps // 2 + 1, dtype=actions.dtype, device=actions.device)
-    return frequencies * sampling_rate / steps, amplitudes
+    frequencies = torch.fft.rfftfreq(
+        steps, 1.0 / sampling_rate, dtype=actions.dtype, device=actions.device
+    )
+    return frequencies, amplitudes
 
 
 def spectral_smoothness(actions: Tensor, form: Literal["caps", "asap"] = "caps") -> Tensor:
