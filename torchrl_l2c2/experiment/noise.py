@@ -27,12 +27,12 @@ from torchrl_l2c2.experiment.frames import check_finite
 from torchrl_l2c2.experiment.naming import plain
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.reports import FinishedRun, find_runs
-from torchrl_l2c2.experiment.reports.comparison import Estimate
+from torchrl_l2c2.experiment.reports.comparison import Estimate, estimate_cell
 from torchrl_l2c2.experiment.reports.field import FIELD_MEASURES
 from torchrl_l2c2.experiment.reports.figures import finish, styles, subplots
 from torchrl_l2c2.experiment.reports.groups import Group, group_records
 from torchrl_l2c2.experiment.reports.statistics import mean
-from torchrl_l2c2.experiment.reports.tables import Table, number, number_range
+from torchrl_l2c2.experiment.reports.tables import Table, number_range
 from torchrl_l2c2.experiment.trained import load_policy
 from torchrl_l2c2.transforms import ObservationNoise
 
@@ -123,7 +123,10 @@ def noise_table(played: Sequence[Played]) -> Table:
     rows = [
         [
             *(group.first.task, group.first.algorithm, group.name, number_range(group.seeds), name),
-            *(_cell(group, summaries, level, quantity) for level in levels),
+            *(
+                estimate_cell(_estimate(group, summaries, level, quantity), quantity)
+                for level in levels
+            ),
         ]
         for group in groups
         for quantity, name in FIELD_MEASURES.items()
@@ -236,13 +239,6 @@ def _estimate(group: Group, summaries: Summaries, level: float, quantity: str) -
     found = [summaries[record.identity][level].get(name, np.nan) for record in group.records]
     values = [value for value in found if not np.isnan(value)]
     return Estimate.of(mean, np.array(values).reshape(-1, 1))
-
-
-def _cell(group: Group, summaries: Summaries, level: float, quantity: str) -> str:
-    estimate = _estimate(group, summaries, level, quantity)
-    if estimate is None:
-        return "-"
-    return estimate.text(partial(number, quantity=quantity, beside=estimate.value))
 
 
 def _levels(text: str) -> list[float]:
