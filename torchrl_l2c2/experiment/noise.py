@@ -84,7 +84,8 @@ def play_with_noise(
 ) -> list[Played]:
     """Plays the policies of runs at every level of noise, which is the same for all of a task.
 
-    Each run has its own test's seed, at every level: without noise it plays its test again.
+    Each run has its own test's seed, at every level: at level 0 it plays its test again, where the
+    task has no noise of its own.
 
     Args:
         runs (sequence of FinishedRun): of any tasks.
