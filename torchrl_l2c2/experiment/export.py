@@ -310,7 +310,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
     parser.add_argument(
         "--episodes", type=int, default=1, help="played to compare the policies (default: 1)"
     )
-    chosen = parser.parse_args(None if arguments is None else list(arguments))
+    chosen = parser.parse_args(arguments)
     if chosen.episodes < 1:
         parser.error(f"--episodes must be at least 1, got {chosen.episodes}")
     with told_in_a_line():

@@ -263,7 +263,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
     )
     add("--episodes", type=int, default=10, help="of each run at each level (default: 10)")
     add("--output", metavar="FOLDER", help="of the files (default: noise/ in the first folder)")
-    chosen = parser.parse_args(None if arguments is None else list(arguments))
+    chosen = parser.parse_args(arguments)
     with told_in_a_line():
         found = find_runs(chosen.folders, required=True)
         played = play_with_noise(found.runs, chosen.levels, episodes=chosen.episodes, progress=True)

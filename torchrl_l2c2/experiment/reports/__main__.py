@@ -37,7 +37,7 @@ examples:
 def main(arguments: Iterable[str] | None = None) -> None:
     """Does what the command line says; an error is one line."""
     parser = _parser()
-    chosen = parser.parse_args(None if arguments is None else list(arguments))
+    chosen = parser.parse_args(arguments)
     if bool(chosen.folders) == bool(chosen.records):
         parser.error("name folders of runs, or files of records with --from")
     if chosen.records and chosen.length:
