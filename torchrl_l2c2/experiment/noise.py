@@ -243,7 +243,11 @@ def _estimate(group: Group, summaries: Summaries, level: float, quantity: str) -
 
 
 def _levels(text: str) -> list[float]:
-    return [float(part) for part in text.split(",")]
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        told = f"must be numbers with commas between them, such as 0,0.1, got {text!r}"
+        raise argparse.ArgumentTypeError(told) from None
 
 
 def main(arguments: Iterable[str] | None = None) -> None:
