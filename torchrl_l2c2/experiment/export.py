@@ -189,11 +189,11 @@ def _compare(
     return {"observations": len(observations), "largest_difference": difference}
 
 
-def _microseconds(function: Callable[[], Any], repeats: int = 200) -> float:
+def _microseconds(function: Callable[[], Any]) -> float:
     """The median time of a call, after some that are not counted."""
     times = []
     with torch.no_grad():
-        for _ in range(repeats + 20):
+        for _ in range(220):
             started = time.perf_counter()
             function()
             times.append(time.perf_counter() - started)
