@@ -198,6 +198,13 @@ def test_what_never_changes_has_none(measure, value, steps):
     assert measure(torch.full((steps, 1), value)).isnan()
 
 
+@pytest.mark.parametrize("form", ["caps", "asap"])
+@pytest.mark.parametrize("value", [0.3, 0.7, 1.0])
+def test_sm_of_what_never_changes_is_zero(form, value):
+    """And no rounding noise, which tables would take for a ratio to it."""
+    assert spectral_smoothness(torch.full((151, 1), value), form).item() == 0.0
+
+
 def test_roughness_is_free_of_amplitude_offset_and_length():
     """White noise has .25, whatever its size; a slow sine less the slower it is."""
     torch.manual_seed(0)

@@ -104,7 +104,7 @@ def spectral_smoothness(actions: Tensor, form: Literal["caps", "asap"] = "caps")
     check_choice("spectral_smoothness: form", form, ("caps", "asap"))
     check_episodes("spectral_smoothness", actions, 4)
     bins = actions.shape[-2] // 2
-    frequencies, amplitudes = amplitude_spectrum(actions)
+    frequencies, amplitudes = amplitude_spectrum(_moved(actions))
     frequencies, amplitudes = frequencies[:bins], amplitudes[..., :bins, :]
     if form == "asap":
         return (amplitudes * frequencies.unsqueeze(-1)).sum(-2).mean(-1)
@@ -143,8 +143,11 @@ def roughness(actions: Tensor) -> Tensor:
         tensor(0.5000)
     """
     check_episodes("roughness", actions, 4)
-    # The constant part is taken off first: its rounding errors would move where nothing does.
-    moved = actions - actions[..., :1, :]
-    frequencies, amplitudes = amplitude_spectrum(moved)
+    frequencies, amplitudes = amplitude_spectrum(_moved(actions))
     moving, weights = amplitudes[..., 1:, :], frequencies[1:].unsqueeze(-1)
     return ((moving * weights).sum(-2) / moving.sum(-2)).mean(-1)
+
+
+def _moved(actions: Tensor) -> Tensor:
+    """Without a constant part, whose rounding errors would move where nothing does."""
+    return actions - actions[..., :1, :]
