@@ -312,6 +312,7 @@ def test_settings_survive_a_round_trip():
         ({"task": {"episodes": 0}}, "task.episodes must be greater than or equal to 1, got 0"),
         ({"task": {"noise_scale": -1.0}}, "task.noise_scale must be greater than or equal to 0"),
         ({"regularizer": {"name": "lipsnet"}}, "regularizer.name must be one of .*'l2c2'"),
+        ({"regularizer": {"sigma": 2.0}}, "regularizer.name must be one of .*, got None"),
         ({"regularizer": {"name": "l2c2", "over_neighbors": "max"}}, "num_samples must be above 1"),
         ({"regularizer": {"name": "l2c2", "gain": "target"}}, "regularizer.gain_target must be"),
         ({"regularizer": {"name": "caps", "mean": "median"}}, "mean must be 'loc' or 'action'"),

@@ -158,7 +158,7 @@ def test_the_spectrum_of_known_signals():
     expected = {0.0: 3.0, 5.0: 2.0, 20.0: 0.5}
     for frequency, amplitude in found.items():
         assert amplitude == pytest.approx(expected.get(frequency, 0.0), abs=1e-4)
-    assert roughness(actions.unsqueeze(-1), 50.0).item() == pytest.approx(
+    assert roughness(actions.unsqueeze(-1)).item() == pytest.approx(
         (2 * 5 + 0.5 * 20) / 2.5 / 50, abs=1e-4
     )
 
@@ -196,6 +196,13 @@ def test_the_highest_frequency_is_left_out_of_sm_and_kept_in_roughness():
 def test_what_never_changes_has_none(measure, value, steps):
     """NaN, and no rounding noise: that of a policy that keeps still."""
     assert measure(torch.full((steps, 1), value)).isnan()
+
+
+@pytest.mark.parametrize("form", ["caps", "asap"])
+@pytest.mark.parametrize("value", [0.3, 0.7, 1.0])
+def test_sm_of_what_never_changes_is_zero(form, value):
+    """And no rounding noise, which tables would take for a ratio to it."""
+    assert spectral_smoothness(torch.full((151, 1), value), form).item() == 0.0
 
 
 def test_roughness_is_free_of_amplitude_offset_and_length():

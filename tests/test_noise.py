@@ -156,6 +156,12 @@ class TestCommand:
         with pytest.raises(SystemExit, match=message):
             main([str(runs), *arguments])
 
+    def test_levels_that_are_no_numbers_are_refused(self, capsys):
+        """Not by the name of a function."""
+        with pytest.raises(SystemExit):
+            main(["runs", "--levels", "0,a"])
+        assert "--levels: must be numbers with commas between them" in capsys.readouterr().err
+
     def test_a_folder_without_runs_is_named(self, tmp_path):
         """With what is looked for."""
         with pytest.raises(SystemExit, match=r"no finished run \(evaluation.json\) below"):

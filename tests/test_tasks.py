@@ -389,5 +389,7 @@ def test_whole_floats_are_integers_on_a_command_line():
     """1e6, which YAML and Hydra read as a float; a broken one is refused."""
     config = ExperimentConfig.from_dict({"task": {"name": "swingup", "frames": 1e6}})
     assert config.task.frames == 1_000_000 and isinstance(config.task.frames, int)
+    layers = ExperimentConfig.from_dict({"algorithm": {"name": "sac", "hidden": [1e2, 64]}})
+    assert layers.algorithm.hidden == (100, 64)
     with pytest.raises(ValueError, match=r"task\.frames must be a valid integer, got 0\.5"):
         ExperimentConfig.from_dict({"task": {"name": "swingup", "frames": 0.5}})

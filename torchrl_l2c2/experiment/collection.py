@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,7 @@ from torchrl.envs import (
 from torchrl_l2c2.experiment.acting import on_tensors
 from torchrl_l2c2.experiment.environments import NOISE_SEED, simulating
 from torchrl_l2c2.experiment.frames import PREVIOUS, Frame, as_reward, stack_frames
+from torchrl_l2c2.experiment.spaces import Env
 from torchrl_l2c2.transforms import ObservationNoise
 
 
@@ -232,20 +233,12 @@ class EpisodeCollector(Collector):
             )
         if self._observation is not None:
             raise RuntimeError("an episode is being played; a run can be saved between episodes.")
-        simulator = self._gymnasium.unwrapped.np_random.bit_generator.state
-        noise = None if self._noise is None else self._noise.get_extra_state()
-        return {
-            "simulator": json.dumps(simulator),
-            "noise": noise,
-            "random_frames_left": self._random_frames_left,
-        }
+        states = generator_states(self._gymnasium, self._noise)
+        return {**states, "random_frames_left": self._random_frames_left}
 
     def set_generator_state(self, state: dict[str, Any]) -> None:
         """Restores what :meth:`generator_state` gave; the next episode starts with a reset."""
-        simulator = json.loads(state["simulator"])
-        self._gymnasium.unwrapped.np_random.bit_generator.state = simulator
-        if self._noise is not None:
-            self._noise.set_extra_state(state["noise"])
+        set_generator_states(self._gymnasium, self._noise, state)
         self._random_frames_left = state["random_frames_left"]
         self._observation = None
 
@@ -258,6 +251,23 @@ def observed(seen: np.ndarray, dtype: torch.dtype, noise: ObservationNoise | Non
     if noise is None:
         return torch.tensor(seen, dtype=dtype)
     return noise._apply_transform(torch.as_tensor(seen, dtype=dtype))
+
+
+def generator_states(gymnasium: Env, noise: ObservationNoise | None) -> dict[str, Any]:
+    """The states of a simulator's random generator and of its noise's, where there is noise."""
+    return {
+        "simulator": json.dumps(gymnasium.unwrapped.np_random.bit_generator.state),
+        "noise": None if noise is None else noise.get_extra_state(),
+    }
+
+
+def set_generator_states(
+    gymnasium: Env, noise: ObservationNoise | None, states: Mapping[str, Any]
+) -> None:
+    """Restores what :func:`generator_states` gave."""
+    gymnasium.unwrapped.np_random.bit_generator.state = json.loads(states["simulator"])
+    if noise is not None:
+        noise.set_extra_state(states["noise"])
 
 
 def as_array(action: Tensor) -> np.ndarray:

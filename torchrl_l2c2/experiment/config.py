@@ -289,7 +289,8 @@ def _read_group(group: str, values: Mapping[str, Any]) -> Any:
                 "env_id", "must be given with task=gymnasium, such as Pendulum-v1, got null.", group
             )
         return read(TaskConfig, values, group)
-    raise SettingError("name", f"must be one of {sorted(choices)}, got {name!r}.", group)
+    given = values.get("name")
+    raise SettingError("name", f"must be one of {sorted(choices)}, got {given!r}.", group)
 
 
 # What may differ between a run and its continuation: it changes none of the numbers.

@@ -23,7 +23,7 @@ from torchrl_l2c2.experiment.reports.names import method_name
 def main(arguments: Iterable[str] | None = None) -> None:
     """Does what the command line says; an error is one line."""
     parser = _parser()
-    chosen = parser.parse_args(None if arguments is None else list(arguments))
+    chosen = parser.parse_args(arguments)
     if chosen.episodes < 1:
         parser.error(f"--episodes must be at least 1, got {chosen.episodes}")
     if chosen.names and len(chosen.names) != len(chosen.folders):

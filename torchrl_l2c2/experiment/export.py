@@ -189,11 +189,11 @@ def _compare(
     return {"observations": len(observations), "largest_difference": difference}
 
 
-def _microseconds(function: Callable[[], Any], repeats: int = 200) -> float:
+def _microseconds(function: Callable[[], Any]) -> float:
     """The median time of a call, after some that are not counted."""
     times = []
     with torch.no_grad():
-        for _ in range(repeats + 20):
+        for _ in range(220):
             started = time.perf_counter()
             function()
             times.append(time.perf_counter() - started)
@@ -310,7 +310,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
     parser.add_argument(
         "--episodes", type=int, default=1, help="played to compare the policies (default: 1)"
     )
-    chosen = parser.parse_args(None if arguments is None else list(arguments))
+    chosen = parser.parse_args(arguments)
     if chosen.episodes < 1:
         parser.error(f"--episodes must be at least 1, got {chosen.episodes}")
     with told_in_a_line():

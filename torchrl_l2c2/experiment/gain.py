@@ -42,18 +42,19 @@ class GainControl:
     def __init__(self, config: ExperimentConfig, learner: Learner) -> None:
         regularizer = config.regularizer
         self._learner, self._updates = learner, 0
-        self._config = regularizer if isinstance(regularizer, GainConfig) else None
+        self._config: GainConfig | None = None  # Of a gain that sets itself.
         self._tells_measured = True
         # Of the episodes since the gain was set: of a rollout several end, and any one is noisy.
         self._seen: list[float] = []
         self.gains: dict[str, ConstantGain] = {}
-        if self._config is not None and self._config.gain != "constant":
-            names = self._terms() if self._config.gain == "gradient" else ["all"]
-            self.gains = {name: _make_gain(self._config, name) for name in names}
-            if self._config.gain == "target":
-                self._check_column(self._config.gain_of, tested=config.late_share > 0)
+        if isinstance(regularizer, GainConfig) and regularizer.gain != "constant":
+            self._config = regularizer
+            names = self._terms() if regularizer.gain == "gradient" else ["all"]
+            self.gains = {name: _make_gain(regularizer, name) for name in names}
+            if regularizer.gain == "target":
+                self._check_column(regularizer.gain_of, tested=config.late_share > 0)
             # Gains that follow a measure rise by themselves; a ramp ends where it ends.
-            learner.tells_faint_regularizer = self._config.gain == "ramp"
+            learner.tells_faint_regularizer = regularizer.gain == "ramp"
             learner.at_full_gain = self._at_full_gain
             self._apply()
 
@@ -80,23 +81,23 @@ class GainControl:
             gain is constant.
         """
         config = self._config
-        if config is not None and config.gain == "target" and config.gain_of not in row:
+        if config is None or (config.gain == "target" and config.gain_of not in row):
             return {}
         logged = {}
         due = ends_round and self._learner.updates > self._updates
-        measured = self._measure(row, training, due)
+        measured = self._measure(config, row, training, due)
         for name, gain in self.gains.items():
             suffix = "" if name == "all" else f"_{name}"
             logged[f"gain{suffix}"] = gain.value
             logged[f"gain_measured{suffix}"] = measured[name]
-        if self.gains and self._config is not None:
-            logged |= self._config.targets
-        if self.gains and due:
+        logged |= config.targets
+        if due:
             self._updates, self._seen = self._learner.updates, []
             for name, gain in self.gains.items():
                 gain.step(measured[name])
             self._apply()
-            self._tell_measured(measured)
+            if config.gain == "target":
+                self._tell_measured(config.gain_of, measured["all"])
         return logged
 
     def state_dict(self) -> dict[str, Any]:
@@ -121,7 +122,7 @@ class GainControl:
             self._apply()
 
     def _apply(self) -> None:
-        if self._config is None or not self.gains:
+        if self._config is None:
             return
         values = {name: gain.value for name, gain in self.gains.items()}
         self._config.apply(self._learner.agent.loss, values)
@@ -134,14 +135,14 @@ class GainControl:
         terms = {"policy": sorted(of_policy), "value": sorted(of_value)}
         return {name: keys for name, keys in terms.items() if keys}
 
-    def _measure(self, row: Mapping[str, float], training: Budget, due: bool) -> dict[str, float]:
-        if self._config is None or not self.gains:
-            return {}
-        if self._config.gain == "ramp":
+    def _measure(
+        self, config: GainConfig, row: Mapping[str, float], training: Budget, due: bool
+    ) -> dict[str, float]:
+        if config.gain == "ramp":
             spent = training.spent(int(row["episode"]), int(row["frames"]))
             return {"all": min(1.0, spent / training.total)}  # A last round may go beyond it.
-        if self._config.gain == "target":
-            self._seen.append(row[self._config.gain_of])
+        if config.gain == "target":
+            self._seen.append(row[config.gain_of])
             numbers = [measured for measured in self._seen if math.isfinite(measured)]
             return {"all": fmean(numbers) if numbers else self._seen[-1]}
         if not due:
@@ -164,20 +165,18 @@ class GainControl:
                 "policy_scale a policy that has a scale).",
             )
 
-    def _tell_measured(self, measured: Mapping[str, float]) -> None:
+    def _tell_measured(self, column: str, measured: float) -> None:
         """Says once that a target is not followed, as its column has no fitting number."""
-        assert self._config is not None
-        if self._config.gain != "target" or 0.0 <= measured["all"] < math.inf:
+        if 0.0 <= measured < math.inf or not self._tells_measured:
             return
-        if self._tells_measured:
-            self._tells_measured = False
-            warnings.warn(
-                f"regularizer.gain_of={self._config.gain_of} is {measured['all']:g} after update "
-                f"{self._updates}: the gain stays where that is no number, and falls where it is "
-                "below 0, whatever gain_target is. Choose a column of numbers of at least 0; "
-                "test_* have some in the last late_share of training alone.",
-                stacklevel=4,
-            )
+        self._tells_measured = False
+        warnings.warn(
+            f"regularizer.gain_of={column} is {measured:g} after update {self._updates}: the gain "
+            "stays where that is no number, and falls where it is below 0, whatever gain_target "
+            "is. Choose a column of numbers of at least 0; test_* have some in the last late_share "
+            "of training alone.",
+            stacklevel=4,
+        )
 
 
 def _make_gain(config: GainConfig, name: str) -> ConstantGain:

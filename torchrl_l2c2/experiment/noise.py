@@ -27,12 +27,12 @@ from torchrl_l2c2.experiment.frames import check_finite
 from torchrl_l2c2.experiment.naming import plain
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.reports import FinishedRun, find_runs
-from torchrl_l2c2.experiment.reports.comparison import Estimate
+from torchrl_l2c2.experiment.reports.comparison import Estimate, estimate_cell
 from torchrl_l2c2.experiment.reports.field import FIELD_MEASURES
 from torchrl_l2c2.experiment.reports.figures import finish, styles, subplots
 from torchrl_l2c2.experiment.reports.groups import Group, group_records
 from torchrl_l2c2.experiment.reports.statistics import mean
-from torchrl_l2c2.experiment.reports.tables import Table, number, number_range
+from torchrl_l2c2.experiment.reports.tables import Table, number_range
 from torchrl_l2c2.experiment.trained import load_policy
 from torchrl_l2c2.transforms import ObservationNoise
 
@@ -84,7 +84,8 @@ def play_with_noise(
 ) -> list[Played]:
     """Plays the policies of runs at every level of noise, which is the same for all of a task.
 
-    Each run has its own test's seed, at every level: without noise it plays its test again.
+    Each run has its own test's seed, at every level: at level 0 it plays its test again, where the
+    task has no noise of its own.
 
     Args:
         runs (sequence of FinishedRun): of any tasks.
@@ -123,7 +124,10 @@ def noise_table(played: Sequence[Played]) -> Table:
     rows = [
         [
             *(group.first.task, group.first.algorithm, group.name, number_range(group.seeds), name),
-            *(_cell(group, summaries, level, quantity) for level in levels),
+            *(
+                estimate_cell(_estimate(group, summaries, level, quantity), quantity)
+                for level in levels
+            ),
         ]
         for group in groups
         for quantity, name in FIELD_MEASURES.items()
@@ -238,15 +242,12 @@ def _estimate(group: Group, summaries: Summaries, level: float, quantity: str) -
     return Estimate.of(mean, np.array(values).reshape(-1, 1))
 
 
-def _cell(group: Group, summaries: Summaries, level: float, quantity: str) -> str:
-    estimate = _estimate(group, summaries, level, quantity)
-    if estimate is None:
-        return "-"
-    return estimate.text(partial(number, quantity=quantity, beside=estimate.value))
-
-
 def _levels(text: str) -> list[float]:
-    return [float(part) for part in text.split(",")]
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        told = f"must be numbers with commas between them, such as 0,0.1, got {text!r}"
+        raise argparse.ArgumentTypeError(told) from None
 
 
 def main(arguments: Iterable[str] | None = None) -> None:
@@ -266,7 +267,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
     )
     add("--episodes", type=int, default=10, help="of each run at each level (default: 10)")
     add("--output", metavar="FOLDER", help="of the files (default: noise/ in the first folder)")
-    chosen = parser.parse_args(None if arguments is None else list(arguments))
+    chosen = parser.parse_args(arguments)
     with told_in_a_line():
         found = find_runs(chosen.folders, required=True)
         played = play_with_noise(found.runs, chosen.levels, episodes=chosen.episodes, progress=True)

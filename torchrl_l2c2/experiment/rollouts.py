@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import warnings
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -15,7 +14,12 @@ from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
 from torchrl_l2c2.experiment.acting import on_tensors
-from torchrl_l2c2.experiment.collection import observed, simulator_and_noise
+from torchrl_l2c2.experiment.collection import (
+    generator_states,
+    observed,
+    set_generator_states,
+    simulator_and_noise,
+)
 from torchrl_l2c2.experiment.frames import PREVIOUS, Frame, as_reward, stack_frames
 
 
@@ -192,7 +196,7 @@ class _Stream:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores it: the simulator plays the same actions again."""
-        self._set_generators(state["generators"])
+        set_generator_states(self._gymnasium, self._noise, state["generators"])
         self._observation, self._frames = None, []
         outputs = state["outputs"]
         for row in zip(*(values.unbind(0) for values in outputs.values()), strict=True):
@@ -214,11 +218,4 @@ class _Stream:
         return observed(seen, self._dtype, self._noise)
 
     def _generators(self) -> dict[str, Any]:
-        simulator = self._gymnasium.unwrapped.np_random.bit_generator.state
-        noise = None if self._noise is None else self._noise.get_extra_state()
-        return {"simulator": json.dumps(simulator), "noise": noise}
-
-    def _set_generators(self, state: dict[str, Any]) -> None:
-        self._gymnasium.unwrapped.np_random.bit_generator.state = json.loads(state["simulator"])
-        if self._noise is not None:
-            self._noise.set_extra_state(state["noise"])
+        return generator_states(self._gymnasium, self._noise)

@@ -17,7 +17,8 @@ class RowWriter:
     TensorDicts and copies are for batches.
 
     Args:
-        replay (TensorDictReplayBuffer): as :func:`make_replay` makes it: one-dimensional, in turn.
+        replay (TensorDictReplayBuffer): as :meth:`ExperimentConfig.make_replay` makes it:
+            one-dimensional, in turn.
     """
 
     def __init__(self, replay: TensorDictReplayBuffer) -> None:

@@ -208,7 +208,7 @@ def run_sweep(command: Sequence[str]) -> int:
 def main(arguments: Iterable[str] | None = None) -> None:
     """Does what the command line says; an error is one line."""
     parser = _parser()
-    chosen = parser.parse_args(None if arguments is None else list(arguments))
+    chosen = parser.parse_args(arguments)
     if chosen.trials < 1:
         parser.error(f"--trials must be at least 1, got {chosen.trials}")
     if chosen.sampler_seed < 0:

@@ -84,7 +84,7 @@ def read(make: Callable[..., Group], values: Mapping[str, Any], prefix: str) -> 
 
 def _plain(value: Any) -> Any:
     if isinstance(value, list):
-        return tuple(value)
+        return tuple(map(_plain, value))
     # Where a float is wanted, pydantic makes one of the integer.
     whole = isinstance(value, float) and value.is_integer() and abs(value) < 2**63
     return int(value) if whole else value

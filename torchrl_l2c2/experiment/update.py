@@ -149,7 +149,7 @@ class ReplayUpdate:
 
     Args:
         agent (Agent): what is updated, in place.
-        replay (TensorDictReplayBuffer): as :func:`make_replay` makes it.
+        replay (TensorDictReplayBuffer): as :meth:`ExperimentConfig.make_replay` makes it.
 
     Keyword Args:
         compile (bool): as for :func:`make_update`.

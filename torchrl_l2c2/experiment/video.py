@@ -187,7 +187,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, help="of all randomness (default: the test's own)")
     parser.add_argument("--noise", type=float, help="on observations (default: the task's)")
     parser.add_argument("--best", action="store_true", help="policy_best.pt instead of policy.pt")
-    chosen = parser.parse_args(None if arguments is None else list(arguments))
+    chosen = parser.parse_args(arguments)
     with told_in_a_line():
         path = record_video(
             chosen.folder,

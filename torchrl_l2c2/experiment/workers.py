@@ -21,7 +21,6 @@ from torchrl.collectors import MultiSyncCollector
 from torchrl.collectors.distributed import RayCollector
 from torchrl.envs import EnvBase, ExplorationType
 
-from torchrl_l2c2.experiment.algorithms import PPOConfig
 from torchrl_l2c2.experiment.algorithms.agent import Agent
 from torchrl_l2c2.experiment.collection import EpisodeCollector
 from torchrl_l2c2.experiment.config import ExperimentConfig
@@ -43,13 +42,13 @@ def make_collector(
         "keep_previous": config.regularizer.reads_previous,
     }
     algorithm = config.algorithm
-    if isinstance(algorithm, PPOConfig) and algorithm.num_envs is not None:
+    if algorithm.num_envs is not None:
         seeds = (config.seed + SEEDS_APART * i for i in range(1, algorithm.num_envs))
         envs = [env, *(make_env(config.task, seed) for seed in seeds)]
         return RolloutCollector(envs, agent.policy, frames_per_batch=algorithm.frames, **options)
     options["random_frames"] = algorithm.random_frames
     if config.num_workers == 1:
-        frames = 1 if config.algorithm.schedule == "step" else config.task.time_limit
+        frames = 1 if algorithm.schedule == "step" else config.task.time_limit
         return EpisodeCollector(env, agent.policy, frames_per_batch=frames, **options)
     ray = config.workers == "ray"
     if ray and find_spec("ray") is None:

@@ -55,8 +55,10 @@ def amplitude_spectrum(actions: Tensor, sampling_rate: float = 1.0) -> tuple[Ten
     amplitudes[..., 0, :] /= 2.0
     if steps % 2 == 0:
         amplitudes[..., -1, :] /= 2.0
-    frequencies = torch.arange(steps // 2 + 1, dtype=actions.dtype, device=actions.device)
-    return frequencies * sampling_rate / steps, amplitudes
+    frequencies = torch.fft.rfftfreq(
+        steps, 1.0 / sampling_rate, dtype=actions.dtype, device=actions.device
+    )
+    return frequencies, amplitudes
 
 
 def spectral_smoothness(actions: Tensor, form: Literal["caps", "asap"] = "caps") -> Tensor:
@@ -102,7 +104,7 @@ def spectral_smoothness(actions: Tensor, form: Literal["caps", "asap"] = "caps")
     check_choice("spectral_smoothness: form", form, ("caps", "asap"))
     check_episodes("spectral_smoothness", actions, 4)
     bins = actions.shape[-2] // 2
-    frequencies, amplitudes = amplitude_spectrum(actions)
+    frequencies, amplitudes = amplitude_spectrum(_moved(actions))
     frequencies, amplitudes = frequencies[:bins], amplitudes[..., :bins, :]
     if form == "asap":
         return (amplitudes * frequencies.unsqueeze(-1)).sum(-2).mean(-1)
@@ -110,28 +112,26 @@ def spectral_smoothness(actions: Tensor, form: Literal["caps", "asap"] = "caps")
     return (amplitudes * weights.unsqueeze(-1)).mean((-2, -1))
 
 
-def roughness(actions: Tensor, sampling_rate: float = 1.0) -> Tensor:
+def roughness(actions: Tensor) -> Tensor:
     r"""The mean frequency of an episode's actions, weighted by amplitude, as a share of the rate.
 
     .. math::
-        \frac{\sum_{i \ge 1} M_i f_i}{f_s \sum_{i \ge 1} M_i}
+        \frac{\sum_{i \ge 1} M_i f_i}{\sum_{i \ge 1} M_i}
 
-    with :math:`M_i` and :math:`f_i` of :func:`amplitude_spectrum`, up to half the rate; the mean
-    over the action's dimensions. Between 0 and .5: white noise has .25, an action that flips from
-    step to step .5, whatever the amplitude and nearly whatever the length. It says how fast an
-    action moves and not how much. The constant part is left out.
+    with :math:`M_i` and :math:`f_i` of :func:`amplitude_spectrum` at a rate of 1; the mean over the
+    action's dimensions. Between 0 and .5: white noise has .25, an action that flips from step to
+    step .5, whatever the amplitude and nearly whatever the length. It says how fast an action moves
+    and not how much. The constant part is left out.
 
     Args:
         actions (Tensor): of whole episodes, shape ``[*B, T, A]`` with at least four steps.
-        sampling_rate (float): actions per second, greater than 0; the result is the same for each.
-            Default 1.
 
     Returns:
         Tensor: of each episode, shape ``[*B]``; NaN where a dimension never changes.
 
     Raises:
         TypeError: the actions are no floating-point tensor.
-        ValueError: an episode has fewer than four steps, or the rate is not greater than 0.
+        ValueError: an episode has fewer than four steps.
 
     Examples:
         >>> import torch
@@ -143,8 +143,11 @@ def roughness(actions: Tensor, sampling_rate: float = 1.0) -> Tensor:
         tensor(0.5000)
     """
     check_episodes("roughness", actions, 4)
-    # The constant part is taken off first: its rounding errors would move where nothing does.
-    moved = actions - actions[..., :1, :]
-    frequencies, amplitudes = amplitude_spectrum(moved, sampling_rate)
+    frequencies, amplitudes = amplitude_spectrum(_moved(actions))
     moving, weights = amplitudes[..., 1:, :], frequencies[1:].unsqueeze(-1)
-    return ((moving * weights).sum(-2) / (sampling_rate * moving.sum(-2))).mean(-1)
+    return ((moving * weights).sum(-2) / moving.sum(-2)).mean(-1)
+
+
+def _moved(actions: Tensor) -> Tensor:
+    """Without a constant part, whose rounding errors would move where nothing does."""
+    return actions - actions[..., :1, :]

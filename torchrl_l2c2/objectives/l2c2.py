@@ -188,7 +188,6 @@ class L2C2Loss(RegularizedLoss):
         self.l2c2_num_samples = int(num_samples)
         self.l2c2_over_neighbors: Literal["mean", "max"] = over_neighbors
         self.l2c2_fraction = float(fraction)
-        self.l2c2_hellinger_samples = hellinger_samples
         self.l2c2_neighbor_key = read_key("neighbor_key", neighbor_key)
         self._l2c2_compared = False
         policies, values = self.policy_networks(), self.value_networks() if beta else []

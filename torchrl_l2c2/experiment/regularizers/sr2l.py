@@ -25,7 +25,7 @@ class SR2LConfig(GainConfig):
     steps: int = Field(default=10, ge=1, description="of the ascent to it")
     policy_distance: Literal["jeffreys", "hellinger", "mean", "mse", "kl"] = Field(
         default="jeffreys",
-        description="how policies are compared; deterministic ones always by their actions",
+        description="how policies are compared; deterministic ones by their actions, and not by kl",
     )
 
     def wrap(self, loss: LossModule) -> LossModule:

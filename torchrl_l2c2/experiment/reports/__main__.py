@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from itertools import chain
 from pathlib import Path
 
 from torchrl_l2c2.experiment.config import ExperimentConfig
+from torchrl_l2c2.experiment.errors import told_in_a_line
 from torchrl_l2c2.experiment.reports.against import against_table
 from torchrl_l2c2.experiment.reports.groups import group_records
 from torchrl_l2c2.experiment.reports.page import fill_pages
@@ -37,7 +37,7 @@ examples:
 def main(arguments: Iterable[str] | None = None) -> None:
     """Does what the command line says; an error is one line."""
     parser = _parser()
-    chosen = parser.parse_args(None if arguments is None else list(arguments))
+    chosen = parser.parse_args(arguments)
     if bool(chosen.folders) == bool(chosen.records):
         parser.error("name folders of runs, or files of records with --from")
     if chosen.records and chosen.length:
@@ -50,10 +50,8 @@ def main(arguments: Iterable[str] | None = None) -> None:
         parser.error("--score prints scores alone; leave it or --against out")
     if chosen.records and chosen.csv:
         parser.error("--csv writes records of folders; --from has them already")
-    try:
+    with told_in_a_line():
         _report(chosen)
-    except (OSError, ValueError) as error:
-        sys.exit(f"error: {error}")
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -132,11 +132,7 @@ def _statistics_row(test: str, group: Group, baseline: Group | None) -> list[str
     for quantity in QUANTITIES:
         center = Estimate.of(interquartile_mean, group.scores(test, quantity))
         better = improvement([group], [baseline], test, quantity) if baseline else None
-        if center is None:
-            cells += ["-", ""]
-        else:
-            write = partial(number, quantity=quantity, beside=center.value)
-            cells += [center.text(write), probability(better)]
+        cells += [estimate_cell(center, quantity), probability(better)]
     return cells
 
 
@@ -193,6 +189,13 @@ def _matrix(groups: Sequence[Group], test: str, quantity: str) -> Scores:
     found = [sorted(group.by_seed(test, quantity).items()) for group in groups]
     columns = [[value for _, value in each] for each in found]
     return np.array(list(zip_longest(*columns, fillvalue=np.nan))).reshape(-1, len(groups))
+
+
+def estimate_cell(estimate: Estimate | None, quantity: str) -> str:
+    """With its interval, and the digits that its quantity is told with; a dash without one."""
+    if estimate is None:
+        return "-"
+    return estimate.text(partial(number, quantity=quantity, beside=estimate.value))
 
 
 def probability(estimate: Estimate | None) -> str:

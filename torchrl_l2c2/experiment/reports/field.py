@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from typing import NamedTuple
 
-from torchrl_l2c2.experiment.reports.comparison import Estimate, improvement, probability
+from torchrl_l2c2.experiment.reports.comparison import (
+    Estimate,
+    estimate_cell,
+    improvement,
+    probability,
+)
 from torchrl_l2c2.experiment.reports.groups import Group, baseline_of, by_task, group_records
 from torchrl_l2c2.experiment.reports.records import Record
 from torchrl_l2c2.experiment.reports.statistics import mean
-from torchrl_l2c2.experiment.reports.tables import Table, number, number_range, of_runs
+from torchrl_l2c2.experiment.reports.tables import Table, number_range, of_runs
 from torchrl_l2c2.experiment.tasks import FIELD_TASKS
 
 
@@ -109,13 +113,9 @@ def _row(group: Group, vanilla: Group | None) -> list[str]:
     first = group.first
     cells = [first.task, first.algorithm, group.name, number_range(group.seeds)]
     for quantity in FIELD_MEASURES:
-        center = Estimate.of(mean, group.scores("last_mean", quantity))
-        if center is None:
-            cells.append("-")
-        else:
-            write = partial(number, quantity=quantity, beside=center.value)
-            known = len(group.scores("last_mean", quantity))
-            cells.append(center.text(write) + of_runs(known, len(group.records)))
+        scores = group.scores("last_mean", quantity)
+        cell = estimate_cell(Estimate.of(mean, scores), quantity)
+        cells.append(cell + of_runs(len(scores), len(group.records)) if len(scores) else cell)
     if vanilla is None:
         cells += [""] * len(BETTER)
     else:

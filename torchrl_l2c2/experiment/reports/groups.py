@@ -66,11 +66,8 @@ def group_records(records: Iterable[Record]) -> list[Group]:
     for record in sorted(records, key=lambda record: record.place):
         # Without the seed, which is the last of it.
         pooled[record.identity[:-1]].append(record)
-    groups = [Group(tuple(members), "") for members in pooled.values()]
-    compared: dict[tuple[str, str], list[Group]] = defaultdict(list)
-    for group in groups:
-        compared[group.first.task, group.first.algorithm].append(group)
-    return [named for together in compared.values() for named in _named(together)]
+    groups = (Group(tuple(members), "") for members in pooled.values())
+    return [named for together in by_task(groups) for named in _named(together)]
 
 
 def by_task(groups: Iterable[Group]) -> list[list[Group]]:

@@ -32,7 +32,7 @@ def write_results(
     Args:
         folder (Path): of the run.
         config (ExperimentConfig): its settings.
-        tests (dict): ``"mean"`` and ``"sampled"``, where there is one: ``"summary"`` and
+        tests (dict): ``"mean"`` and, where there is one, ``"sampled"``: ``"summary"`` and
             ``"episodes"`` of the test with the policy's mean and with samples.
 
     Returns:
@@ -41,7 +41,7 @@ def write_results(
     named = {group: getattr(config, group).name for group in ("task", "algorithm", "regularizer")}
     run = {**named, "seed": config.seed, "solved_at": config.task.solved_at}
     rest = {name: test for name, test in tests.items() if name != "mean"}
-    evaluation = {"run": run, **tests.get("mean", {}), **rest}
+    evaluation = {"run": run, **tests["mean"], **rest}
     draw_learning_curves([FinishedRun.read(folder, evaluation)], folder / "learning_curves.png")
     # Last, as it marks the run as finished.
     write_json(folder / "evaluation.json", evaluation)
