@@ -58,7 +58,7 @@ class LCPLoss(RegularizedLoss):
         if not self.has_stochastic_policy():
             raise TypeError(
                 f"LCPLoss needs a stochastic policy: that of {type(base_loss).__name__} has no "
-                "likelihood. CAPSLoss, CATSLoss, SR2LLoss and L2C2Loss take deterministic ones."
+                "likelihood. All other regularizers take deterministic ones."
             )
         self.declare_terms(policy=["loss_lcp"])
 
