@@ -504,7 +504,7 @@ class TestLCP:
 
     def test_a_deterministic_policy_is_refused(self):
         """With the regularizers that take it."""
-        with pytest.raises(TypeError, match=r"DDPGLoss has no likelihood. CAPSLoss, CATSLoss"):
+        with pytest.raises(TypeError, match=r"DDPGLoss has no likelihood. All other regularizers"):
             LCPLoss(linear_base())
 
 
