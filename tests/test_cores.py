@@ -1,12 +1,16 @@
 """How long a sweep takes on so many cores, on paper."""
 
 import math
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from benchmarks.cores import RECORDS, makespan, recorded, report, sweep
 from torchrl_l2c2.experiment.reports import read_records
+
+ROOT = Path(__file__).parents[1]
 
 
 @pytest.mark.parametrize(("cores", "hours"), [(1, 15.0), (2, 10.0), (3, 8.0), (4, 7.0), (9, 6.0)])
@@ -40,3 +44,10 @@ def test_the_page_says_where_it_stops_scaling():
     page = report([3600.0] * 4 + [3 * 3600.0], [], where)
     assert "| 1 | 7.0 | 100% |" in page and "| 2 | 5.0 | 70% |" in page
     assert "The longest takes 3.0 hours" in page and "from 5 cores on" in page
+
+
+def test_the_readme_has_the_hours_of_the_page():
+    """Those of one core."""
+    readme, page = ((ROOT / name).read_text() for name in ("README.md", "results/cores.md"))
+    (told,) = re.findall(r"\[(\d+) hours of one core\]", readme)
+    assert f"one core each, {told} hours in all" in page
