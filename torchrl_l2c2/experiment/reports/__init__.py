@@ -27,6 +27,7 @@ from torchrl_l2c2.experiment.reports.runs import (
     finished_run,
     read_runs,
 )
+from torchrl_l2c2.experiment.reports.tables import Table
 
 __all__ = [
     "PAPER",
@@ -37,6 +38,7 @@ __all__ = [
     "Group",
     "Published",
     "Record",
+    "Table",
     "compare_with_paper",
     "draw_learning_curves",
     "draw_plane",
