@@ -175,8 +175,8 @@ def unknown_setting(name: str) -> str:
     known = {*STEERING, *(field.name for field in dataclasses.fields(ExperimentConfig))}
     known |= {f"{of[0]}.{each}" for of, names in settings.items() for each in names}
     near = sorted(each for each in known if each.endswith(f".{name}"))
-    near = near or [ALSO_CALLED[each] for each in [name.removesuffix("s")] if each in ALSO_CALLED]
-    near = near or get_close_matches(name, sorted(known), 1)
+    called = ALSO_CALLED.get(name.removesuffix("s"))
+    near = near or ([called] if called else get_close_matches(name, sorted(known), 1))
     meant = f"; did you mean {near[0]}?" if near else "."
     return f"{name} is not a setting{meant} --help lists every setting."
 
