@@ -202,7 +202,10 @@ def test_what_never_changes_has_none(measure, value, steps):
 @pytest.mark.parametrize("value", [0.3, 0.7, 1.0])
 def test_sm_of_what_never_changes_is_zero(form, value):
     """And no rounding noise, which tables would take for a ratio to it."""
-    assert spectral_smoothness(torch.full((151, 1), value), form).item() == 0.0
+    still = torch.full((151, 1), value)
+    assert spectral_smoothness(still, form).item() == 0.0
+    amplitudes = amplitude_spectrum(still)[1]
+    assert amplitudes[0].item() == pytest.approx(value) and not amplitudes[1:].any()
 
 
 def test_roughness_is_free_of_amplitude_offset_and_length():

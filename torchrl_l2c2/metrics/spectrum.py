@@ -51,8 +51,10 @@ def amplitude_spectrum(actions: Tensor, sampling_rate: float = 1.0) -> tuple[Ten
     if actions.itemsize < 4:  # Of which there is no transform.
         actions = actions.float()
     steps = actions.shape[-2]
-    amplitudes = 2.0 / steps * torch.fft.rfft(actions, dim=-2).abs()
-    amplitudes[..., 0, :] /= 2.0
+    # The constant part is taken off first: its rounding errors would move where nothing does.
+    moved = actions - actions[..., :1, :]
+    amplitudes = 2.0 / steps * torch.fft.rfft(moved, dim=-2).abs()
+    amplitudes[..., 0, :] = actions.mean(-2).abs()
     if steps % 2 == 0:
         amplitudes[..., -1, :] /= 2.0
     frequencies = torch.fft.rfftfreq(
@@ -104,7 +106,7 @@ def spectral_smoothness(actions: Tensor, form: Literal["caps", "asap"] = "caps")
     check_choice("spectral_smoothness: form", form, ("caps", "asap"))
     check_episodes("spectral_smoothness", actions, 4)
     bins = actions.shape[-2] // 2
-    frequencies, amplitudes = amplitude_spectrum(_moved(actions))
+    frequencies, amplitudes = amplitude_spectrum(actions)
     frequencies, amplitudes = frequencies[:bins], amplitudes[..., :bins, :]
     if form == "asap":
         return (amplitudes * frequencies.unsqueeze(-1)).sum(-2).mean(-1)
@@ -143,11 +145,6 @@ def roughness(actions: Tensor) -> Tensor:
         tensor(0.5000)
     """
     check_episodes("roughness", actions, 4)
-    frequencies, amplitudes = amplitude_spectrum(_moved(actions))
+    frequencies, amplitudes = amplitude_spectrum(actions)
     moving, weights = amplitudes[..., 1:, :], frequencies[1:].unsqueeze(-1)
     return ((moving * weights).sum(-2) / moving.sum(-2)).mean(-1)
-
-
-def _moved(actions: Tensor) -> Tensor:
-    """Without a constant part, whose rounding errors would move where nothing does."""
-    return actions - actions[..., :1, :]

@@ -47,11 +47,8 @@ def draw_together(diagnoses: Sequence[Diagnosis]) -> bytes:
 
 def draw_spectra(diagnoses: Sequence[Diagnosis]) -> list[bytes]:
     """Amplitudes of the frequencies that the actions are made of, as shares of their range."""
-    # From the first action on: of one that never changes nothing is left, not even rounding.
-    moved = ((one.relative - one.relative[:1])[:, busiest(one)] for one in diagnoses)
     spectra = [
-        amplitude_spectrum(actions, one.rate or 1.0)
-        for actions, one in zip(moved, diagnoses, strict=True)
+        amplitude_spectrum(one.relative[:, busiest(one)], one.rate or 1.0) for one in diagnoses
     ]
     top = max(float(amplitudes[1:].max()) for _, amplitudes in spectra) or 1.0
 
