@@ -14,7 +14,6 @@ import numpy as np
 from torchrl_l2c2.experiment.reports.names import method_name, name_with_settings
 from torchrl_l2c2.experiment.reports.records import Record
 from torchrl_l2c2.experiment.reports.statistics import Scores
-from torchrl_l2c2.experiment.saved import BUDGETS
 
 # A row's settings by name; ``None`` where the default stands.
 Settings = tuple[tuple[str, str | None], ...]
@@ -232,12 +231,9 @@ def _own(group: Group) -> Settings:
 def _others(group: Group) -> dict[str, str]:
     """All other settings, and the length."""
     # A run of so many frames has a number of episodes, too, which says nothing.
-    others = _without(group.first, "regularizer.", *BUDGETS)
+    known = group.first.settings_of_any_length.items()
+    others = {k: v for k, v in known if not k.startswith("regularizer.")}
     return {**others, LENGTH: group.first.length}
-
-
-def _without(record: Record, *prefixes: str) -> dict[str, str]:
-    return {k: v for k, v in record.other_settings.items() if not k.startswith(prefixes)}
 
 
 def _named(groups: list[Group]) -> list[Group]:
@@ -274,7 +270,8 @@ def _differing(group: Group, groups: Sequence[Group]) -> dict[str, str]:
             if not own_kind or other.first.method == group.first.method
         }
 
-    return {k: v for k, v in _without(group.first, *BUDGETS).items() if len(others_have(k)) > 1}
+    known = group.first.settings_of_any_length.items()
+    return {k: v for k, v in known if len(others_have(k)) > 1}
 
 
 def _shortest(key: str, keys: set[str]) -> str:

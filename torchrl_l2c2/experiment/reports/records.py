@@ -88,7 +88,7 @@ class Record:
         What differs in the regularizer alone, and so is compared, is together.
         """
         task = list(TASKS).index(self.task) if self.task in TASKS else len(TASKS)
-        words = {k: f"{k}={v}" for k, v in self.other_settings.items() if k not in BUDGETS}
+        words = {k: f"{k}={v}" for k, v in self.settings_of_any_length.items()}
         own = [word for name, word in words.items() if name.startswith("regularizer.")]
         others = [word for word in words.values() if word not in own]
         amount, unit = self.length.split()
@@ -115,6 +115,11 @@ class Record:
     def other_settings(self) -> dict[str, str]:
         """What differs from the defaults, by name."""
         return read_differences(self.differences)
+
+    @cached_property
+    def settings_of_any_length(self) -> dict[str, str]:
+        """Of these all but how long is trained, which :attr:`length` says."""
+        return {k: v for k, v in self.other_settings.items() if k not in BUDGETS}
 
     @property
     def is_of_own_task(self) -> bool:

@@ -19,7 +19,6 @@ from torchrl_l2c2.experiment.reports.names import method_name
 from torchrl_l2c2.experiment.reports.records import QUANTITIES, TESTS, Record
 from torchrl_l2c2.experiment.reports.score import COMPARED, Reading
 from torchrl_l2c2.experiment.reports.statistics import mean_and_deviation
-from torchrl_l2c2.experiment.saved import BUDGETS
 
 LEGEND = (
     "Means over seeds, standard deviations over seeds in brackets. "
@@ -147,8 +146,8 @@ def score_table(readings: Sequence[Reading]) -> Table:
     rows = []
     for reading in readings:
         first = reading.vanilla.first
-        others = {k: v for k, v in first.other_settings.items() if k not in BUDGETS}
-        named = " ".join(f"{name}={value}" for name, value in others.items()) or "the defaults"
+        others = [f"{name}={value}" for name, value in first.settings_of_any_length.items()]
+        start = [first.task, " ".join(others) or "the defaults", first.length]
         seeds = list(dict.fromkeys(number_range(g.seeds) for g in (reading.vanilla, reading.caps)))
         for test in ("late_mean", "late_sampled"):
             cells = reading.cells(test)
@@ -156,7 +155,7 @@ def score_table(readings: Sequence[Reading]) -> Table:
                 continue
             rows.append(
                 [
-                    *(first.task, named, first.length, "; ".join(seeds)),
+                    *(*start, "; ".join(seeds)),
                     *(f"{reading.updates:.0f}", TESTS[test].split(", ")[1]),
                     or_dash(reading.score(test), ".2f"),
                     *(or_dash(cells[m, q], ".2f") for m in COMPARED for q in QUANTITIES),
