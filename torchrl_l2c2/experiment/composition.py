@@ -31,7 +31,7 @@ PACKAGE = Path(__file__).parents[1]
 CONF = next(folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if folder.is_dir())
 
 # What a method is chosen by.
-ALSO_CALLED = {"method": "regularizer", "loss": "regularizer"}
+ALSO_CALLED = {"method": ["regularizer"], "methods": ["regularizer"]}
 
 
 def register() -> None:
@@ -175,8 +175,7 @@ def unknown_setting(name: str) -> str:
     known = {*STEERING, *(field.name for field in dataclasses.fields(ExperimentConfig))}
     known |= {f"{of[0]}.{each}" for of, names in settings.items() for each in names}
     near = sorted(each for each in known if each.endswith(f".{name}"))
-    called = ALSO_CALLED.get(name.removesuffix("s"))
-    near = near or ([called] if called else get_close_matches(name, sorted(known), 1))
+    near = near or ALSO_CALLED.get(name) or get_close_matches(name, sorted(known), 1)
     meant = f"; did you mean {near[0]}?" if near else "."
     return f"{name} is not a setting{meant} --help lists every setting."
 

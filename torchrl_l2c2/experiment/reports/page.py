@@ -20,7 +20,6 @@ from torchrl_l2c2.experiment.reports.paper import PAPER, TAU, is_of_paper
 from torchrl_l2c2.experiment.reports.paper_table import deployed_table, paper_table
 from torchrl_l2c2.experiment.reports.records import Record
 from torchrl_l2c2.experiment.reports.tables import Table, settings_notes
-from torchrl_l2c2.experiment.saved import BUDGETS
 from torchrl_l2c2.experiment.tasks import TASKS
 
 START, END = "<!-- results: start -->", "<!-- results: end -->"
@@ -130,15 +129,20 @@ def fill_pages(
             "of the field's table, of which a page's results are: name a file that has some, by "
             "--from or --csv."
         )
-    filled = {}
-    for path, text in pages.items():
-        whole = results.text(path.with_suffix(".svg").name)
-        whole = "\n\n".join([*(table.markdown() for table in first), whole])
-        brief = START_TABLE in text
-        filled[path] = fill(text, results.table, START_TABLE) if brief else fill(text, whole)
-    for path, text in filled.items():
-        if START_TABLE not in text:
-            results.draw(path.with_suffix(".svg"))
+    brief = {
+        path: fill(text, results.table, START_TABLE)
+        for path, text in pages.items()
+        if START_TABLE in text
+    }
+    before = [table.markdown() for table in first]
+    whole = {
+        path: fill(text, "\n\n".join([*before, results.text(path.with_suffix(".svg").name)]))
+        for path, text in pages.items()
+        if path not in brief
+    }
+    for path in whole:
+        results.draw(path.with_suffix(".svg"))
+    for path, text in (brief | whole).items():
         write_atomically(path, text.encode())
 
 
@@ -158,6 +162,6 @@ def shown_groups(records: Sequence[Record]) -> list[Group]:
 def is_as_usual(record: Record, *but: str) -> bool:
     """Whether it has its task's default length and settings, but for some that are named."""
     task = TASKS.get(record.task)
-    others = {k for k in record.other_settings if not k.startswith("regularizer.")}
-    others -= {*BUDGETS, *but}
+    others = {k for k in record.settings_of_any_length if not k.startswith("regularizer.")}
+    others -= {*but}
     return task is not None and record.length == f"{task.episodes} episodes" and not others
