@@ -7,6 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from small import ALGORITHMS
 from tensordict import TensorDict
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch import nn
@@ -380,7 +381,7 @@ def run(tmp_path_factory):
 def trained(folder, env_id="Pendulum-v1"):
     config = ExperimentConfig(
         task=TaskConfig("task", env_id, episodes=4, max_steps=40, noise_scale=0.05),
-        algorithm=PPORPEConfig(hidden=(8,), replay_ratio=2.0),
+        algorithm=ALGORITHMS["ppo_rpe"],
         regularizer=L2C2Config(sigma=0.5),
         compile=False,
         late_share=0.0,
@@ -419,8 +420,7 @@ class TestRun:
         for target in (0.01, 1.0):
             regularizer = L2C2Config(gain="gradient", gain_target=target)
             task = TaskConfig("pendulum", "Pendulum-v1", episodes=3, max_steps=60)
-            few = PPORPEConfig(hidden=(8,), replay_ratio=2.0)
-            config = ExperimentConfig(task, few, regularizer, compile=False)
+            config = ExperimentConfig(task, ALGORITHMS["ppo_rpe"], regularizer, compile=False)
             experiment = Experiment(config, tmp_path / str(target))
             experiment.train()
             experiment.finish(experiment.test(1))

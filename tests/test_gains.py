@@ -11,6 +11,7 @@ import warnings
 
 import pytest
 import torch
+from small import ALGORITHMS
 
 from torchrl_l2c2.experiment import (
     AdamConfig,
@@ -171,7 +172,7 @@ def small(regularizer=None, **settings):
     return ExperimentConfig(
         **{
             "task": TASK,
-            "algorithm": PPORPEConfig(hidden=(8,), replay_ratio=2.0),
+            "algorithm": ALGORITHMS["ppo_rpe"],
             "regularizer": regularizer or L2C2Config(),
             "replay": UniformReplayConfig(batch_size=8),
             "optimizer": AdamConfig(),

@@ -7,8 +7,9 @@ import sys
 import numpy as np
 import pytest
 import torch
+from small import ALGORITHMS
 
-from torchrl_l2c2.experiment import Experiment, ExperimentConfig, PPORPEConfig, TaskConfig
+from torchrl_l2c2.experiment import Experiment, ExperimentConfig, TaskConfig
 from torchrl_l2c2.experiment.process import ProcessState
 
 
@@ -49,8 +50,7 @@ def test_a_run_changes_nothing_of_the_process():
     threads, traced = torch.get_num_threads(), torch._dynamo.config.trace_autograd_ops
     before = torch.get_rng_state()
     task = TaskConfig("pendulum", "Pendulum-v1", episodes=2, max_steps=40)
-    few = PPORPEConfig(hidden=(8,), replay_ratio=2.0)
-    config = ExperimentConfig(task, few, compile=False, threads=threads + 1)
+    config = ExperimentConfig(task, ALGORITHMS["ppo_rpe"], compile=False, threads=threads + 1)
     experiment = Experiment(config)
     experiment.train()
     experiment.test(1)
@@ -62,8 +62,7 @@ def test_a_run_changes_nothing_of_the_process():
 def test_two_runs_in_turns_are_as_one_after_the_other():
     """Neither draws the other's numbers."""
     task = TaskConfig("pendulum", "Pendulum-v1", episodes=4, max_steps=40)
-    few = PPORPEConfig(hidden=(8,), replay_ratio=2.0)
-    config = ExperimentConfig(task, few, compile=False, late_share=0.0)
+    config = ExperimentConfig(task, ALGORITHMS["ppo_rpe"], compile=False, late_share=0.0)
     alone, first, second = (Experiment(config) for _ in range(3))
     for episodes in (1, 2, 3, 4):
         first.train(episodes)
