@@ -32,6 +32,7 @@ from torchrl.modules import (
 )
 from torchrl.objectives import (
     A2CLoss,
+    BCLoss,
     ClipPPOLoss,
     CQLLoss,
     CrossQLoss,
@@ -499,6 +500,22 @@ CASES = [
         HELLINGER,
         ("qvalue", "value"),
         continuous=False,
+    ),
+    Case(
+        "BC",
+        lambda **kw: BCLoss(gaussian_actor(), **kw),
+        transitions,
+        HELLINGER,
+        (),
+        has_targets=False,
+    ),
+    Case(
+        "deterministic BC",
+        lambda **kw: BCLoss(deterministic_actor(), **kw),
+        transitions,
+        DISTANCE,
+        (),
+        has_targets=False,
     ),
     Case(
         "CQL",

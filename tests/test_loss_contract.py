@@ -66,7 +66,8 @@ def equal(a: torch.Tensor | TensorDictBase, b: torch.Tensor | TensorDictBase) ->
 
 def expected_keys(case: Case) -> set[str]:
     policy = set() if case.policy is None else {case.policy}
-    return {*case.terms, *SHARED, *policy, "l2c2_value_distance"}
+    values = {"l2c2_value_distance"} if case.values else set()
+    return {*case.terms, *SHARED, *policy, *values}
 
 
 class TestWhatIsAdded:
@@ -147,7 +148,8 @@ class TestWhatIsAdded:
         batch = batch_of(case)
         del batch[unravel_key(("next", case.observation))]
         with pytest.raises(KeyError, match=r"next observation.*'next', .*'observation'"):
-            regularized(case).value_regularizer(batch)
+            loss = regularized(case)
+            (loss.value_regularizer if case.values else loss.policy_regularizer)(batch)
 
     def test_next_observations_that_are_not_finite_do_no_harm(self, case):
         """NaN at an episode's end counts as no displacement, in values and gradients."""
@@ -185,7 +187,7 @@ class TestWhatIsKept:
         before = run(base, batch_of(case))  # the value estimator is made here
         keys = copy.copy(base.tensor_keys)
         loss = L2C2Loss(base, NEAR)
-        loss.set_keys(reward="other_reward")
+        loss.set_keys(**{"reward" if case.values else "action": "other"})
         after = run(base, batch_of(case))
         assert type(base) is type(plain(case))
         assert set(after.keys()) == set(before.keys())
@@ -260,7 +262,7 @@ class TestWhatIsKept:
     def test_value_estimators_can_be_chosen(self, case):
         """make_value_estimator acts as on the plain loss."""
         base, loss = plain(case), regularized(case)
-        if not case.declares_keys:
+        if not (case.declares_keys and case.values):
             pytest.skip("the plain loss has no value estimator")
         for each in (base, loss):
             each.make_value_estimator(gamma=0.5)
@@ -269,6 +271,8 @@ class TestWhatIsKept:
 
     def test_keys_can_be_renamed(self, case):
         """set_keys acts as on the plain loss, and in_keys follow."""
+        if not case.values:
+            pytest.skip("behavior cloning reads no rewards")
         batch = batch_of(case, neighbors=1)
         batch["next"].rename_key_("reward", "other_reward")
         expected = run(regularized(case), batch_of(case, neighbors=1))
@@ -385,7 +389,8 @@ class TestSchedules:
         before = run(loss, batch.copy())
         buffer = loss.l2c2_coeff
         loss.l2c2_coeff = 0.5
-        loss.l2c2_beta = 0.3
+        if case.values:
+            loss.l2c2_beta = 0.3
         assert loss.l2c2_coeff is buffer
         after = run(loss, batch)
         for key in case.terms:
@@ -410,11 +415,12 @@ class TestSchedules:
         with pytest.raises(ValueError, match="l2c2_beta has nothing to scale"):
             loss.l2c2_beta = 0.1
 
-    def test_a_missing_policy_is_pointed_out(self, case):
-        """Losses without a policy say that its term is left out; others say nothing."""
+    def test_a_missing_term_is_pointed_out(self, case):
+        """Losses without a policy, or without values, say what is left out; others say nothing."""
         base = plain(case)
-        if case.policy is None:
-            with pytest.warns(UserWarning, match="leaves out the policy term"):
+        if case.policy is None or not case.values:
+            term = "value" if case.policy else "policy"
+            with pytest.warns(UserWarning, match=f"leaves out the {term} term"):
                 L2C2Loss(base)
         else:
             with warnings.catch_warnings():

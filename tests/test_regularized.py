@@ -47,7 +47,6 @@ from torchrl.modules import (
 )
 from torchrl.objectives import (
     A2CLoss,
-    BCLoss,
     ClipPPOLoss,
     CrossQLoss,
     DDPGLoss,
@@ -386,14 +385,13 @@ class TestAttributes:
 
 class TestWhatIsRefused:
     def test_losses_without_transitions(self):
-        """Imitation and sequence models have no next state: the message says so."""
+        """Sequence models have no next state: the message says so."""
         actor = TensorDictModule(
             mlp(OBSERVATION + ACTION + 1, ACTION),
             ["observation", "action", "return_to_go"],
             ["action"],
         )
         for loss in (
-            BCLoss(gaussian_actor()),
             DTLoss(actor),
             OnlineDTLoss(gaussian_actor(), alpha_init=1.0, target_entropy=-1.0),
         ):

@@ -8,6 +8,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import (
+    BCLoss,
     DreamerActorLoss,
     DreamerV3ActorLoss,
     DreamerV3Loss,
@@ -49,7 +50,9 @@ def check_is_trained_on_transitions(loss: LossModule) -> None:
             f"{name} evaluates its networks along trajectories that a learned model imagines, not "
             "at single observed states, so that there is no neighborhood to regularize them in."
         )
-    if in_keys and not any(isinstance(key, tuple) and key[0] == "next" for key in in_keys):
+    # Demonstrations have next states, which behavior cloning alone does not read.
+    reads_next = any(isinstance(key, tuple) and key[0] == "next" for key in in_keys)
+    if in_keys and not (reads_next or isinstance(loss, BCLoss)):
         raise TypeError(
             f"{name} is not trained on transitions (it reads {sorted(in_keys, key=str)}): "
             "without a next observation there is nothing to regularize between."
