@@ -75,14 +75,13 @@ def test_tests_during_training_are_continued_with_the_run(tmp_path):
     assert whole._best_policy.tests == parts._best_policy.tests
 
 
-def test_a_run_in_another_folder_takes_its_best_policy_along(tmp_path):
+def test_a_run_in_another_folder_takes_its_best_policy_along(folder, tmp_path):
     """Even where no later one is better, or tested."""
-    run(tmp_path / "old", evaluate_every=2, task=replace(TASK, episodes=2))
-    config = ExperimentConfig(**FEW_UPDATES)
-    Experiment(config, tmp_path / "new", resume=tmp_path / "old").close()
+    config = ExperimentConfig(**FEW_UPDATES | {"task": replace(TASK, episodes=8)})
+    Experiment(config, tmp_path / "new", resume=folder).close()
     for name in ("evaluations.json", "policy_best.pt"):
         brought = (tmp_path / "new" / name).read_bytes()
-        assert brought == (tmp_path / "old" / name).read_bytes()
+        assert brought == (folder / name).read_bytes()
 
 
 def test_a_run_without_tests_plays_none():
@@ -266,6 +265,6 @@ def test_the_best_policy_is_loaded_where_there_is_one(folder, tmp_path):
     kept = torch.load(folder / "policy_best.pt", weights_only=True)
     policy = load_policy(folder, best=True)[0]
     assert all(kept[k].equal(v) for k, v in policy.state_dict().items())
-    run(tmp_path)
+    shutil.copytree(folder, tmp_path / "without", ignore=shutil.ignore_patterns("policy_best.pt"))
     with pytest.raises(FileNotFoundError, match=r"evaluate_every=N makes it .* in another folder"):
-        load_policy(tmp_path, best=True)
+        load_policy(tmp_path / "without", best=True)

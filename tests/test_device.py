@@ -1,5 +1,7 @@
 """Updates on one device, a policy that plays on the CPU."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from small import ALGORITHMS, env_id_of, replay_of
@@ -14,12 +16,14 @@ from torchrl_l2c2.experiment.settings import SettingError
 
 CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 
+FEW_UPDATES = {name: replace(ALGORITHMS[name], random_frames=50) for name in ("sac", "td3")}
+
 
 def config(name, **settings):
     return ExperimentConfig(
         **{
-            "task": TaskConfig("task", env_id_of(name), episodes=4, max_steps=30),
-            "algorithm": ALGORITHMS[name],
+            "task": TaskConfig("task", env_id_of(name), episodes=3, max_steps=30),
+            "algorithm": FEW_UPDATES.get(name, ALGORITHMS[name]),
             # By priority where that is usual: the draws go to the device as well.
             **({} if name == "ppo_rpe" else {"replay": replay_of(name)}),
             "optimizer": AdamConfig(lr=0.001),

@@ -378,6 +378,12 @@ def run(tmp_path_factory):
     return trained(tmp_path_factory.mktemp("runs") / "l2c2")
 
 
+@pytest.fixture(scope="module")
+def blank(tmp_path_factory):
+    """Of a task that draws nothing."""
+    return trained(tmp_path_factory.mktemp("runs") / "blank", "Blank-v0")
+
+
 def trained(folder, env_id="Pendulum-v1"):
     config = ExperimentConfig(
         task=TaskConfig("task", env_id, episodes=4, max_steps=40, noise_scale=0.05),
@@ -419,7 +425,7 @@ class TestRun:
         shares = {}
         for target in (0.01, 1.0):
             regularizer = L2C2Config(gain="gradient", gain_target=target)
-            task = TaskConfig("pendulum", "Pendulum-v1", episodes=3, max_steps=60)
+            task = TaskConfig("pendulum", "Pendulum-v1", episodes=3, max_steps=40)
             config = ExperimentConfig(task, ALGORITHMS["ppo_rpe"], regularizer, compile=False)
             experiment = Experiment(config, tmp_path / str(target))
             experiment.train()
@@ -518,11 +524,10 @@ gymnasium.register("Blank-v0", Blank)
 class TestCommand:
     """Says it, and writes the page."""
 
-    def test_two_runs(self, run, tmp_path, capsys):
+    def test_two_runs(self, run, blank, tmp_path, capsys):
         """A video where the task draws pictures, a word where it does not."""
         pytest.importorskip("pygame")
         pytest.importorskip("imageio_ffmpeg")
-        blank = trained(tmp_path / "blank", "Blank-v0")
         path = tmp_path / "new" / "page.html"
         main([str(run), str(blank), "--episodes", "1", "--output", str(path)])
         told, text = capsys.readouterr().out, path.read_text()
@@ -535,12 +540,12 @@ class TestCommand:
         main([str(run), "--no-video", "--episodes", "1"])
         assert "<video" not in (run / "diagnosis.html").read_text()
 
-    def test_actions_of_all_runs_are_one_picture(self, run, tmp_path, capsys):
+    def test_actions_of_all_runs_are_one_picture(self, run, blank, tmp_path, capsys):
         """A row for each, by the names that were given, on the same axes."""
-        other, path = trained(tmp_path / "other", "Blank-v0"), tmp_path / "new" / "actions.svg"
+        path = tmp_path / "new" / "actions.svg"
         names = ["the first", "the second"]
         chosen = ["--names", *names, "--actions", str(path), "--no-video", "--episodes", "1"]
-        main([str(run), str(other), *chosen])
+        main([str(run), str(blank), *chosen])
         told, picture = capsys.readouterr().out, path.read_text()
         for name in names:
             assert f"{name}: return " in told and f">{name}: return " in picture

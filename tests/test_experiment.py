@@ -55,7 +55,8 @@ FEW_UPDATES = PPORPEConfig(replay_ratio=2.0)
 
 
 def small(**settings):
-    return ExperimentConfig(**{"task": PENDULUM, "compile": False, "test_episodes": 2, **settings})
+    usual = {"task": PENDULUM, "algorithm": FEW_UPDATES, "compile": False, "test_episodes": 2}
+    return ExperimentConfig(**{**usual, **settings})
 
 
 def known(row):
@@ -78,9 +79,7 @@ def test_200_steps_of_every_task_and_with_every_method(task, regularizer):
     config = TaskConfig(
         task, f"pybullet_envs_gymnasium:{TASKS[task]}", episodes=episodes, max_steps=100
     )
-    experiment = Experiment(
-        small(task=config, algorithm=FEW_UPDATES, regularizer=regularizer, test_episodes=1)
-    )
+    experiment = Experiment(small(task=config, regularizer=regularizer, test_episodes=1))
     metrics = experiment.train()
     assert experiment.player.frames >= 200
     assert experiment.learner.updates > 0
@@ -98,7 +97,7 @@ def test_the_same_seed_gives_the_same_numbers_and_another_seed_others():
     """Everything random hangs on the seed."""
 
     def numbers(seed):
-        return known(Experiment(small(algorithm=FEW_UPDATES, seed=seed)).train()[-1])
+        return known(Experiment(small(seed=seed)).train()[-1])
 
     assert numbers(0) == numbers(0)
     assert numbers(0) != numbers(1)
@@ -109,13 +108,15 @@ def test_the_same_seed_gives_the_same_numbers_and_another_seed_others():
     [
         {"replay": UniformReplayConfig(batch_size=32)},
         {"optimizer": AdamConfig()},
-        {"algorithm": PPORPEConfig(schedule="step", updates=2)},
-        {"algorithm": PPORPEConfig(acting_policy="online", baseline="target")},
-        {"algorithm": PPORPEConfig(importance="mean")},
-        {"algorithm": PPORPEConfig(reduction="mean")},
-        {"algorithm": PPORPEConfig(time_limit="terminated", squash="sigmoid")},
-        {"algorithm": PPORPEConfig(squash="none", threshold="ema", critic_weighting="ratio")},
-        {"algorithm": PPORPEConfig(reward_scale=1.0, hidden=(8,), num_heads=1, updates=3)},
+        {"algorithm": replace(FEW_UPDATES, schedule="step")},
+        {"algorithm": replace(FEW_UPDATES, acting_policy="online", baseline="target")},
+        {"algorithm": replace(FEW_UPDATES, importance="mean")},
+        {"algorithm": replace(FEW_UPDATES, reduction="mean")},
+        {"algorithm": replace(FEW_UPDATES, time_limit="terminated", squash="sigmoid")},
+        {"algorithm": replace(FEW_UPDATES, squash="none", threshold="ema")},
+        {"algorithm": replace(FEW_UPDATES, critic_weighting="ratio")},
+        {"algorithm": replace(FEW_UPDATES, reward_scale=1.0, hidden=(8,), num_heads=1)},
+        {"algorithm": PPORPEConfig(updates=3)},
         {"task": replace(PENDULUM, noise_scale=0.0)},
     ],
     ids=str,
@@ -199,9 +200,9 @@ def test_updates_follow_the_schedule():
     episode.train()
     assert episode.learner.updates == 40 // 32 + 80 // 32
     step = Experiment(small(algorithm=PPORPEConfig(schedule="step", updates=2)))
-    step.train()
+    step.train(1)
     # From the step on that fills the first batch of 32.
-    assert step.learner.updates == 2 * (2 * 40 - 31)
+    assert step.learner.updates == 2 * (40 - 31)
 
 
 def test_the_replay_ratio_is_how_often_a_transition_is_drawn():
@@ -410,7 +411,7 @@ def test_a_longer_run_begins_as_a_shorter_one():
 def test_a_training_in_parts_is_the_one_in_one_go():
     """Also beside tests; the learning rate falls over all of it, whose last part has late tests."""
     task, adam = replace(PENDULUM, episodes=6), AdamConfig(linear=True)
-    settings = small(task=task, algorithm=PPORPEConfig(hidden=(8,)), optimizer=adam, late_share=0.5)
+    settings = small(task=task, optimizer=adam, late_share=0.5)
     whole, parts = Experiment(settings), Experiment(settings)
     for episodes in (2, 4, None):
         parts.train(episodes)
@@ -421,10 +422,10 @@ def test_a_training_in_parts_is_the_one_in_one_go():
 
 
 ALGORITHMS = {
-    "sac": SACConfig(random_frames=20),
-    "td3": TD3Config(random_frames=20),
+    "sac": SACConfig(random_frames=60),
+    "td3": TD3Config(random_frames=60),
     "ppo": PPOConfig(frames=60, epochs=2),
-    "dqn": DQNConfig(random_frames=20),
+    "dqn": DQNConfig(random_frames=100),
 }
 
 
@@ -484,6 +485,9 @@ PENDULUM_OVERRIDES = (
     "task.max_steps=50",
     "test_episodes=2",
 )
+
+
+SHORTER = ("algorithm.replay_ratio=1", "test_episodes=1")
 
 
 def test_a_run_from_the_command_line_leaves_everything_behind(tmp_path):
@@ -577,7 +581,7 @@ def test_what_is_refused_with_workers_ends(tmp_path):
 
 def test_a_sweep_gives_one_table(tmp_path):
     """Methods and seeds in their order; figures over seeds with every seed's own behind them."""
-    overrides = ("regularizer=none,l2c2", "seed=0,1", "hydra/launcher=basic")
+    overrides = (*SHORTER, "regularizer=none,l2c2", "seed=0,1", "hydra/launcher=basic")
     done = run_train("-m", *PENDULUM_OVERRIDES, *overrides, folder=tmp_path)
     runs = read_runs(tmp_path)
     assert [(run.regularizer, run.seed) for run in runs] == [
@@ -598,7 +602,8 @@ def test_a_sweep_gives_one_table(tmp_path):
 
 def test_in_a_sweep_a_failed_job_is_told_and_the_others_go_on(tmp_path):
     """And the same command again does not repeat what is finished."""
-    overrides = ("-m", *PENDULUM_OVERRIDES, "regularizer.sigma=-1,1", "hydra/launcher=basic")
+    overrides = ("-m", *PENDULUM_OVERRIDES, *SHORTER, "regularizer.sigma=-1,1")
+    overrides += ("hydra/launcher=basic",)
     failed = run_train(*overrides, folder=tmp_path, check=False)
     assert failed.returncode == 1
     assert "sigma must be greater than 0, got -1" in failed.stderr

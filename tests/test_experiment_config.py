@@ -1,11 +1,13 @@
 """The settings: declared once, and what cannot be is refused with what is allowed."""
 
+import copy
 import dataclasses
 import inspect
 import subprocess
 import sys
 from contextlib import nullcontext
-from functools import partial
+from functools import cache, partial
+from itertools import zip_longest
 from pathlib import Path
 
 import pytest
@@ -35,12 +37,24 @@ from torchrl_l2c2.experiment.tasks import FIELD_TASKS, PAPER_TASKS
 ROOT = Path(__file__).parent.parent
 
 
-def composed(*overrides):
-    """What the command composes."""
+@pytest.fixture(scope="module", autouse=True)
+def nodes_of_the_command():
+    """Stored once for all tests."""
     with own_nodes():
         register()
         with initialize_config_dir(str(CONF), version_base="1.3"):
-            return OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
+            yield
+    composed_once.cache_clear()
+
+
+@cache
+def composed_once(*overrides):
+    return OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
+
+
+def composed(*overrides):
+    """What the command composes."""
+    return copy.deepcopy(composed_once(*overrides))
 
 
 def test_the_command_has_the_defaults_of_the_classes():
@@ -48,14 +62,22 @@ def test_the_command_has_the_defaults_of_the_classes():
     assert ExperimentConfig.from_dict(composed()) == ExperimentConfig()
 
 
-@pytest.mark.parametrize(("group", "name"), [(g, name) for g in GROUPS for name in GROUPS[g]])
-def test_every_choice_is_the_object_of_its_name(group, name):
+# An algorithm brings its replay; of the others, one of each group is chosen at a time.
+APART = ("algorithm", "replay")
+CHOICES = [((group, name),) for group in APART for name in GROUPS[group]]
+CHOICES += zip_longest(*([(g, name) for name in GROUPS[g]] for g in GROUPS if g not in APART))
+
+
+@pytest.mark.parametrize("chosen", [dict(filter(None, each)) for each in CHOICES], ids=str)
+def test_every_choice_is_the_object_of_its_name(chosen):
     """From the command line and from its name alone."""
     # The frames of one rollout are what on-policy learning alone can use.
-    extra = ["algorithm=ppo"] if name == "rollout" else []
-    config = ExperimentConfig.from_dict(composed(f"{group}={name}", *extra))
-    assert getattr(config, group) == GROUPS[group][name]
-    assert GROUPS[group][name].name == name
+    extra = ["algorithm=ppo"] if chosen.get("replay") == "rollout" else []
+    given = [f"{group}={name}" for group, name in chosen.items()]
+    config = ExperimentConfig.from_dict(composed(*given, *extra))
+    for group, name in chosen.items():
+        assert getattr(config, group) == GROUPS[group][name]
+        assert GROUPS[group][name].name == name
 
 
 @pytest.mark.parametrize("algorithm", GROUPS["algorithm"])
@@ -187,9 +209,8 @@ ZOO = {
 @pytest.mark.parametrize("algorithm", ["ppo", "sac"])
 @pytest.mark.parametrize("task", FIELD_TASKS)
 def test_a_preset_is_of_a_task_and_an_algorithm(task, algorithm):
-    """Whichever way they are chosen; what is given beside it goes before."""
-    chosen = ["preset=rl_zoo", f"task={task}", f"algorithm={algorithm}"]
-    values = composed(*chosen)
+    """Whichever way they are chosen."""
+    values = composed("preset=rl_zoo", f"task={task}", f"algorithm={algorithm}")
     config = ExperimentConfig.from_dict(values)
     assert values["preset"] == "rl_zoo"
     sizes, own = ZOO[task, algorithm]
@@ -200,8 +221,12 @@ def test_a_preset_is_of_a_task_and_an_algorithm(task, algorithm):
     assert config.optimizer.eps == (1e-5 if algorithm == "ppo" else 1e-8)
     assert config.optimizer.linear == ((task, algorithm) == ("lunarlander", "sac"))
     assert (config.task.env_id, config.test_episodes) == (FIELD_TASKS[task].env_id, 10)
-    other = ExperimentConfig.from_dict(composed(*chosen, "algorithm.gamma=0.5"))
-    assert other.algorithm.gamma == 0.5
+
+
+def test_what_is_given_beside_a_preset_goes_before():
+    """Whatever it has of it."""
+    chosen = ["preset=rl_zoo", "task=hopper_v5", "algorithm=ppo", "algorithm.gamma=0.5"]
+    assert ExperimentConfig.from_dict(composed(*chosen)).algorithm.gamma == 0.5
 
 
 def test_baselines_settings_of_hopper_are_those_of_stable_baselines_normalized():

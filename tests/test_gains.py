@@ -161,6 +161,7 @@ class TestByHand:
 
 
 TASK = TaskConfig("pendulum", "Pendulum-v1", episodes=6, max_steps=40)
+FEW_UPDATES = dataclasses.replace(ALGORITHMS["ppo_rpe"], replay_ratio=1.0)
 KINDS = {
     "ramp": {"gain": "ramp"},
     "gradient": {"gain": "gradient", "gain_target": 0.3},
@@ -172,7 +173,7 @@ def small(regularizer=None, **settings):
     return ExperimentConfig(
         **{
             "task": TASK,
-            "algorithm": ALGORITHMS["ppo_rpe"],
+            "algorithm": FEW_UPDATES,
             "regularizer": regularizer or L2C2Config(),
             "replay": UniformReplayConfig(batch_size=8),
             "optimizer": AdamConfig(),
@@ -281,12 +282,17 @@ class TestInARun:
         """Parameters, gains and metrics, to the last bit."""
         assert_continues(small(L2C2Config(**KINDS[kind]), late_share=0.0), tmp_path, 3, 6)
 
+    @pytest.fixture
+    def measured_soon(self, monkeypatch):
+        """After 20 updates, not 100, it is told which regularizer is faint."""
+        monkeypatch.setattr("torchrl_l2c2.experiment.learner.MEASURED_AFTER", 20)
+
     @pytest.mark.parametrize("kind", ["constant", "ramp", "target"])
-    def test_a_gain_that_does_not_rise_by_itself_is_told_to_be_faint(self, kind):
-        """After 100 updates; a ramp by what it ends with, and goes on from where it is."""
+    def test_a_gain_that_does_not_rise_by_itself_is_told_to_be_faint(self, kind, measured_soon):
+        """Once measured; a ramp by what it ends with, and goes on from where it is."""
         of_kind = {"gain": kind, **({"gain_target": 0.1} if kind == "target" else {})}
         regularizer = L2C2Config(lambda_min=1e-9, lambda_max=1e-8, **of_kind)
-        run = Experiment(small(regularizer, algorithm=PPORPEConfig(hidden=(8,), updates=60)))
+        run = Experiment(small(regularizer, algorithm=PPORPEConfig(hidden=(8,), updates=12)))
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             run.train(2)
@@ -295,10 +301,10 @@ class TestInARun:
         if kind == "ramp":
             assert run.agent.loss.l2c2_coeff == run.metrics[-1]["gain_measured"] > 0.0
 
-    def test_a_ramp_is_told_by_the_gain_that_it_ends_with(self):
+    def test_a_ramp_is_told_by_the_gain_that_it_ends_with(self, measured_soon):
         """Its first updates have none."""
         regularizer = L2C2Config(lambda_min=1.0, lambda_max=100.0, gain="ramp")
-        run = Experiment(small(regularizer, algorithm=PPORPEConfig(hidden=(8,), updates=120)))
+        run = Experiment(small(regularizer, algorithm=PPORPEConfig(hidden=(8,), updates=24)))
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             run.train(1)
@@ -343,19 +349,23 @@ ROLLOUTS = {
 }
 
 
+# What is normalized is played by simulators as well.
+KINDS_OF_ROLLOUTS = ["episodes", pytest.param("simulators", marks=pytest.mark.slow), "normalized"]
+
+
 def small_ppo(kind="episodes", **settings):
     """A rollout is forgotten before the gain is set, and several episodes end in it."""
     regularizer = L2C2Config(**{**KINDS["gradient"], "policy_distance": "mean", **settings})
     return small(
         regularizer,
-        algorithm=PPOConfig(hidden=(8,), epochs=2, **ROLLOUTS[kind]),
-        replay=RolloutReplayConfig(batch_size=16),
+        algorithm=PPOConfig(hidden=(8,), epochs=1, **ROLLOUTS[kind]),
+        replay=RolloutReplayConfig(batch_size=32),
         late_share=0.0,
     )
 
 
 class TestRollouts:
-    @pytest.mark.parametrize("kind", ROLLOUTS)
+    @pytest.mark.parametrize("kind", KINDS_OF_ROLLOUTS)
     def test_the_share_is_measured_on_the_rollout_that_was_learned_from(self, kind, monkeypatch):
         """With rate 1 the next measurement there gives the target."""
         run, kept = Experiment(small_ppo(kind, gain_rate=1.0)), []
@@ -363,7 +373,7 @@ class TestRollouts:
         monkeypatch.setattr(run.learner.replay, "extend", lambda t: kept.append(t) or extend(t))
         run.train(2)
         rollout, batch = torch.cat(kept), run.learner.example()
-        rows = torch.linspace(0, len(rollout) - 1, 16).long()
+        rows = torch.linspace(0, len(rollout) - 1, 32).long()
         assert len(run.learner.replay) == 0 < run.learner.updates
         assert batch["observation"].equal(rollout["observation"][rows])
         assert batch["advantage"].equal(rollout["advantage"][rows])
@@ -371,7 +381,7 @@ class TestRollouts:
         assert shares["loss_l2c2_actor"] == pytest.approx(0.3, rel=1e-4)
         assert shares["loss_l2c2_critic"] == pytest.approx(0.3, rel=1e-4)
 
-    @pytest.mark.parametrize("kind", ROLLOUTS)
+    @pytest.mark.parametrize("kind", KINDS_OF_ROLLOUTS)
     def test_it_is_measured_with_the_gain_that_was_applied(self, kind):
         """Once for a rollout; with rate 1 every gain follows from the one before and its share."""
         run = Experiment(small_ppo(kind, gain_rate=1.0))
@@ -383,7 +393,7 @@ class TestRollouts:
             assert after["gain_policy"] == pytest.approx(expected)
             assert row["updates"] < after["updates"]
 
-    @pytest.mark.parametrize("kind", ROLLOUTS)
+    @pytest.mark.parametrize("kind", KINDS_OF_ROLLOUTS)
     def test_a_target_is_of_the_rollout_that_was_learned_from(self, kind):
         """Of all its episodes: a single one is noisy, and the first that ends a short one."""
         of_kind = {"gain": "target", "gain_target": 0.1, "gain_rate": 0.5}
@@ -404,7 +414,7 @@ class TestRollouts:
         assert several
 
     @pytest.mark.parametrize("gain", ["gradient", "target"])
-    @pytest.mark.parametrize("kind", ROLLOUTS)
+    @pytest.mark.parametrize("kind", KINDS_OF_ROLLOUTS)
     def test_a_continued_run_is_the_uninterrupted_one(self, tmp_path, kind, gain):
         """To the last bit, wherever in the rollouts it was interrupted."""
         assert_continues(small_ppo(kind, gain=gain), tmp_path, 5, 10)

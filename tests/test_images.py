@@ -166,7 +166,7 @@ def test_where_to_press_is_learned_from_the_image(tmp_path):
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_every_algorithm_trains_its_convolutional_layers_with_l2c2(name):
     """All of them: those of policy and values."""
-    run = lamp_experiment(name, L2C2Config(), episodes=6)
+    run = lamp_experiment(name, L2C2Config(), episodes=6 if name == "ppo" else 3)
     seen = {
         key: value.clone()
         for key, value in run.agent.loss.named_parameters()
@@ -180,6 +180,6 @@ def test_every_algorithm_trains_its_convolutional_layers_with_l2c2(name):
 
 def test_caps_takes_images():
     """Its noisy states are images as well."""
-    run = lamp_experiment("ppo_rpe", CAPSConfig(), episodes=4)
+    run = lamp_experiment("ppo_rpe", CAPSConfig(), episodes=2)
     rows = run.train()
     assert rows[-1]["updates"] > 0 and np.isfinite(rows[-1]["loss_caps_spatial"])

@@ -1,5 +1,6 @@
 """The package as a whole: its style, what importing it needs, and what it says of itself."""
 
+import json
 import re
 import subprocess
 import sys
@@ -29,17 +30,48 @@ def test_the_types_fit():
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_importing_the_components_needs_nothing_of_the_experiment():
+# What is imported, and when, in a process that has imported nothing yet: one for all tests.
+IMPORTS = """
+import json, sys, torchrl
+begun = set(sys.modules)
+ours = lambda: sorted(name for name in sys.modules if name.startswith('torchrl_l2c2.'))
+new = lambda before: sorted({name.split('.')[0] for name in set(sys.modules) - before} & FOREIGN)
+FOREIGN = {'hydra', 'omegaconf', 'gymnasium', 'pybullet', 'matplotlib', 'tqdm'}
+import torchrl_l2c2
+told = {'at first': [*ours(), *new(begun)], 'losses': 'torchrl.objectives' in sys.modules}
+import torchrl.modules, torchrl.objectives, torchrl.envs
+before = set(sys.modules)
+told['dir'] = 'L2C2Loss' in dir(torchrl_l2c2)
+told['named'] = torchrl_l2c2.L2C2Loss.__name__, 'torchrl_l2c2.objectives' in ours()
+from torchrl_l2c2 import *
+told['components'] = new(before)
+import torchrl_l2c2.trainers
+from hydra.core.config_store import ConfigStore
+repo = ConfigStore.instance().repo
+told['stored'] = ['sac.yaml' in repo['loss'], 'l2c2.yaml' in repo['loss']]
+torchrl_l2c2.trainers.register()
+told['registered'] = 'l2c2.yaml' in repo['loss']
+print(json.dumps(told))
+"""
+
+
+@pytest.fixture(scope="module")
+def imported():
+    """What that process tells."""
+    command = [sys.executable, "-c", IMPORTS]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def test_importing_the_components_needs_nothing_of_the_experiment(imported):
     """No Hydra, Gymnasium, PyBullet or drawing library beyond what torchrl itself imports."""
-    code = (
-        "import sys, torchrl, torchrl.modules, torchrl.objectives, torchrl.envs\n"
-        "before = set(sys.modules)\n"
-        "from torchrl_l2c2 import *\n"
-        "new = {name.split('.')[0] for name in set(sys.modules) - before}\n"
-        "print(sorted(new & {'hydra', 'gymnasium', 'pybullet', 'matplotlib', 'tqdm'}))\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    assert imported["components"] == []
+
+
+def test_hydra_is_optional_and_registration_explicit(imported):
+    """Importing the package imports no Hydra; importing the configurations stores none of them."""
+    assert imported["at first"] == []
+    assert imported["stored"] == [True, False] and imported["registered"]
 
 
 def test_the_package_says_what_there_is_without_torch():
@@ -60,17 +92,10 @@ def test_the_package_says_what_there_is_without_torch():
         assert find_spec(command), command
 
 
-def test_importing_the_package_puts_off_what_it_exports():
+def test_importing_the_package_puts_off_what_it_exports(imported):
     """Not one of its modules is imported before a name of it is used; then it is there."""
-    code = (
-        "import sys, torchrl, torchrl_l2c2\n"
-        "ours = lambda: sorted(name for name in sys.modules if name.startswith('torchrl_l2c2.'))\n"
-        "print(ours(), 'torchrl.objectives' in sys.modules)\n"
-        "assert 'L2C2Loss' in dir(torchrl_l2c2)\n"
-        "print(torchrl_l2c2.L2C2Loss.__name__, 'torchrl_l2c2.objectives' in ours())\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines() == ["[] False", "L2C2Loss True"]
+    assert imported["at first"] == [] and not imported["losses"]
+    assert imported["dir"] and imported["named"] == ["L2C2Loss", True]
 
 
 def test_every_public_name_is_documented_with_an_example():

@@ -288,6 +288,7 @@ def paper_loss_and_batch():
     )
 
 
+@pytest.mark.slow  # that there is no break, test_loss_contract finds out with L2C2 around it
 def test_compiled_without_a_break_it_gives_the_same_losses():
     """One graph, the same numbers."""
     loss, batch = paper_loss_and_batch()

@@ -100,9 +100,10 @@ def test_it_compiles_under_autocast(batch):
         batch[key].bfloat16() for key in ("observation", ("next", "observation"))
     )
     loss = CATSLoss(ppo())
-    compiled = torch.compile(loss, fullgraph=True, backend="eager")
+    # Not beside the loss's own terms, which would take most of the time.
+    compiled = torch.compile(loss.policy_regularizer, fullgraph=True, backend="eager")
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        found, expected = compiled(batch.copy()), loss(batch.copy())
+        found, expected = compiled(batch.copy()), loss.policy_regularizer(batch.copy())
     torch.testing.assert_close(found["loss_cats"], expected["loss_cats"])
 
 

@@ -4,10 +4,12 @@ import copy
 import json
 import logging
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 
 import pytest
 import torch
+import torch._inductor.compile_fx
 
 from torchrl_l2c2 import NeighborTransform
 from torchrl_l2c2.experiment import (
@@ -33,7 +35,7 @@ logging.getLogger("torchrl").setLevel(logging.ERROR)
 TASK = TaskConfig("pendulum", "Pendulum-v1", episodes=1, max_steps=60)
 PAPER = ExperimentConfig(
     task=TASK,
-    algorithm=PPORPEConfig(hidden=(8,), num_heads=2),
+    algorithm=PPORPEConfig(hidden=(8,), num_heads=2, replay_ratio=5.0),
     replay=PrioritizedReplayConfig(capacity=50, batch_size=8),
     compile=False,
 )
@@ -53,6 +55,21 @@ CASES = {
         replay=PrioritizedReplayConfig(capacity=50, batch_size=8),
     ),
 }
+
+
+@cache
+def state_of(config: ExperimentConfig) -> dict[str, object]:
+    """Of a run that was trained, once for all tests that go on from there."""
+    experiment = Experiment(config)
+    experiment.train()
+    return experiment.state_dict()
+
+
+def trained(config: ExperimentConfig) -> Experiment:
+    """A run of its own in that state."""
+    experiment = Experiment(config)
+    experiment.load_state_dict(copy.deepcopy(state_of(config)))
+    return experiment
 
 
 def by_hand(experiment: Experiment) -> None:
@@ -90,8 +107,7 @@ def test_an_update_is_what_sampling_updating_and_prioritizing_by_hand_gives(name
     """To the bit: rows, weights, neighbors, and the priorities that decide the next rows."""
     results = []
     for step in (lambda experiment: experiment.learner.update(True), by_hand):
-        experiment = Experiment(CASES[name])
-        experiment.train()
+        experiment = trained(CASES[name])
         before = learned(experiment)
         torch.manual_seed(0)  # SAC draws actions.
         for _ in range(5):
@@ -103,8 +119,7 @@ def test_an_update_is_what_sampling_updating_and_prioritizing_by_hand_gives(name
 
 def test_the_batch_has_the_entries_and_neighbors_that_the_buffer_gives():
     """Whatever the buffer's transform writes, at its own random numbers."""
-    experiment = Experiment(PAPER)
-    experiment.train()
+    experiment = trained(PAPER)
     update, state = experiment.learner.update, experiment.state_dict()
     expected = experiment.learner.replay.sample()
     experiment.load_state_dict(state)
@@ -133,14 +148,12 @@ def test_where_a_transition_lies_says_nothing_of_its_neighbor(name):
 
 
 @pytest.mark.skipif(not compiler_available(), reason="no C++ compiler")
-# The rollout's, below, is the quick one with Adam.
+# The others with Adam take as long.
 @pytest.mark.parametrize("name", ["prioritized", pytest.param("sac", marks=pytest.mark.slow)])
 def test_compiled_it_learns_the_same_and_follows_what_may_change(name):
     """Gain, learning rate, a policy left out, and an older state, loaded over its tensors."""
     seen = []
-    played = Experiment(CASES[name])
-    played.train()
-    state = played.state_dict()
+    state = copy.deepcopy(state_of(CASES[name]))
     for compile in (True, False):
         experiment, values = Experiment(replace(CASES[name], compile=compile)), []
         # With a learning rate that is a number, as it was in earlier checkpoints.
@@ -189,8 +202,7 @@ def test_a_loss_that_was_compiled_still_has_its_contents(name):
 
 def test_advantages_are_those_of_the_whole_episode():
     """By hand, from the last frame to the first; the shuffled rows of a minibatch keep them."""
-    experiment = Experiment(CASES["rollout"])
-    experiment.train()
+    experiment = trained(CASES["rollout"])
     algorithm, episode = experiment.config.algorithm, experiment.learner.replay[:]
     critic = experiment.agent.advantage.value_network
     with torch.no_grad():
@@ -209,12 +221,14 @@ def test_advantages_are_those_of_the_whole_episode():
 
 
 @pytest.mark.skipif(not compiler_available(), reason="no C++ compiler")
-def test_a_rollout_s_smaller_last_batch_is_learned_from_without_a_graph(monkeypatch):
+@pytest.mark.parametrize("graph", ["as it is", pytest.param("compiled", marks=pytest.mark.slow)])
+def test_a_rollout_s_smaller_last_batch_is_learned_from_without_a_graph(monkeypatch, graph):
     """Compiled, two passes with batches of 21, 21 and 18 do as they do uncompiled."""
+    if graph == "as it is":
+        monkeypatch.setattr(torch._inductor.compile_fx, "compile_fx", lambda module, _: module)
     read, runs = ReplayUpdate.read, []
     monkeypatch.setattr(ReplayUpdate, "read", lambda *args: runs.append(args) or read(*args))
-    played = Experiment(CASES["rollout"])
-    played.train()
+    played = trained(CASES["rollout"])
     seen = []
     for compile in (True, False):
         experiment = Experiment(replace(CASES["rollout"], compile=compile))

@@ -6,6 +6,7 @@ import hashlib
 import importlib.metadata
 import json
 import re
+import shutil
 import signal
 import sys
 import time
@@ -75,6 +76,32 @@ def small(**settings):
     )
 
 
+@pytest.fixture(scope="module")
+def first_ended(tmp_path_factory):
+    """The folder of a run that was trained, and that of the same run with its results."""
+    trained, ended = (tmp_path_factory.mktemp("first") / name for name in ("trained", "ended"))
+    run = Experiment(small(), trained)
+    run.train()
+    shutil.copytree(trained, ended, ignore=shutil.ignore_patterns(".lock*"))
+    run.close()
+    run = Experiment(small(), ended)
+    run.finish(run.test())
+    run.close()
+    return trained, ended
+
+
+@pytest.fixture
+def trained(first_ended, tmp_path):
+    """A copy of the first, of the test's own."""
+    return shutil.copytree(first_ended[0], tmp_path / "run")
+
+
+@pytest.fixture
+def ended(first_ended, tmp_path):
+    """A copy of the second, likewise."""
+    return shutil.copytree(first_ended[1], tmp_path / "run")
+
+
 def parameter_hash(experiment):
     digest = hashlib.sha256()
     for name, tensor in sorted(experiment.agent.loss.state_dict().items()):
@@ -106,7 +133,10 @@ def lines(folder, late_tests=True):
         {"regularizer": L2C2Config()},
         {"regularizer": CAPSConfig(), "task": HOPPER, "algorithm": PPORPEConfig()},
         {"replay": UniformReplayConfig(batch_size=32), "optimizer": AdamConfig()},
-        {"algorithm": PPORPEConfig(schedule="step"), "task": replace(SWINGUP, max_steps=30)},
+        {
+            "algorithm": PPORPEConfig(schedule="step", replay_ratio=3.0),
+            "task": replace(SWINGUP, max_steps=30),
+        },
         {
             # Three episodes of 30 frames end in two rollouts, ten frames before their end.
             "task": TaskConfig("pendulum", "Pendulum-v1", 0.01, 6, 30),
@@ -143,27 +173,19 @@ def test_a_continued_run_is_the_uninterrupted_one(tmp_path, settings):
     assert second.test() == whole.test()
 
 
-def test_a_run_can_be_continued_in_another_folder(tmp_path):
+def test_a_run_can_be_continued_in_another_folder(trained, tmp_path):
     """resume= reads there and writes here."""
-    Experiment(small(), tmp_path / "a").train()
-    longer = Experiment(
-        small(task=replace(SWINGUP, episodes=8)), tmp_path / "b", resume=tmp_path / "a"
-    )
+    longer = Experiment(small(task=replace(SWINGUP, episodes=8)), tmp_path / "b", resume=trained)
     longer.train()
-    assert len(lines(tmp_path / "a")) == 6
+    assert len(lines(trained)) == 6
     assert [row["episode"] for row in lines(tmp_path / "b")] == [str(i) for i in range(1, 9)]
 
 
 @pytest.mark.parametrize("steps", range(8))
-def test_a_finished_run_that_goes_on_is_unfinished(tmp_path, monkeypatch, steps):
+def test_a_finished_run_that_goes_on_is_unfinished(ended, monkeypatch, steps):
     """Killed after any of its first steps, it is not taken for the longer run, and goes on."""
     shorter, longer = small(), small(task=replace(SWINGUP, episodes=8))
-    run = Experiment(shorter, tmp_path)
-    run.train()
-    run.finish(run.test())
-    (tmp_path / "video.mp4").touch()
-    run.close()
-
+    (ended / "video.mp4").touch()
     left = iter(range(steps))
 
     def until_it_is_killed(changed):
@@ -178,14 +200,14 @@ def test_a_finished_run_that_goes_on_is_unfinished(tmp_path, monkeypatch, steps)
         write = until_it_is_killed(write_json)
         patched.setattr("torchrl_l2c2.experiment.folder.write_json", write)
         patched.setattr(Path, "unlink", until_it_is_killed(Path.unlink))
-        Experiment(longer, tmp_path).close()
-    assert finished_run(tmp_path, longer.to_dict()) is None
-    assert (finished_run(tmp_path, shorter.to_dict()) is None) == (steps > 0)
-    saved = json.loads((tmp_path / "config.json").read_text())
+        Experiment(longer, ended).close()
+    assert finished_run(ended, longer.to_dict()) is None
+    assert (finished_run(ended, shorter.to_dict()) is None) == (steps > 0)
+    saved = json.loads((ended / "config.json").read_text())
     ends = {"policy.pt", "video.mp4", "learning_curves.png"}
     of_the_longer = saved["task"]["episodes"] == 8
-    assert not of_the_longer or not ends & {path.name for path in tmp_path.iterdir()}
-    again = Experiment(longer, tmp_path)
+    assert not of_the_longer or not ends & {path.name for path in ended.iterdir()}
+    again = Experiment(longer, ended)
     assert len(again.train()) == 8
 
 
@@ -196,10 +218,9 @@ def finished(folder, **settings):
     run.close()
 
 
-def test_what_changes_no_number_leaves_a_run_finished(tmp_path):
+def test_what_changes_no_number_leaves_a_run_finished(ended):
     """And its test, also where something is made of such settings."""
-    finished(tmp_path)
-    test = (tmp_path / "evaluation.json").read_bytes()
+    test = (ended / "evaluation.json").read_bytes()
     for settings in (
         {"test_episodes": 0},
         {"threads": 2},
@@ -208,21 +229,20 @@ def test_what_changes_no_number_leaves_a_run_finished(tmp_path):
         {"checkpoint_interval": 5.0},
         {"task": replace(small().task, solved_at=1e6)},
     ):
-        assert finished_run(tmp_path, small(**settings).to_dict()) is not None
-        Experiment(small(**settings), tmp_path).close()
-        assert (tmp_path / "evaluation.json").read_bytes() == test
-        assert finished_run(tmp_path, small().to_dict()) is not None
+        assert finished_run(ended, small(**settings).to_dict()) is not None
+        Experiment(small(**settings), ended).close()
+        assert (ended / "evaluation.json").read_bytes() == test
+        assert finished_run(ended, small().to_dict()) is not None
 
 
-def test_a_setting_that_is_new_and_off_leaves_a_run_finished(tmp_path):
+def test_a_setting_that_is_new_and_off_leaves_a_run_finished(ended):
     """A release that adds one has no test played again."""
-    finished(tmp_path)
-    saved = json.loads((tmp_path / "config.json").read_text())
+    saved = json.loads((ended / "config.json").read_text())
     del saved["task"]["images"], saved["task"]["frames"], saved["regularizer"]["max_step"]
-    (tmp_path / "config.json").write_text(json.dumps(saved))
-    assert finished_run(tmp_path, small().to_dict()) is not None
+    (ended / "config.json").write_text(json.dumps(saved))
+    assert finished_run(ended, small().to_dict()) is not None
     longer = small(task=replace(small().task, episodes=7))
-    assert finished_run(tmp_path, longer.to_dict()) is None
+    assert finished_run(ended, longer.to_dict()) is None
 
 
 def test_a_run_is_finished_when_all_of_its_files_are_there(tmp_path, monkeypatch):
@@ -238,48 +258,44 @@ def test_a_run_is_finished_when_all_of_its_files_are_there(tmp_path, monkeypatch
     assert finished_run(tmp_path, small().to_dict()) is None
 
 
-def test_what_only_training_reads_is_told_when_that_is_over(tmp_path):
+def test_what_only_training_reads_is_told_when_that_is_over(trained):
     """And not where the run goes on."""
-    Experiment(small(), tmp_path).train()
     told = "evaluate_every=2 changes nothing: it is of training, which is over .* Choose another"
     with pytest.warns(UserWarning, match=told):
-        Experiment(small(evaluate_every=2), tmp_path).close()
+        Experiment(small(evaluate_every=2), trained).close()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        Experiment(small(evaluate_every=2, task=replace(SWINGUP, episodes=8)), tmp_path).close()
+        Experiment(small(evaluate_every=2, task=replace(SWINGUP, episodes=8)), trained).close()
 
 
-def test_a_finished_run_without_checkpoints_is_not_begun_anew(tmp_path):
+def test_a_finished_run_without_checkpoints_is_not_begun_anew(ended):
     """By another length, or another test; its results would be gone."""
-    finished(tmp_path)
-    for path in list_checkpoints(tmp_path):
+    for path in list_checkpoints(ended):
         path.unlink()
-    before = contents(tmp_path)
+    before = contents(ended)
     with pytest.raises(CheckpointError, match=r"has ended, and no checkpoint.* any more to go on"):
-        Experiment(small(test_episodes=3), tmp_path)
-    assert contents(tmp_path) == before
+        Experiment(small(test_episodes=3), ended)
+    assert contents(ended) == before
 
 
-def test_a_test_of_other_length_replaces_the_old_one_when_it_has_ended(tmp_path):
+def test_a_test_of_other_length_replaces_the_old_one_when_it_has_ended(ended):
     """Interrupted, the old one is still there, and the same command plays the new one."""
-    finished(tmp_path)
     more = small(test_episodes=3)
-    run = Experiment(more, tmp_path)
-    assert find_runs([tmp_path]).runs[0].test_episodes == 1
-    assert finished_run(tmp_path, more.to_dict()) is None
+    run = Experiment(more, ended)
+    assert find_runs([ended]).runs[0].test_episodes == 1
+    assert finished_run(ended, more.to_dict()) is None
     run.finish(run.test())
     run.close()
-    assert finished_run(tmp_path, more.to_dict()).test_episodes == 3
-    assert finished_run(tmp_path, small().to_dict()) is None
+    assert finished_run(ended, more.to_dict()).test_episodes == 3
+    assert finished_run(ended, small().to_dict()) is None
 
 
-def test_changed_settings_are_refused_and_nothing_is_overwritten(tmp_path):
+def test_changed_settings_are_refused_and_nothing_is_overwritten(trained):
     """The error names the setting with both values."""
-    Experiment(small(), tmp_path).train()
-    before = contents(tmp_path)
+    before = contents(trained)
     with pytest.raises(ValueError, match=r"regularizer.sigma=1.0, not 2.0: give the same"):
-        Experiment(small(regularizer=L2C2Config(sigma=2.0)), tmp_path)
-    assert contents(tmp_path) == before
+        Experiment(small(regularizer=L2C2Config(sigma=2.0)), trained)
+    assert contents(trained) == before
 
 
 def test_a_damaged_newest_checkpoint_gives_the_run_from_the_one_before(tmp_path):
@@ -348,37 +364,34 @@ def test_what_is_refused_from_elsewhere_leaves_no_folder(tmp_path, what):
     assert not (tmp_path / "b").exists()
 
 
-def test_what_is_no_run_is_refused_where_there_is_one_already(tmp_path):
+def test_what_is_no_run_is_refused_where_there_is_one_already(ended):
     """One that has checkpoints, and one that the command finds finished."""
-    finished(tmp_path)
-    values = {"resume": str(tmp_path / "nonsense"), "allow_other_versions": False}
-    for again in (partial(Experiment, small(), tmp_path, resume=values["resume"]),
-                  partial(run, small(), tmp_path, values)):  # fmt: skip
+    values = {"resume": str(ended / "nonsense"), "allow_other_versions": False}
+    for again in (partial(Experiment, small(), ended, resume=values["resume"]),
+                  partial(run, small(), ended, values)):  # fmt: skip
         with pytest.raises(CheckpointError, match=r"nonsense' holds no checkpoint_.*leave resume"):
             again()
 
 
-def test_other_versions_are_refused_unless_they_are_allowed(tmp_path):
+def test_other_versions_are_refused_unless_they_are_allowed(trained):
     """The error names what differs, with both versions; a package only there now matters not."""
-    Experiment(small(), tmp_path).train()
-    of_other_versions(tmp_path, torch="1.0", box2d="2.3")
+    of_other_versions(trained, torch="1.0", box2d="2.3")
     told = f"made with torch 1.0, now {importlib.metadata.version('torch')}: the numbers may differ"
     with pytest.raises(OtherRunError, match=re.escape(told)):
-        Experiment(small(), tmp_path)
+        Experiment(small(), trained)
     with pytest.warns(UserWarning, match=re.escape(told)):
-        again = Experiment(small(), tmp_path, allow_other_versions=True)
+        again = Experiment(small(), trained, allow_other_versions=True)
     assert len(again.metrics) == 6
 
 
-def test_fewer_episodes_than_there_are_are_refused(tmp_path):
+def test_fewer_episodes_than_there_are_are_refused(trained):
     """Nothing is changed, and the run can be continued as it was or for longer."""
-    Experiment(small(), tmp_path).train()
-    before = contents(tmp_path)
+    before = contents(trained)
     with pytest.raises(OtherRunError, match=r"episodes=5 is fewer than the 6 .* already has"):
-        Experiment(small(task=replace(SWINGUP, episodes=5)), tmp_path)
-    assert contents(tmp_path) == before
+        Experiment(small(task=replace(SWINGUP, episodes=5)), trained)
+    assert contents(trained) == before
     with pytest.raises(OtherRunError, match="episodes=5 is fewer than the 6"):
-        Experiment(small(), tmp_path).train(5)
+        Experiment(small(), trained).train(5)
 
 
 def test_fewer_frames_than_there_are_are_refused(tmp_path):
@@ -428,13 +441,12 @@ def test_what_followed_another_length_is_told(tmp_path, setting, told):
         Experiment(replace(config, task=SWINGUP), tmp_path).close()
 
 
-def test_what_changes_no_number_may_change(tmp_path):
+def test_what_changes_no_number_may_change(trained):
     """Where metrics go, which policies are tested and how often it is saved."""
-    Experiment(small(), tmp_path).train()
     other = small(
         logger=GROUPS["logger"]["tensorboard"], late_share=0.5, test_episodes=3, checkpoint_keep=5
     )
-    assert len(Experiment(other, tmp_path).metrics) == 6
+    assert len(Experiment(other, trained).metrics) == 6
 
 
 def test_which_policies_are_tested_may_not_change_where_a_gain_follows_the_tests():
@@ -474,7 +486,8 @@ def test_another_choice_is_named_and_not_what_it_brings():
 @pytest.mark.parametrize("file", ["checkpoint_00000002.pt", "metrics.csv", "train.log"])
 def test_a_full_disk_names_the_file_and_the_last_good_checkpoint(tmp_path, monkeypatch, file):
     """And the run continues from there when there is room again."""
-    experiment = Experiment(small(), tmp_path)
+    config = small(task=replace(SWINGUP, episodes=3))
+    experiment = Experiment(config, tmp_path)
     experiment.train(1)
     full = OSError(28, "No space left on device")
 
@@ -489,7 +502,7 @@ def test_a_full_disk_names_the_file_and_the_last_good_checkpoint(tmp_path, monke
         experiment.train()
     experiment.close()
     monkeypatch.undo()
-    assert len(Experiment(small(), tmp_path).train()) == 6
+    assert len(Experiment(config, tmp_path).train()) == 3
 
 
 def test_an_error_that_there_is_no_room_to_log_is_told(tmp_path):

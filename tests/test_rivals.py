@@ -669,7 +669,7 @@ RUNNING = [CATSConfig(), GradCAPSConfig(), ASAPConfig(), SR2LConfig(steps=2), LC
 def small_run(regularizer, compile=False):
     config = ExperimentConfig(
         task=TaskConfig("pendulum", "Pendulum-v1", episodes=2, max_steps=40),
-        algorithm=PPORPEConfig(hidden=(8,)),
+        algorithm=PPORPEConfig(hidden=(8,), replay_ratio=1.0),
         regularizer=regularizer,
         replay=UniformReplayConfig(batch_size=8),
         optimizer=AdamConfig(),

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import copy
 import math
-import os
 import re
-import subprocess
+import runpy
 import sys
 from pathlib import Path
 from typing import Any
@@ -508,19 +507,17 @@ def test_the_runner_builds_it_by_its_name(monkeypatch: pytest.MonkeyPatch, tmp_p
     assert again.alg.regularization.updates == 2
 
 
-def test_the_example_trains_and_compares(tmp_path: Path) -> None:
+def test_the_example_trains_and_compares(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """It prints a table of numbers with their intervals, and can be read in one go."""
-    done = subprocess.run(
-        [sys.executable, str(EXAMPLE)],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(EXAMPLE.parents[1])},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(EXAMPLE.parent)
+    monkeypatch.setattr(sys, "argv", [str(EXAMPLE)])
+    with torch.random.fork_rng():
+        runpy.run_path(str(EXAMPLE), run_name="__main__")
     cell = r"(-?[0-9.]+) ± ([0-9.]+)"
-    rows = re.findall(rf"^\| (.+) \| {cell} \| {cell} \|$", done.stdout, re.M)
+    rows = re.findall(rf"^\| (.+) \| {cell} \| {cell} \|$", capsys.readouterr().out, re.M)
     plain, regularized, difference = [[float(cell) for cell in row[1:]] for row in rows]
     for column in (0, 2):
         assert difference[column] == pytest.approx(regularized[column] - plain[column], abs=2e-3)

@@ -37,11 +37,11 @@ CONTINUOUS = {
 }
 DISCRETE = {"CartPole-v1": BUILT_IN, "Acrobot-v1": BUILT_IN, "LunarLander-v3": BOX2D}
 ALGORITHMS = {
-    "ppo_rpe": PPORPEConfig(),
-    "sac": SACConfig(random_frames=50, hidden=(32,)),
-    "td3": TD3Config(random_frames=50, hidden=(32,)),
+    "ppo_rpe": PPORPEConfig(replay_ratio=2.0),
+    "sac": SACConfig(random_frames=250, hidden=(32,)),
+    "td3": TD3Config(random_frames=250, hidden=(32,)),
     "ppo": PPOConfig(frames=100, epochs=2),
-    "dqn": DQNConfig(random_frames=50, hidden=(32,)),
+    "dqn": DQNConfig(random_frames=250, hidden=(32,)),
 }
 PAIRS = [
     *(

@@ -345,7 +345,7 @@ def test_an_episode_is_as_long_as_the_task_is_registered():
     limits = {name: chosen.time_limit for name, chosen in PAPER_TASKS.items()}
     assert limits == {"swingup": 1000, "reacher": 150, "hopper": 1000, "ant": 1000}
     assert TaskConfig("pendulum", "Pendulum-v1", max_steps=7).time_limit == 7
-    run = experiment("td3", TaskConfig("pendulum", "Pendulum-v1", episodes=1))
+    run = experiment("ppo", TaskConfig("pendulum", "Pendulum-v1", episodes=1))
     assert run.train()[0]["length"] == 200 and run.test().lengths == [200]
 
 

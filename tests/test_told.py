@@ -21,7 +21,6 @@ from torchrl_l2c2.experiment import (
     ExperimentConfig,
     L2C2Config,
     NoRegularizerConfig,
-    PPORPEConfig,
     SACConfig,
     TaskConfig,
     TD3Config,
@@ -56,7 +55,9 @@ def warned(make_it):
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_a_parameter_that_is_not_finite_stops_every_algorithm(tmp_path, name):
     """With its name, the update and the last checkpoint, whatever the loss has made of it."""
-    run = make(name, tmp_path)
+    settings = {"random_frames": 35} if name in ("sac", "td3") else {}
+    few = {"algorithm": replace(ALGORITHMS[name], **settings)}  # updates, that is
+    run = make(name, tmp_path, **few)
     run.train(1)
     parameter_name, parameter = list(run.agent.loss.named_parameters())[-1]
     step = run.agent.optimizer.step
@@ -67,7 +68,7 @@ def test_a_parameter_that_is_not_finite_stops_every_algorithm(tmp_path, name):
         if run.learner.updates == last - 1:
             parameter.data.view(-1)[0] = float("inf")
 
-    last = make(name).train(2)[-1]["updates"]
+    last = make(name, **few).train(2)[-1]["updates"]
     run.agent.optimizer.step = broken
     run.learner.renew()
     with pytest.raises(FloatingPointError, match=f"not finite after update {last}: ") as stopped:
@@ -109,7 +110,7 @@ def test_a_run_of_random_actions_alone_says_so(tmp_path):
     run = make("sac", algorithm=SACConfig(hidden=(8,), random_frames=80))
     (message,) = warned(run.train)
     assert message.startswith("the policy never acted in 80 frames")
-    trained = make("sac", tmp_path)
+    trained = make("sac", tmp_path, algorithm=SACConfig(hidden=(8,), random_frames=60))
     assert not warned(trained.train)
     trained.finish(trained.test())
     assert json.loads((tmp_path / "evaluation.json").read_text())["training"]["untrained"] is None
@@ -235,28 +236,44 @@ def test_frozen_parameters_have_no_part_in_a_share():
     assert gradient_shares(loss, batch)["loss_l2c2_actor"] == 0.0
 
 
-def many_updates(name, regularizer):
-    algorithm = replace(ALGORITHMS[name], **({"epochs": 15} if name == "ppo" else {}))
+@pytest.fixture
+def measured_soon(monkeypatch):
+    """After 15 updates, not 100, it is told which regularizer is faint."""
+    monkeypatch.setattr("torchrl_l2c2.experiment.learner.MEASURED_AFTER", 15)
+
+
+def many_updates(name, regularizer, updates=20):
+    """In three episodes; with at least so many."""
     task = replace(PENDULUM, episodes=3)
-    if name == "ppo_rpe":
-        algorithm = PPORPEConfig(hidden=(8,), updates=40)
+    few = {
+        "ppo_rpe": {"updates": -(-updates // 2), "replay_ratio": None},
+        "ppo": {"epochs": -(-updates // 8)},  # of eight batches in four rollouts
+    }
+    algorithm = replace(ALGORITHMS[name], **few.get(name, {"random_frames": 120 - updates}))
     return make(name, task=task, algorithm=algorithm, regularizer=regularizer)
 
 
+def test_a_regularizer_is_measured_after_a_hundred_updates():
+    """Tests with fewer have it told sooner."""
+    faint = CAPSConfig(lambda_temporal=1e-9, lambda_spatial=1e-9)
+    (message,) = warned(many_updates("sac", faint, updates=105).train)
+    assert message.startswith("after 100 updates")
+
+
 @pytest.mark.parametrize("name", ["ppo_rpe", "sac", "td3", "ppo"])
-def test_a_faint_regularizer_is_told_once_with_what_to_change(name):
+def test_a_faint_regularizer_is_told_once_with_what_to_change(name, measured_soon):
     """Of every algorithm; a strong one is not."""
     faint, strong = (
         CAPSConfig(lambda_temporal=1e-9, lambda_spatial=1e-9),
         CAPSConfig(lambda_temporal=1.0, lambda_spatial=1.0),
     )
     (message,) = warned(many_updates(name, faint).train)
-    assert message.startswith("after 100 updates") and "loss_caps_spatial" in message
+    assert message.startswith("after 15 updates") and "loss_caps_spatial" in message
     assert "raise the gains of the regularizer" in message
     assert not warned(many_updates(name, strong).train)
 
 
-def test_a_predictor_beside_the_policy_hides_no_faint_regularizer():
+def test_a_predictor_beside_the_policy_hides_no_faint_regularizer(measured_soon):
     """ASAP's, which the loss's own terms do not train: its share is infinite."""
     faint = ASAPConfig(lambda_spatial=1e-12, lambda_grad=1e-12)
     (message,) = warned(many_updates("sac", faint).train)
@@ -266,13 +283,13 @@ def test_a_predictor_beside_the_policy_hides_no_faint_regularizer():
 @pytest.mark.parametrize(
     "name", ["ppo", *(pytest.param(name, marks=pytest.mark.slow) for name in ("ppo_rpe", "sac"))]
 )
-def test_looking_for_a_faint_regularizer_changes_no_number(monkeypatch, name):
+def test_looking_for_a_faint_regularizer_changes_no_number(monkeypatch, measured_soon, name):
     """Nor any random stream: every parameter is what it is without."""
 
     def parameters():
         run = many_updates(name, L2C2Config())
         run.train()
-        assert run.learner.updates > 100
+        assert run.learner.updates > 15
         return torch.cat([p.detach().flatten() for p in run.agent.loss.state_dict().values()])
 
     looked = parameters()

@@ -31,13 +31,13 @@ from torchrl_l2c2.experiment.regularizers import REGULARIZERS
 
 pytestmark = pytest.mark.skipif(not compiler_available(), reason="no C++ compiler")
 
-TASK = TaskConfig("task", "Pendulum-v1", max_steps=40, episodes=3)
-PPO = PPOConfig(frames=40, epochs=2, hidden=(8,))
+TASK = TaskConfig("task", "Pendulum-v1", max_steps=40, episodes=2)
+PPO = PPOConfig(frames=40, epochs=2, hidden=(8,))  # 4 updates an episode
 FIXED = replace(PPO, num_envs=1, clip_actions=True, log_scale=0.0)
 ALGORITHMS = {
-    "PPO-RPE": PPORPEConfig(updates=6, hidden=(8,)),
-    "SAC": SACConfig(random_frames=20, hidden=(8,)),
-    "TD3": TD3Config(random_frames=20, hidden=(8,)),
+    "PPO-RPE": PPORPEConfig(updates=4, hidden=(8,)),
+    "SAC": SACConfig(random_frames=60, hidden=(8,)),
+    "TD3": TD3Config(random_frames=60, hidden=(8,)),
     "DQN": DQNConfig(random_frames=20, hidden=(8,)),
     "PPO": PPO,
     "PPO, entropy that is estimated": replace(PPO, entropy_coeff=0.01),

@@ -249,6 +249,7 @@ SMALL = {
     "task": {"name": "Pendulum-v1", "env_id": "Pendulum-v1", "episodes": 1, "max_steps": 40},
     "compile": False,
     "late_share": 0.0,
+    "algorithm": {"name": "ppo_rpe", "replay_ratio": 2.0},
 }
 OF_COMPONENTS = [
     (group, choice, name, kind)
@@ -266,7 +267,7 @@ def test_what_is_taken_begins_to_learn_or_is_refused_by_its_component(data):
     """No other error before the first update; numbers that are not finite there are told."""
     group, choice, name, kind = data.draw(st.sampled_from(OF_COMPONENTS))
     value = data.draw(values(kind, inside=True))
-    chosen = SMALL | {group: {"name": choice, name: value}}
+    chosen = SMALL | {group: {**SMALL.get(group, {"name": choice}), name: value}}
     try:
         experiment = Experiment(ExperimentConfig.from_dict(chosen))
     except ValueError as refused:

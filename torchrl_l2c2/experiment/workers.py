@@ -123,10 +123,13 @@ class MultiEpisodeCollector(_Rounds, MultiSyncCollector):
         >>> from torchrl_l2c2 import make_actor
         >>> create_env = partial(GymEnv, "Pendulum-v1", max_episode_steps=7)
         >>> actor = make_actor(3, create_env().action_spec)
-        >>> collector = MultiEpisodeCollector(create_env, actor, num_workers=2, max_steps=7)
-        >>> [episode.shape for episode in collector.rollout()]
+        >>> def play():
+        ...     collector = MultiEpisodeCollector(create_env, actor, num_workers=2, max_steps=7)
+        ...     episodes = collector.rollout()
+        ...     collector.shutdown()
+        ...     return [episode.shape for episode in episodes]
+        >>> play()  # doctest: +SKIP
         [torch.Size([7]), torch.Size([7])]
-        >>> collector.shutdown()
     """
 
     def __init__(
