@@ -1,9 +1,14 @@
 """Small settings of every algorithm, for tests that are not about learning well."""
 
+import copy
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
+from typing import Any
 
+from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
+from omegaconf import OmegaConf
 
 from torchrl_l2c2.experiment import (
     DQNConfig,
@@ -14,6 +19,7 @@ from torchrl_l2c2.experiment import (
     TD3Config,
     UniformReplayConfig,
 )
+from torchrl_l2c2.experiment.composition import CONF, register
 from torchrl_l2c2.experiment.config import GROUPS
 
 ALGORITHMS = {
@@ -45,3 +51,16 @@ def own_nodes() -> Iterator[None]:
         yield
     finally:
         store.repo = stored
+
+
+def composed(*overrides: str) -> dict[str, Any]:
+    """What the command composes."""
+    return copy.deepcopy(_composed_once(overrides))
+
+
+@cache
+def _composed_once(overrides: tuple[str, ...]) -> Any:
+    with own_nodes():
+        register()
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            return OmegaConf.to_container(compose("config", list(overrides)), resolve=True)

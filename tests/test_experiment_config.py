@@ -1,19 +1,17 @@
 """The settings: declared once, and what cannot be is refused with what is allowed."""
 
-import copy
 import dataclasses
 import inspect
 import subprocess
 import sys
 from contextlib import nullcontext
-from functools import cache, partial
+from functools import partial
 from itertools import zip_longest
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
-from small import own_nodes
+from small import composed
 
 import torchrl_l2c2
 from torchrl_l2c2 import PPORPELoss, make_actor, make_critic
@@ -27,7 +25,7 @@ from torchrl_l2c2.experiment import (
     SACConfig,
     TaskConfig,
 )
-from torchrl_l2c2.experiment.composition import CONF, check_preset, register, tell_tuned
+from torchrl_l2c2.experiment.composition import CONF, check_preset, tell_tuned
 from torchrl_l2c2.experiment.config import GROUPS
 from torchrl_l2c2.experiment.manual import manual, page
 from torchrl_l2c2.experiment.regularizers import BEGIN_TUNED, REGULARIZERS, TUNED, TUNED_ON
@@ -35,26 +33,6 @@ from torchrl_l2c2.experiment.settings import SettingError, describe
 from torchrl_l2c2.experiment.tasks import FIELD_TASKS, PAPER_TASKS
 
 ROOT = Path(__file__).parent.parent
-
-
-@pytest.fixture(scope="module", autouse=True)
-def nodes_of_the_command():
-    """Stored once for all tests."""
-    with own_nodes():
-        register()
-        with initialize_config_dir(str(CONF), version_base="1.3"):
-            yield
-    composed_once.cache_clear()
-
-
-@cache
-def composed_once(*overrides):
-    return OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
-
-
-def composed(*overrides):
-    """What the command composes."""
-    return copy.deepcopy(composed_once(*overrides))
 
 
 def test_the_command_has_the_defaults_of_the_classes():

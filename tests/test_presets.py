@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from small import composed
 from tensordict import TensorDict
-from test_experiment_config import composed
 from torch.distributions import Normal
 
 from torchrl_l2c2.experiment import ExperimentConfig
