@@ -55,6 +55,7 @@ experiment.algorithms.dqn experiment.algorithms.ppo
 experiment.algorithms.__init__
 experiment.config
 experiment.naming experiment.saved
+experiment.identity
 experiment.folder
 experiment.reports.statistics experiment.reports.names experiment.reports.paper
 experiment.reports.differences

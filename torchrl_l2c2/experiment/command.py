@@ -198,14 +198,7 @@ def run(
     # Here, as settings are checked before anything waits for torch.
     from torchrl_l2c2.experiment.continuation import check_elsewhere, tell_past
     from torchrl_l2c2.experiment.lock import wait_for_folder
-    from torchrl_l2c2.experiment.process import keep_freed_memory
-    from torchrl_l2c2.experiment.reports import (
-        compare_with_paper,
-        draw_learning_curves,
-        finished_run,
-    )
-    from torchrl_l2c2.experiment.trained import save_policy
-    from torchrl_l2c2.experiment.training import Experiment
+    from torchrl_l2c2.experiment.reports import finished_run
     from torchrl_l2c2.experiment.video import check_pictures, check_video, record_video
 
     video = folder / "video.mp4"
@@ -213,11 +206,7 @@ def run(
     if records:
         check_video()
         check_pictures(config.task)
-    for chatty in ("torchrl", "matplotlib", "torch"):
-        logging.getLogger(chatty).setLevel(logging.ERROR)
-    keep_freed_memory()
-    warnings.simplefilter("ignore", FutureWarning)
-    warnings.filterwarnings("ignore", "No target network updater")
+    _quieten()
     chosen = (config.task, config.algorithm, config.regularizer)
     named = f"{', '.join(group.name for group in chosen)}, seed {config.seed}: {folder}"
     print(f"{standing}: {named}" if standing else named, flush=True)
@@ -225,29 +214,58 @@ def run(
     wait_for_folder(folder, patience)
     check_elsewhere(values["resume"])
     finished = finished_run(folder, config.to_dict())
-    if finished is not None:
-        tell_past(finished.config, config.to_dict())
+    if finished is None:
+        finished = _train(config, folder, values, standing)
     else:
-        going_on = {name: values[name] for name in ("resume", "allow_other_versions")}
-        with closing(Experiment(config, folder, **going_on)) as experiment, _end_logged(folder):
-            experiment.train(progress=standing or True)
-            if config.test_episodes:
-                tests = [experiment.test(sampled=s, progress=True) for s in (False, True)]
-                finished = experiment.finish(*tests)
-                log(folder, f"finished:\n{compare_with_paper(finished)}")
-            else:
-                save_policy(experiment.agent.policy, folder / "policy.pt")
+        tell_past(finished.config, config.to_dict())
     if records:
         record_video(folder, video)
     if finished is not None:
-        print(compare_with_paper(finished))
-        picture = folder / "learning_curves.png"
-        if not picture.exists():
-            draw_learning_curves([finished], picture)
-        print(f"picture: {picture}", flush=True)
+        _show(finished)
     if video.exists():
         print(f"video: {video}", flush=True)
     return finished
+
+
+def _quieten() -> None:
+    """Libraries say nothing that a user of the command could act on."""
+    for chatty in ("torchrl", "matplotlib", "torch"):
+        logging.getLogger(chatty).setLevel(logging.ERROR)
+    warnings.simplefilter("ignore", FutureWarning)
+    warnings.filterwarnings("ignore", "No target network updater")
+
+
+def _train(
+    config: ExperimentConfig, folder: Path, values: dict[str, Any], standing: str
+) -> FinishedRun | None:
+    """Trains and tests a policy, or trains it alone where no test is asked for."""
+    from torchrl_l2c2.experiment.process import keep_freed_memory
+    from torchrl_l2c2.experiment.reports import compare_with_paper
+    from torchrl_l2c2.experiment.trained import save_policy
+    from torchrl_l2c2.experiment.training import Experiment
+
+    keep_freed_memory()
+    going_on = {name: values[name] for name in ("resume", "allow_other_versions")}
+    with closing(Experiment(config, folder, **going_on)) as experiment, _end_logged(folder):
+        experiment.train(progress=standing or True)
+        if not config.test_episodes:
+            save_policy(experiment.agent.policy, folder / "policy.pt")
+            return None
+        tests = [experiment.test(sampled=s, progress=True) for s in (False, True)]
+        finished = experiment.finish(*tests)
+        log(folder, f"finished:\n{compare_with_paper(finished)}")
+        return finished
+
+
+def _show(finished: FinishedRun) -> None:
+    """The result beside the paper's, and a picture of how it was learned."""
+    from torchrl_l2c2.experiment.reports import compare_with_paper, draw_learning_curves
+
+    print(compare_with_paper(finished))
+    picture = finished.folder / "learning_curves.png"
+    if not picture.exists():
+        draw_learning_curves([finished], picture)
+    print(f"picture: {picture}", flush=True)
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from typing import Any
 from torchrl_l2c2.experiment.checkpoints import CheckpointError, list_checkpoints, load_newest
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.errors import OtherRunError, SimulatorError
-from torchrl_l2c2.experiment.saved import differing, of_length
+from torchrl_l2c2.experiment.identity import differing, of_length
 from torchrl_l2c2.experiment.tasks import Budget, TaskConfig
 from torchrl_l2c2.experiment.versions import versions
 

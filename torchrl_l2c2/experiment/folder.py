@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_l2c2.experiment.files import write_atomically, write_json
-from torchrl_l2c2.experiment.saved import is_tested
+from torchrl_l2c2.experiment.identity import is_tested
 from torchrl_l2c2.experiment.versions import code_commit, versions
 
 README = """\

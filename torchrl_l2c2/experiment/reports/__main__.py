@@ -10,6 +10,7 @@ from pathlib import Path
 
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.errors import told_in_a_line
+from torchrl_l2c2.experiment.identity import of_length
 from torchrl_l2c2.experiment.reports.against import against_table
 from torchrl_l2c2.experiment.reports.groups import group_records
 from torchrl_l2c2.experiment.reports.page import fill_pages
@@ -19,7 +20,6 @@ from torchrl_l2c2.experiment.reports.results import printed_tables
 from torchrl_l2c2.experiment.reports.runs import FinishedRun, Found, find_runs
 from torchrl_l2c2.experiment.reports.score import Reading, readings
 from torchrl_l2c2.experiment.reports.tables import score_table
-from torchrl_l2c2.experiment.saved import of_length
 
 DESCRIPTION = """\
 Reads every finished run below folders, prints their tables beside the paper's numbers, and writes a

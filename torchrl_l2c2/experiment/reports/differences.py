@@ -13,7 +13,7 @@ from torchrl_l2c2.experiment.config import (
     is_free,
     is_neutral,
 )
-from torchrl_l2c2.experiment.saved import BUDGETS, by_name
+from torchrl_l2c2.experiment.identity import BUDGETS, by_name
 from torchrl_l2c2.experiment.tasks import TASKS
 
 # Chosen by name; what else these groups have are settings of what was chosen.

@@ -14,10 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_l2c2.experiment.files import make_folder, write_atomically
+from torchrl_l2c2.experiment.identity import BUDGETS
 from torchrl_l2c2.experiment.reports.differences import read_differences
 from torchrl_l2c2.experiment.reports.names import method_order
 from torchrl_l2c2.experiment.reports.paper import TAU, Published, paper_of
-from torchrl_l2c2.experiment.saved import BUDGETS, read_rows
+from torchrl_l2c2.experiment.saved import read_rows
 from torchrl_l2c2.experiment.tasks import TASKS
 
 # Which policies act, and how: the last policy's test episodes, or one episode of every policy

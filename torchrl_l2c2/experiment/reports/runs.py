@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_l2c2.experiment.config import ExperimentConfig
+from torchrl_l2c2.experiment.identity import is_tested
 from torchrl_l2c2.experiment.reports.differences import (
     differences,
     fingerprint,
@@ -19,7 +20,6 @@ from torchrl_l2c2.experiment.reports.differences import (
 from torchrl_l2c2.experiment.reports.records import QUANTITIES, Record
 from torchrl_l2c2.experiment.saved import (
     REMEDY,
-    is_tested,
     read_back,
     read_config,
     read_evaluation,
