@@ -17,6 +17,7 @@ LAYERS = """
 _version _checks
 neighborhood affinities gains transforms.random
 distances transforms.neighbors transforms.noise modules updaters optim.adaterm metrics.actions
+divergences
 policy_distances
 transforms.__init__ optim.__init__ metrics.policy metrics.spectrum
 metrics.__init__

@@ -11,8 +11,10 @@ import warnings
 
 import pytest
 import torch
+from losses import CASES
 from small import ALGORITHMS
 
+from torchrl_l2c2 import L2C2Loss, Neighborhood, NeighborTransform
 from torchrl_l2c2.experiment import (
     AdamConfig,
     CAPSConfig,
@@ -63,6 +65,22 @@ class TestByHand:
     def test_the_first_measurement_of_a_gradient_sets_the_gain(self):
         """A share of 5e-6 at the gain 1 is .1 at 20 thousand, whatever the rate."""
         assert GradientGain(0.1, rate=0.1).step(5e-6) == pytest.approx(2e4)
+
+    def test_cloning_that_takes_the_actors_place_is_none_of_its_gradient(self):
+        """CQL's two terms of the policy are descended one after the other, and never summed."""
+        torch.manual_seed(0)
+        case = next(case for case in CASES if case.name == "CQL")
+        loss, batch = L2C2Loss(case.make(), Neighborhood()), case.batch(8)
+        batch = NeighborTransform(Neighborhood())(batch)
+        with torch.random.fork_rng():
+            terms = loss(batch.copy())
+        parameters = list(loss.actor_network_params.values(True, True))
+        norms = {}
+        for key in ("loss_actor", "loss_l2c2_actor"):
+            gradients = torch.autograd.grad(terms[key], parameters, retain_graph=True)
+            norms[key] = torch.cat([g.flatten() for g in gradients]).norm().item()
+        share = gradient_shares(loss, batch)["loss_l2c2_actor"]
+        assert share == pytest.approx(norms["loss_l2c2_actor"] / norms["loss_actor"], rel=1e-4)
 
     def test_a_gradients_share_is_met_at_once_with_rate_1(self):
         """Also by later measurements: .02 at the gain 3 is .1 at 15."""

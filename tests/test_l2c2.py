@@ -9,14 +9,17 @@ import warnings
 import pytest
 import torch
 from losses import (
+    AGENTS,
     BOUNDS,
     OBSERVATION,
     action_values,
+    agents_batch,
     critic,
     deterministic_actor,
     gaussian_actor,
     heads_critic,
     make_distributional_dqn,
+    make_mappo,
     mlp,
     on_policy,
     one_hot_batch,
@@ -27,7 +30,15 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.modules import Actor, IndependentNormal, ProbabilisticActor, ValueOperator
-from torchrl.objectives import DDPGLoss, DiscreteSACLoss, DQNLoss, PPOLoss, SACLoss, TD3Loss
+from torchrl.objectives import (
+    ClipPPOLoss,
+    DDPGLoss,
+    DiscreteSACLoss,
+    DQNLoss,
+    PPOLoss,
+    SACLoss,
+    TD3Loss,
+)
 
 from torchrl_l2c2 import L2C2Loss, Neighborhood, NeighborTransform, PPORPELoss
 from torchrl_l2c2.objectives.neighbors import draw_rows, l2c2_penalty
@@ -212,6 +223,23 @@ class TestThePenalty:
             alone.append(L2C2Loss(base, NEAR).policy_regularizer(one)["loss_l2c2_actor"])
         found = loss.policy_regularizer(batch)["loss_l2c2_actor"]
         torch.testing.assert_close(found, torch.maximum(*alone))
+
+    @pytest.mark.parametrize("last", [(), (1,)], ids=["[B, agents]", "[B, agents, 1]"])
+    def test_a_mask_of_agents_leaves_agents_out(self, last):
+        """Of terms and of what is logged: the team's distance counts for each that is left."""
+        base, batch = make_mappo(), agents_batch(4)
+        mask = torch.rand(4, AGENTS) > 0.4
+        batch["agents", "mask"] = mask.reshape(4, AGENTS, *last)
+        near = NeighborTransform(NEAR, [("agents", "observation")])(batch)["neighbor"]
+        values = L2C2Loss(make_mappo(reduction="none"), NEAR)
+        values.load_state_dict(base.state_dict())
+        found, expected = L2C2Loss(base, NEAR), values.policy_regularizer(batch)
+        found.loss_mask_key = ("agents", "mask")
+        found = found.policy_regularizer(batch)
+        term = expected["loss_l2c2_actor"]
+        torch.testing.assert_close(found["loss_l2c2_actor"], term[mask].mean())
+        distance = near["distance"].expand(4, AGENTS)[mask].mean()
+        torch.testing.assert_close(found["l2c2_distance"], distance)
 
     def test_agents_share_the_gain_of_their_team(self):
         """Differences [K, B, agents] for gains [K, B]."""
@@ -482,6 +510,15 @@ class TestWhichStatesAreMoved:
         loss, batch = self.two_part_loss(moved_keys=["velocity"])
         with pytest.raises(KeyError, match=r"velocity.*position"):
             loss.policy_regularizer(batch.exclude(("next", "velocity"), "velocity"))
+
+    def test_every_network_has_to_be_moved(self):
+        """A critic that reads another observation would be compared with itself."""
+        critic = ValueOperator(mlp(4, 1), in_keys=["state"])
+        base = ClipPPOLoss(gaussian_actor(), critic)
+        with pytest.raises(ValueError, match=r"critic_network reads \['state'\] alone.*beta=0"):
+            L2C2Loss(base, NEAR, moved_keys=["observation"])
+        assert L2C2Loss(base, NEAR, beta=0.0, moved_keys=["observation"]).policy_terms
+        assert L2C2Loss(base, NEAR, moved_keys=["observation", "state"]).added_terms
 
     @pytest.mark.parametrize(
         ("given", "error", "message"),

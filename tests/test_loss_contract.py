@@ -357,6 +357,21 @@ class TestHowTermsAreReduced:
         for key in case.terms:
             torch.testing.assert_close(found[key], values[key][mask].mean())
 
+    def test_a_gain_may_be_set_before_the_backward_pass(self, case):
+        """The gradient is that of the gain that the terms were made with."""
+        loss, batch = regularized(case), batch_of(case, neighbors=1)
+        parameters = [p for p in loss.parameters() if p.requires_grad]
+        gradients = []
+        for later in (loss.l2c2_coeff.item(), 0.0):
+            terms = loss.policy_regularizer(batch.copy())
+            terms.update(loss.value_regularizer(batch.copy()))
+            total = sum(terms[key].sum() for key in case.terms)
+            coeff, loss.l2c2_coeff = loss.l2c2_coeff.item(), later
+            gradients.append(torch.autograd.grad(total, parameters, allow_unused=True))
+            loss.l2c2_coeff = coeff
+        for expected, found in zip(*gradients, strict=True):
+            assert (found is None and expected is None) or torch.equal(found, expected)
+
     def test_batches_of_trajectories_are_taken(self, case):
         """A batch [B, T] gives the same terms as its transitions in one row."""
         if not case.trajectories:

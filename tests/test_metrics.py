@@ -239,6 +239,12 @@ def test_noise_sensitivity_of_a_linear_policy():
     assert found.item() == pytest.approx(0.5 * 0.04 * weight.square().sum().item(), rel=0.03)
 
 
+def test_noise_sensitivity_refuses_integers():
+    """Noise on them would be rounded away."""
+    with pytest.raises(TypeError, match=r"floating point, got torch\.uint8: noise on integers"):
+        noise_sensitivity(lambda s: s, torch.zeros(4, 3, dtype=torch.uint8), 0.2)
+
+
 def test_noise_sensitivity_refuses_actions_without_a_dimension_of_their_own():
     """It would sum over the batch, and grow with it."""
     observations = torch.randn(8, 3)

@@ -15,9 +15,9 @@ from torch import distributions as d
 from torchrl import modules as rl
 
 from torchrl_l2c2 import make_actor, squared_hellinger
+from torchrl_l2c2.divergences import kl_divergence
 from torchrl_l2c2.policy_distances import (
     choose_policy_distance,
-    kl_divergence,
     mean_distance,
     mean_squared_error,
     policy_mean,

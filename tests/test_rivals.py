@@ -31,7 +31,7 @@ from torchrl.modules import (
     NormalParamExtractor,
     ProbabilisticActor,
 )
-from torchrl.objectives import DDPGLoss, DQNLoss, PPOLoss
+from torchrl.objectives import BCLoss, DDPGLoss, DQNLoss, PPOLoss
 
 from torchrl_l2c2 import ASAPLoss, CAPSLoss, CATSLoss, GradCAPSLoss, L2C2Loss, LCPLoss, SR2LLoss
 from torchrl_l2c2.experiment import (
@@ -99,6 +99,16 @@ def linear_normal(scale: float = 0.5) -> PPOLoss:
         return_log_prob=True,
     )
     return PPOLoss(actor, None)
+
+
+@pytest.mark.parametrize("kind", [LCPLoss, SR2LLoss])
+def test_no_successor_is_asked_for_that_is_not_read(kind):
+    """A batch of the in_keys alone will do, also of demonstrations that have none."""
+    loss = kind(BCLoss(gaussian_actor()))
+    batch = transitions(5).exclude("next")
+    asked = batch.select(*loss.in_keys)
+    assert loss(asked)["loss_bc"].equal(loss(batch)["loss_bc"])
+    assert ("next", "observation") in CATSLoss(loss).in_keys
 
 
 class TestCATS:

@@ -428,7 +428,9 @@ def update_and_save(ppo: PPO) -> dict[str, Any]:
 def test_a_checkpoint_of_another_ppo_is_a_beginning(before: type[PPO]) -> None:
     """Its networks are taken, and the ramp begins."""
     ppo = make(rsl.L2C2PPO, regularizer_cfg={"ramp_updates": 4})
-    ppo.load(make(before).save(), None, strict=True)
+    other = make(before)
+    update(collected(other))
+    ppo.load(other.save(), None, strict=True)
     assert update(collected(ppo))["l2c2_actor"] == 0
 
 
@@ -448,11 +450,14 @@ def test_what_cannot_be_regularized_is_refused(settings: dict[str, Any], said: s
 
 
 def test_the_groups_that_move_can_be_chosen() -> None:
-    """Privileged observations alone: the actor, which does not read them, has no term."""
-    cfg: dict[str, Any] = {"moved_keys": ["privileged"], "neighbor_key": "near"}
+    """Of what the critic reads only that which the actor reads, too; the actor has to be moved."""
+    cfg: dict[str, Any] = {"moved_keys": ["policy"], "neighbor_key": "near"}
     ppo = make(rsl.L2C2PPO, regularizer_cfg=cfg)
-    assert ppo.regularization.neighbors.in_keys == ["privileged"]
+    assert ppo.regularization.neighbors.in_keys == ["policy"]
     assert ppo.regularization.neighbors.out_key == "near"
+    assert update(collected(ppo))["l2c2_critic"] > 0
+    with pytest.raises(ValueError, match=r"\['privileged'\], and actor_network reads \['policy'\]"):
+        make(rsl.L2C2PPO, regularizer_cfg={"moved_keys": ["privileged"]})
     with pytest.raises(ValueError, match=r"names \['nonsense'\], and .*'policy', 'privileged'"):
         make(rsl.L2C2PPO, regularizer_cfg={"moved_keys": ["nonsense"]})
 

@@ -32,6 +32,7 @@ from torchrl.modules import Actor, ValueOperator
 from torchrl.objectives import DDPGLoss
 
 from torchrl_l2c2 import L2C2Loss, Neighborhood, NeighborTransform, ObservationNoise
+from torchrl_l2c2.transforms import draw_neighbors
 
 NEAR = Neighborhood(sigma=2.0, lambda_min=0.1, lambda_max=1.0)
 
@@ -267,6 +268,16 @@ def test_missing_entries_are_named(missing, name):
     data = transitions(4).exclude(missing)
     with pytest.raises(KeyError, match=f"needs {name}.*it has.*observation"):
         NeighborTransform(NEAR)(data)
+
+
+def test_one_name_is_a_state_of_one_part():
+    """And not a list of its letters."""
+    batch = transitions(4)
+    one, listed = (
+        draw_neighbors(batch, NEAR, keys, generator=generator())
+        for keys in ("observation", ["observation"])
+    )
+    assert one["observation"].equal(listed["observation"])
 
 
 def test_integer_states_have_no_neighbors():

@@ -242,6 +242,10 @@ def _measured(measured: Any) -> float:
     return float(measured)
 
 
+# CQL's cloning, which takes the place of its actor's term and is never added to it.
+ALTERNATIVE = ("loss_actor_bc",)
+
+
 def is_loss(key: str) -> bool:
     """Whether an entry of a loss's output is one of the terms that are summed."""
     return key == "loss" or key.startswith("loss_")
@@ -309,7 +313,8 @@ def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]
             return (None,) * len(parameters)
         return torch.autograd.grad(value, parameters, allow_unused=True, retain_graph=True)
 
-    losses = (terms[key] for key in terms.keys() if is_loss(key) and key not in added)
+    others = (*added, *ALTERNATIVE)
+    losses = (terms[key] for key in terms.keys() if is_loss(key) and key not in others)
     own = gradients(sum(losses, torch.zeros(())))  # The loss may have none, as rsl_rl's.
     shares = {}
     for key in added:

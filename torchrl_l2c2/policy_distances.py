@@ -16,20 +16,12 @@ from torch.distributions import (
     OneHotCategorical,
     TransformedDistribution,
 )
-from torch.distributions import kl_divergence as closed_kl_divergence
-from torchrl.modules import TanhNormal, TruncatedNormal
-from torchrl.modules.distributions import has_analytic_kl
+from torchrl.modules import TruncatedNormal
 
 from torchrl_l2c2._checks import check_choice, check_positive_int
-from torchrl_l2c2.affinities import all_probs, same_bounds, sum_to
-from torchrl_l2c2.distances import (
-    MONTE_CARLO_SAMPLES,
-    check_pair,
-    draws,
-    log_prob_of,
-    squared_error,
-    squared_hellinger,
-)
+from torchrl_l2c2.affinities import all_probs
+from torchrl_l2c2.distances import squared_error, squared_hellinger
+from torchrl_l2c2.divergences import kl_divergence
 
 PolicyDistance = Callable[[Distribution, Distribution], Tensor]
 """A distance of two policies of batch shape ``[*B]``: a tensor of that shape, at least 0."""
@@ -253,98 +245,3 @@ def mean_squared_error(p: Distribution | Tensor, q: Distribution | Tensor) -> Te
     """
     mean = policy_mean(p)
     return squared_error(mean, policy_mean(q)) * (2 / mean.shape[-1])
-
-
-def kl_divergence(
-    p: Distribution, q: Distribution, *, num_samples: int = MONTE_CARLO_SAMPLES
-) -> Tensor:
-    r"""Kullback-Leibler divergence of two policies, in closed form or as a non-negative estimate.
-
-    .. math::
-        D(p \Vert q) = \int p(a) \ln\frac{p(a)}{q(a)}\, da
-
-    lies in ``[0, inf)`` and is not symmetric. Squashing both policies alike does not change it.
-    Closed forms are torch's; the heads of composite policies add up. A pair without one is
-    estimated from actions of :math:`p`, by
-
-    .. math::
-        \mathbb E_{a \sim p}\left[r - 1 - \ln r\right], \qquad r = q(a) / p(a),
-
-    no term of which is negative (Schulman, "Approximating KL divergence", 2020: k3). The estimate
-    and its gradient, into both policies, are unbiased.
-
-    Args:
-        p: one policy, batch shape ``[*B]``.
-        q: the other, of the same actions.
-        num_samples: actions drawn where there is no closed form, at least 1; the standard deviation
-            falls with its square root. Defaults to ``16``.
-
-    Returns:
-        The divergences, shape ``[*B]``.
-
-    Raises:
-        TypeError: a policy is deterministic, or can neither be sampled nor scored.
-        ValueError: the event shapes differ, or ``num_samples`` is below 1.
-
-    Examples:
-        >>> import torch
-        >>> from torch.distributions import Normal
-        >>> kl_divergence(Normal(torch.tensor([0.0, 3.0]), 1.0), Normal(torch.zeros(2), 1.0))
-        tensor([0.0000, 4.5000])
-    """
-    check_pair(p, q)
-    check_positive_int("num_samples", num_samples)
-    if isinstance(p, CompositeDistribution) and isinstance(q, CompositeDistribution):
-        heads = (
-            kl_divergence(head, q.dists[name], num_samples=num_samples)
-            for name, head in p.dists.items()
-        )
-        ndim = max(len(p.batch_shape), len(q.batch_shape))
-        return functools.reduce(torch.add, (sum_to(head, ndim) for head in heads))
-    if isinstance(p, Independent) and isinstance(q, Independent):
-        base = kl_divergence(p.base_dist, q.base_dist, num_samples=num_samples)
-        return sum_to(base, base.ndim - p.reinterpreted_batch_ndims)
-    for kind in (Categorical, OneHotCategorical):
-        if isinstance(p, kind) and isinstance(q, kind):
-            return _categorical_kl(p, q)
-    if isinstance(p, TanhNormal) and isinstance(q, TanhNormal):
-        # Torch would compare the bounds, in a way that does not compile.
-        same = same_bounds(p, q)
-        base = closed_kl_divergence(p.base_dist, q.base_dist)
-        if isinstance(same, Tensor):
-            return torch.where(same, base, torch.nan)
-        return base if same else _monte_carlo(p, q, num_samples)
-    if has_analytic_kl(p, q):
-        return closed_kl_divergence(p, q)
-    return _monte_carlo(p, q, num_samples)
-
-
-def _categorical_kl(
-    p: Categorical | OneHotCategorical, q: Categorical | OneHotCategorical
-) -> Tensor:
-    """Of torch's value, and with a gradient where actions are impossible, as under a mask."""
-    probs_p, probs_q = all_probs(p), all_probs(q)
-    possible, both = probs_p > 0, (probs_p > 0) & (probs_q > 0)
-    logs = p.logits, q.logits
-    listed = probs_p is not p.probs or probs_q is not q.probs
-    if listed:  # by a sparse mask, in any order
-        smallest = torch.finfo(probs_p.dtype).tiny
-        logs = probs_p.clamp_min(smallest).log(), probs_q.clamp_min(smallest).log()
-    log_p, log_q = (torch.where(both, log, 0.0) for log in logs)
-    finite = (probs_p * (log_p - log_q)).sum(-1)
-    return torch.where((possible & ~both).any(-1), torch.inf, finite)
-
-
-def _monte_carlo(p: Distribution, q: Distribution, num_samples: int) -> Tensor:
-    try:
-        sample = p.sample(draws(p, q, num_samples))
-        log_p, log_q = log_prob_of(p, sample), log_prob_of(q, sample)
-    except NotImplementedError as error:
-        raise TypeError(
-            f"{type(p).__name__} and {type(q).__name__} have no closed-form divergence and cannot "
-            "be sampled and scored: give a function of your own instead."
-        ) from error
-    log_ratio = log_q - log_p
-    # 1 in value; its gradient is that of the distribution that the actions are drawn from.
-    drawn = (log_p - log_p.detach()).exp()
-    return (drawn * (torch.expm1(log_ratio) - log_ratio)).mean(0)

@@ -101,6 +101,7 @@ def noise_sensitivity(
         Tensor: a single number, the mean over ``[*B]``.
 
     Raises:
+        TypeError: the observations are not floating point.
         ValueError: the scale is not a finite number greater than 0, or actions lack their
             dimension.
 
@@ -114,6 +115,11 @@ def noise_sensitivity(
         tensor(0.0600)
     """
     check_real("noise_sensitivity: scale", scale, above=0)
+    if not observations.is_floating_point():
+        raise TypeError(
+            f"noise_sensitivity: observations must be floating point, got {observations.dtype}: "
+            "noise on integers would be rounded away. Cast them as the policy does."
+        )
     noise = torch.randn(
         observations.shape,
         generator=generator,
@@ -126,7 +132,7 @@ def noise_sensitivity(
         raise ValueError(
             "noise_sensitivity: actions must be [*B, A] of observations [*B, *F], got "
             f"{tuple(change.shape)} of {tuple(observations.shape)}: give actions of one number a "
-            "last dimension of 1."
+            "last dimension of 1, and a single observation a batch dimension."
         )
     return 0.5 * change.square().sum(-1).mean()
 

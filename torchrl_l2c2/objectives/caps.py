@@ -103,8 +103,8 @@ class CAPSLoss(RegularizedLoss):
             policy_mean(here, squashed=squashed), policy_mean(there, squashed=squashed)
         )
         temporal, spatial = (self.reduce_term(term, tensordict) for term in (temporal, spatial))
-        terms.set("loss_caps_temporal", self.caps_lambda_temporal * temporal)
-        terms.set("loss_caps_spatial", self.caps_lambda_spatial * spatial)
+        terms.set("loss_caps_temporal", self.scaled(temporal, "caps_lambda_temporal"))
+        terms.set("loss_caps_spatial", self.scaled(spatial, "caps_lambda_spatial"))
         return terms
 
     def _states(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -81,7 +81,7 @@ class CATSLoss(RegularizedLoss):
         squashed = self.cats_mean == "action"
         means = (policy_mean(p, squashed=squashed) for p in self.policies_at(tensordict, states))
         term = self.reduce_term(cats_term(*means).squeeze(0), tensordict)
-        return terms.set("loss_cats", self.cats_lambda_temporal * term)
+        return terms.set("loss_cats", self.scaled(term, "cats_lambda_temporal"))
 
 
 def cats_term(

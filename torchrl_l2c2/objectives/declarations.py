@@ -114,3 +114,13 @@ class DeclaredTerms(LossMixin):
         if used:
             gain = torch.tensor(float(value), device=self._default_device)
             self.register_buffer(name, gain, persistent=False)
+
+    def scaled(self, term: Tensor, name: str) -> Tensor:
+        """A term times a gain, which may be assigned to before the term's backward pass.
+
+        Args:
+            term: what is scaled.
+            name: of a registered coefficient.
+        """
+        # Autograd keeps the factor, and an assignment writes into the gain itself.
+        return term * self._buffers[name].clone()

@@ -101,7 +101,7 @@ class GradCAPSLoss(RegularizedLoss):
         terms = super().policy_regularizer(tensordict)
         means = self.successive_means(tensordict)
         term = self.reduce_term(grad_caps_term(*means, self.grad_caps_epsilon), tensordict)
-        return terms.set("loss_grad_caps", self.grad_caps_lambda_temporal * term)
+        return terms.set("loss_grad_caps", self.scaled(term, "grad_caps_lambda_temporal"))
 
     def successive_means(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
         """The policy's means ``[*B, A]`` at the states before, the states and the next ones.

@@ -197,7 +197,7 @@ class L2C2Loss(RegularizedLoss):
         how = (policy_distance, hellinger_samples) != ("hellinger", None)
         _check_terms(type(base_loss).__name__, policies, values, beta, how)
         self.declare_networks([*policies, *values])
-        read = [key for wiring in self._evaluation.wiring.values() for key in wiring.states]
+        read = {name: self._evaluation.wiring[name].states for name in [*policies, *values]}
         self.l2c2_moved_keys = None if moved_keys is None else read_moved_keys(moved_keys, read)
         if policies:
             name = distance_name(policy_distance, self.has_stochastic_policy(), hellinger_samples)
@@ -232,7 +232,7 @@ class L2C2Loss(RegularizedLoss):
         for network in self._l2c2_values:
             difference = self._value_difference(network, tensordict, near)
             penalty = self._penalty(difference, near, tensordict)
-            terms.set(_value_term(network), self.l2c2_beta * penalty)
+            terms.set(_value_term(network), self.scaled(penalty, "l2c2_beta"))
             diagnostics.append(self._diagnostic(difference, near, tensordict))
         terms.set("l2c2_value_distance", sum(diagnostics))
         return terms.update(self._gain_diagnostics(near, tensordict))
@@ -278,7 +278,7 @@ class L2C2Loss(RegularizedLoss):
         gain = self.l2c2_neighborhood.gain(near.distance)
         penalty = l2c2_penalty(difference, gain, self.l2c2_over_neighbors)
         penalty = near.to_batch(penalty, tensordict.batch_size)
-        return self.l2c2_coeff * self.reduce_term(penalty, tensordict)
+        return self.scaled(self.reduce_term(penalty, tensordict), "l2c2_coeff")
 
     def _neighbors(self, tensordict: TensorDictBase) -> Neighbors:
         return self.made_once("l2c2_neighbors", lambda: self._make_neighbors(tensordict))

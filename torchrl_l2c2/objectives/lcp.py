@@ -54,7 +54,7 @@ class LCPLoss(RegularizedLoss):
 
     def __init__(self, base_loss: LossModule, coeff: float = 0.002) -> None:
         self.register_coefficient("lcp_coeff", coeff)
-        self.declare_policy()
+        self.declare_policy(successors=False)
         if not self.has_stochastic_policy():
             raise TypeError(
                 f"LCPLoss needs a stochastic policy: that of {type(base_loss).__name__} has no "
@@ -77,7 +77,7 @@ class LCPLoss(RegularizedLoss):
             log_prob = log_prob_of(policy, actions)
             term = lcp_term(log_prob, list(states.values()), tensordict.batch_dims + 1)
         term = self.reduce_term(term.squeeze(0), tensordict)
-        return terms.set("loss_lcp", self.lcp_coeff * term)
+        return terms.set("loss_lcp", self.scaled(term, "lcp_coeff"))
 
 
 def lcp_term(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from math import isclose
 from typing import Literal, NamedTuple
@@ -106,17 +106,17 @@ def read_neighbors(
 
 
 def read_moved_keys(
-    moved_keys: str | Sequence[NestedKey], read: Sequence[NestedKey]
+    moved_keys: str | Sequence[NestedKey], read: Mapping[str, Sequence[NestedKey]]
 ) -> list[NestedKey]:
     """The entries that neighbors differ in; a string is one, as TorchRL's transforms have it.
 
     Args:
         moved_keys (str or sequence of NestedKey): their names.
-        read (sequence of NestedKey): those that the networks read.
+        read (Mapping): those that each network reads, by its name.
 
     Raises:
         TypeError: they are no names.
-        ValueError: there is none, or one that no network reads.
+        ValueError: there is none, one that no network reads, or a network reads none of them.
     """
     if not isinstance(moved_keys, Sequence):
         raise TypeError(f"moved_keys must be a list of entries, got {moved_keys!r}.")
@@ -127,11 +127,17 @@ def read_moved_keys(
             "moved_keys must name at least one observation, got none: leave it at None for all "
             "that can be moved, or pass coeff=0 for no regularization."
         )
-    if unread := [key for key in keys if key not in read]:
-        there = sorted(set(read), key=str)
+    there = sorted({key for states in read.values() for key in states}, key=str)
+    if unread := [key for key in keys if key not in there]:
         raise ValueError(
             f"moved_keys names {unread}, and the networks read {there}; what begins with '_' is "
             "TorchRL's own and no observation."
+        )
+    if still := [name for name, states in read.items() if not set(keys) & set(states)]:
+        raise ValueError(
+            f"moved_keys names {keys}, and {still[0]} reads {list(read[still[0]])} alone, which "
+            "would not move: name one of these, too, or leave its term out (of value functions "
+            "with beta=0)."
         )
     return keys
 

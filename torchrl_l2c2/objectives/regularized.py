@@ -16,6 +16,7 @@ from torchrl_l2c2.objectives.evaluation import EvaluatedNetworks, Policy, is_ens
 from torchrl_l2c2.objectives.shared_evaluation import SharedEvaluation
 from torchrl_l2c2.objectives.specialization import SpecializedLoss
 from torchrl_l2c2.objectives.transitions import (
+    as_masked,
     check_is_trained_on_transitions,
     find_states,
     find_transitions,
@@ -80,7 +81,7 @@ class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
         ...         states = tensordict.select("observation")[None]
         ...         _, action = self.policies_at(tensordict, states)
         ...         cost = self.reduce_term(action.square().sum(-1).mean(0), tensordict)
-        ...         return terms.set("loss_stillness", self.stillness_coeff * cost)
+        ...         return terms.set("loss_stillness", self.scaled(cost, "stillness_coeff"))
         >>> actor = Actor(torch.nn.Linear(3, 1))
         >>> value = ValueOperator(
         ...     MLP(in_features=4, out_features=1), in_keys=["observation", "action"]
@@ -93,6 +94,7 @@ class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
     """
 
     _inputs: tuple[NestedKey, ...] = ()
+    _followed: tuple[str, ...] = ()
     _evaluation = EvaluatedNetworks()  # Every loss has its own, made with it.
 
     def __new__(cls, base_loss: LossModule, *args: Any, **kwargs: Any) -> RegularizedLoss:
@@ -147,8 +149,8 @@ class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
 
     # For who writes a regularizer: declarations, made in __init__.
 
-    def declare_networks(self, networks: Iterable[str]) -> None:
-        """Declares which networks, by their names, are evaluated.
+    def declare_networks(self, networks: Iterable[str], *, successors: bool = True) -> None:
+        """Declares which networks, by their names, are evaluated; with successors at next states.
 
         Raises:
             TypeError: one is recurrent, does not declare its keys, or has several distributions; or
@@ -160,10 +162,12 @@ class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
         for name in networks:
             if getattr(self, name, None) is None:
                 raise ValueError(f"the loss has no network {name!r}, but {there}.")
+        if successors:
+            self._followed = (*self._followed, *networks)
         self._wire([*self._evaluation.wiring, *networks])
 
-    def declare_policy(self) -> None:
-        """Declares that the policy is evaluated.
+    def declare_policy(self, *, successors: bool = True) -> None:
+        """Declares that the policy is evaluated; with successors at next states.
 
         Raises:
             TypeError: the loss has none, or as :meth:`declare_networks`.
@@ -172,7 +176,7 @@ class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
         if not networks:
             regularizer, *_, loss = (part.__name__ for part in self._parts)
             raise TypeError(f"{regularizer} needs a policy: {loss} has none.")
-        self.declare_networks(networks)
+        self.declare_networks(networks, successors=successors)
 
     def declare_inputs(self, keys: Iterable[NestedKey]) -> None:
         """Declares entries of the batch that are read beside states and their successors."""
@@ -297,12 +301,11 @@ class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
 
     def made_once(self, name: str, make: Callable[[], Made]) -> Made:
         """What ``make()`` gives, made once in a forward pass for both methods; else anew."""
-        forward_pass = self._evaluation.forward_pass
-        if forward_pass is None:
+        if (shared := self._evaluation.forward_pass) is None:
             return make()
-        if name not in forward_pass.made:
-            forward_pass.made[name] = make()
-        return forward_pass.made[name]
+        if name not in shared.made:
+            shared.made[name] = make()
+        return shared.made[name]
 
     def reduce_term(self, value: Tensor, tensordict: TensorDictBase) -> Tensor:
         """Reduces as the loss does its own terms: its reduction, masks and priority weights.
@@ -325,6 +328,7 @@ class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
     def reduce_diagnostic(self, value: Tensor, tensordict: TensorDictBase) -> Tensor:
         """The plain mean over the unmasked batch, detached; with reduction="none" the values."""
         reduction = "none" if self._term_reduction == "none" else "mean"
+        value = as_masked(value, tensordict, self._loss_mask_keys())
         return self._reduce_loss(value.detach(), tensordict, reduction=reduction)
 
     # Internals.
@@ -341,6 +345,6 @@ class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
     def _wire(self, networks: Iterable[str]) -> None:
         self._evaluation.wire(self, networks)
         if self.in_keys:
-            wirings = self._evaluation.wiring.values()
+            wirings = (self._evaluation.wiring[name] for name in self._followed)
             successors = (next_key(key) for wiring in wirings for key in wiring.states)
             self.in_keys = list(dict.fromkeys([*self.in_keys, *successors, *self._inputs]))

@@ -12,6 +12,7 @@ from torch.distributions import Distribution
 from torchrl.objectives import LossModule
 
 from torchrl_l2c2._checks import check_positive_int, check_real, check_takes_gradients
+from torchrl_l2c2.divergences import kl_divergence
 from torchrl_l2c2.objectives.evaluation import Policy
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
 from torchrl_l2c2.policy_distances import (
@@ -19,7 +20,6 @@ from torchrl_l2c2.policy_distances import (
     choose_policy_distance,
     compare_policies,
     distance_name,
-    kl_divergence,
 )
 
 States = Mapping[NestedKey, Tensor]
@@ -73,7 +73,6 @@ class SR2LLoss(RegularizedLoss):
         >>> value = ValueOperator(torch.nn.Bilinear(3, 1, 1), in_keys=["observation", "action"])
         >>> loss = SR2LLoss(DDPGLoss(actor, value), epsilon=0.1, coeff=1.0)
         >>> batch = TensorDict({"observation": torch.randn(32, 3)}, batch_size=[32])
-        >>> batch["next", "observation"] = batch["observation"]
         >>> loss.policy_regularizer(batch)["loss_sr2l"]  # (3 * 0.1)^2 / 2, in a corner
         tensor(0.0450, grad_fn=<MulBackward0>)
     """
@@ -92,7 +91,7 @@ class SR2LLoss(RegularizedLoss):
         check_positive_int("steps", steps)
         self.sr2l_epsilon, self.sr2l_steps = float(epsilon), int(steps)
         self.register_coefficient("sr2l_coeff", coeff)
-        self.declare_policy()
+        self.declare_policy(successors=False)
         if policy_distance == "jeffreys":
             self._sr2l_distance: PolicyDistance = jeffreys_divergence
         else:
@@ -117,7 +116,7 @@ class SR2LLoss(RegularizedLoss):
 
         farthest = ascend(distance, states, self.sr2l_epsilon, self.sr2l_steps)
         term = self.reduce_term(distance(farthest), tensordict)
-        return terms.set("loss_sr2l", self.sr2l_coeff * term)
+        return terms.set("loss_sr2l", self.scaled(term, "sr2l_coeff"))
 
 
 def jeffreys_divergence(p: Distribution, q: Distribution) -> Tensor:

@@ -140,6 +140,24 @@ def finite_successor(state: Tensor, successor: Tensor) -> Tensor:
     return torch.where(successor.isfinite(), successor, state)
 
 
+def as_masked(value: Tensor, tensordict: TensorDictBase, mask_keys: Iterable[NestedKey]) -> Tensor:
+    """A number of each transition, ``[*B]``, as one of each agent where a mask is of agents.
+
+    Args:
+        value (Tensor): ``[*B, ...]``.
+        tensordict (TensorDictBase): the batch, ``[*B]``.
+        mask_keys (Iterable of NestedKey): where masks may lie in it, ``[*B, ...]`` or with a last
+            dimension of 1 behind.
+    """
+    for mask in (tensordict.get(key, None) for key in mask_keys):
+        if mask is not None:
+            mask = mask.squeeze(-1) if mask.ndim > value.ndim and mask.shape[-1] == 1 else mask
+            if mask.ndim > value.ndim:
+                more = (None,) * (mask.ndim - value.ndim)
+                value = value[(..., *more)].expand_as(mask)
+    return value
+
+
 def next_key(key: NestedKey) -> NestedKey:
     """Where the successor of an entry lies."""
     # Not by unravel_key, which Dynamo leaves out.

@@ -98,15 +98,16 @@ class Regularization:
         """What the next updates depend on."""
         generator = None if self.neighbors is None else self.neighbors.generator
         drawn = {} if generator is None else {"generator": generator.get_state()}
-        return {"updates": self.updates, **drawn}
+        return {"coefficient": self.coefficient, "updates": self.updates, **drawn}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores what :meth:`state_dict` gave."""
+        """Restores what :meth:`state_dict` gave; of another regularizer nothing."""
+        if state.get("coefficient", self.coefficient) != self.coefficient:
+            return
         self.updates = state["updates"]
         self._set_gain()
         generator = None if self.neighbors is None else self.neighbors.generator
-        # None is saved by a regularizer that draws nothing, and one of another kind by another kind
-        # of device: this one's then begins as it would anew.
+        # One of another kind is saved by another kind of device: this one's then begins anew.
         if generator is not None and "generator" in state:
             saved = state["generator"].cpu()
             if saved.shape == generator.get_state().shape:

@@ -19,7 +19,7 @@ Transitions = dict[NestedKey, tuple[Tensor, Tensor]]  # states and successors, b
 def draw_neighbors(
     tensordict: TensorDictBase,
     neighborhood: Neighborhood,
-    in_keys: Sequence[NestedKey],
+    in_keys: str | Sequence[NestedKey],
     num_samples: int = 1,
     generator: torch.Generator | None = None,
 ) -> TensorDictBase:
@@ -39,6 +39,7 @@ def draw_neighbors(
         >>> near["observation"].shape, near["distance"].shape
         (torch.Size([4, 2, 3]), torch.Size([4, 2]))
     """
+    in_keys = [in_keys] if isinstance(in_keys, str) else in_keys
     _check_names(in_keys)
     transitions = _transitions(tensordict, in_keys)
     uniform = _draw(tensordict, transitions, neighborhood, num_samples, generator)
