@@ -101,6 +101,28 @@ def linear_normal(scale: float = 0.5) -> PPOLoss:
     return PPOLoss(actor, None)
 
 
+@pytest.mark.parametrize("kind", [CAPSLoss, CATSLoss, GradCAPSLoss, ASAPLoss, SR2LLoss, LCPLoss])
+def test_a_gain_may_be_set_before_the_backward_pass(kind):
+    """As by a ramp while gradients of several batches are gathered."""
+    batch = transitions(4)
+    batch["frames"] = torch.cat((batch["observation"], batch["observation"]), -1)
+    loss = kind(PPOLoss(gaussian_actor(), None))
+    parameters = [p for p in loss.parameters() if p.requires_grad]
+    gradients = []
+    for factor in (1.0, 0.0):
+        torch.manual_seed(0)
+        terms = loss.policy_regularizer(batch.copy())
+        before = {name: getattr(loss, name).item() for name in loss._coefficients}
+        for name, value in before.items():
+            setattr(loss, name, factor * value)
+        total = sum(terms[key] for key in loss.added_terms)
+        gradients.append(torch.autograd.grad(total, parameters, allow_unused=True))
+        for name, value in before.items():
+            setattr(loss, name, value)
+    for expected, found in zip(*gradients, strict=True):
+        assert (found is None and expected is None) or torch.equal(found, expected)
+
+
 @pytest.mark.parametrize("kind", [LCPLoss, SR2LLoss])
 def test_no_successor_is_asked_for_that_is_not_read(kind):
     """A batch of the in_keys alone will do, also of demonstrations that have none."""

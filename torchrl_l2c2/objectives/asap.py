@@ -107,9 +107,8 @@ class ASAPLoss(GradCAPSLoss):
         _, mean, _ = self.successive_means(tensordict)
         predicted = self._predicted(tensordict)
         for kind, trained, fixed in (("spatial", mean, predicted), ("temporal", predicted, mean)):
-            term = 2.0 * squared_error(trained, fixed.detach())
-            gain = getattr(self, f"asap_lambda_{kind}")
-            terms.set(f"loss_asap_{kind}", gain * self.reduce_term(term, tensordict))
+            term = self.reduce_term(2.0 * squared_error(trained, fixed.detach()), tensordict)
+            terms.set(f"loss_asap_{kind}", self.scaled(term, f"asap_lambda_{kind}"))
         return terms
 
     def _predicted(self, tensordict: TensorDictBase) -> Tensor:
