@@ -345,12 +345,13 @@ def test_a_batch_that_is_not_finite_can_be_skipped(entry):
     """Nothing changes but the count; a finite batch then learns as ever."""
     experiment = Experiment(small(on_nonfinite="skip"))
     experiment.train()
-    before = [p.clone() for p in experiment.agent.loss.parameters()]
+    loss = experiment.agent.loss
+    before = [p.clone() for p in (*loss.parameters(), *loss.buffers())]
     rows = experiment.learner.replay.storage._storage[entry]
     finite = rows.clone()
     rows.fill_(float("nan"))
     assert experiment.learner.update(True) is None
-    after = experiment.agent.loss.parameters()
+    after = (*loss.parameters(), *loss.buffers())
     assert all(torch.equal(a, b) for a, b in zip(before, after, strict=True))
     rows.copy_(finite)
     assert experiment.learner.update(True)[0].isfinite().all()

@@ -25,7 +25,7 @@ from torchrl_l2c2.experiment import (
     SACConfig,
     TaskConfig,
 )
-from torchrl_l2c2.experiment.composition import CONF, check_preset, tell_tuned
+from torchrl_l2c2.experiment.composition import CONF, check_budget, check_preset, tell_tuned
 from torchrl_l2c2.experiment.config import GROUPS
 from torchrl_l2c2.experiment.manual import manual, page
 from torchrl_l2c2.experiment.regularizers import BEGIN_TUNED, REGULARIZERS, TUNED, TUNED_ON
@@ -235,6 +235,16 @@ def test_a_preset_without_settings_of_a_task_is_refused(preset):
     """And not left at the defaults."""
     with pytest.raises(SettingError, match="preset must have settings of task=swingup with algo"):
         check_preset(composed(f"preset={preset}", "algorithm=ppo"), preset)
+
+
+def test_episodes_beside_a_presets_frames_are_refused():
+    """They would not be read; frames that are switched off leave them."""
+    chosen = ["preset=rl_zoo", "task=pendulum", "algorithm=ppo", "task.episodes=5"]
+    config = ExperimentConfig.from_dict(composed(*chosen))
+    with pytest.raises(SettingError, match=r"task\.episodes is not read .* 500000: give task\."):
+        check_budget(config, chosen)
+    check_budget(config, chosen[:-1])
+    check_budget(ExperimentConfig.from_dict(composed(*chosen, "task.frames=null")), chosen)
 
 
 @pytest.mark.parametrize("algorithm", TUNED)

@@ -186,6 +186,8 @@ def test_a_finished_run_that_goes_on_is_unfinished(ended, monkeypatch, steps):
     """Killed after any of its first steps, it is not taken for the longer run, and goes on."""
     shorter, longer = small(), small(task=replace(SWINGUP, episodes=8))
     (ended / "video.mp4").touch()
+    (ended / "export").mkdir()
+    (ended / "export" / "policy.onnx").touch()
     left = iter(range(steps))
 
     def until_it_is_killed(changed):
@@ -204,9 +206,9 @@ def test_a_finished_run_that_goes_on_is_unfinished(ended, monkeypatch, steps):
     assert finished_run(ended, longer.to_dict()) is None
     assert (finished_run(ended, shorter.to_dict()) is None) == (steps > 0)
     saved = json.loads((ended / "config.json").read_text())
-    ends = {"policy.pt", "video.mp4", "learning_curves.png"}
+    ends = {"policy.pt", "video.mp4", "learning_curves.png", "policy.onnx"}
     of_the_longer = saved["task"]["episodes"] == 8
-    assert not of_the_longer or not ends & {path.name for path in ended.iterdir()}
+    assert not of_the_longer or not ends & {path.name for path in ended.rglob("*")}
     again = Experiment(longer, ended)
     assert len(again.train()) == 8
 
@@ -481,6 +483,21 @@ def test_another_choice_is_named_and_not_what_it_brings():
     saved = small(regularizer=NoRegularizerConfig()).to_dict()
     with pytest.raises(OtherRunError, match=r"made with regularizer=none, not l2c2: give the same"):
         check_same_settings(saved, small().to_dict())
+
+
+def test_metrics_that_another_program_has_saved_are_refused(tmp_path):
+    """Before anything is trained; with the lines' ends of the program they would be cut in two."""
+    config = small(task=replace(SWINGUP, episodes=3))
+    experiment = Experiment(config, tmp_path)
+    experiment.train(1)
+    experiment.close()
+    metrics = tmp_path / "metrics.csv"
+    content = metrics.read_bytes()
+    metrics.write_bytes(content.replace(b"\n", b"\r\n"))
+    with pytest.raises(ValueError, match="is not what the checkpoint was taken with"):
+        Experiment(config, tmp_path)
+    metrics.write_bytes(content)
+    assert len(Experiment(config, tmp_path).train()) == 3
 
 
 @pytest.mark.parametrize("file", ["checkpoint_00000002.pt", "metrics.csv", "train.log"])

@@ -1,5 +1,6 @@
 """Rollouts of a fixed length: what is in them, what is learned from them, how they are saved."""
 
+import json
 import os
 import signal
 from functools import partial
@@ -23,11 +24,13 @@ from torchrl_l2c2.experiment import (
     PPOConfig,
     RolloutReplayConfig,
     TaskConfig,
+    evaluate,
     load_policy,
     make_env,
 )
 from torchrl_l2c2.experiment.diagnosis.run import value_function
 from torchrl_l2c2.experiment.evaluate import evaluate_policy
+from torchrl_l2c2.experiment.noise import play_with_noise
 from torchrl_l2c2.experiment.rollouts import RolloutCollector
 from torchrl_l2c2.experiment.signals import Interrupted
 from torchrl_l2c2.metrics import saturation
@@ -144,6 +147,31 @@ class Moody(gymnasium.Env):
         return np.array([Moody.count], np.float32)
 
 
+class Global(gymnasium.Env):
+    """Draws its rewards from NumPy's global generator, once where it is made."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (1,), np.float32)
+    action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.random.normal(size=1).astype(np.float32), {}
+
+    def step(self, action):
+        reward = float(np.random.normal())
+        return np.random.normal(size=1).astype(np.float32), reward, False, False, {}
+
+
+gymnasium.register("Global-v0", Global, max_episode_steps=20)
+
+
+class Half(Moody):
+    """Its actions have a least, and no largest."""
+
+    action_space = spaces.Box(0.0, np.inf, (1,), np.float32)
+
+
+gymnasium.register("Half-v0", Half, max_episode_steps=20)
 gymnasium.register("Moody-v0", Moody, max_episode_steps=20)
 MOODY = TaskConfig("moody", "Moody-v0", episodes=2)
 
@@ -195,6 +223,29 @@ def test_the_task_gets_clipped_actions_and_the_loss_those_that_were_drawn():
         written = run.agent.policy(frames.select("observation"))
     assert not written["loc"].equal(written["action"])
     assert written["action"].equal(written["loc"].clamp(-0.1, 0.2))
+
+
+def test_a_task_of_numpys_generator_is_tested_as_it_was(tmp_path, capsys):
+    """By the command, and without noise; elsewhere than in the run's own process."""
+    task = TaskConfig("global", "Global-v0", episodes=2)
+    run = experiment(task, folder=tmp_path)
+    run.train()
+    finished = run.finish(run.test())
+    expected = json.loads((tmp_path / "evaluation.json").read_text())["summary"]
+    np.random.seed(7)
+    evaluate.main([str(tmp_path), "--episodes", str(run.config.test_episodes)])
+    assert json.loads(capsys.readouterr().out) == expected
+    ((_, summaries),) = play_with_noise([finished], levels=[0.0], episodes=run.config.test_episodes)
+    assert summaries[0.0]["return_mean"] == expected["return_mean"]
+
+
+def test_a_bound_on_one_side_clips_what_is_deployed_too():
+    """As it clips what training gives the task."""
+    run = experiment(TaskConfig("half", "Half-v0", episodes=2), clip_actions=True, log_scale=0.0)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        written = run.agent.policy(TensorDict({"observation": torch.randn(200, 1) * 100}, [200]))
+    assert written["loc"].min() < 0 == written["action"].min()
+    assert written["action"].equal(written["loc"].clamp_min(0.0))
 
 
 def test_a_test_with_samples_gives_the_task_clipped_actions():

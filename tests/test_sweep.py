@@ -257,7 +257,9 @@ def test_two_jobs_do_not_share_a_folder(tmp_path):
         sweep.claim(0, tmp_path / "seed_0")
         sweep.claim(1, tmp_path / "seed_1")
         sweep.claim(0, tmp_path / "seed_0")
-        with pytest.raises(SettingError, match=r"another for job 2 than for job 0 .*seed_0: how"):
+        with pytest.raises(
+            SettingError, match=r"another for job 2 than for job 0 .*seed_0: they have"
+        ):
             sweep.claim(2, tmp_path / "seed_0")
 
 

@@ -85,7 +85,7 @@ def main() -> None:
     keep_ctrl_c_from_children()
     signal.signal(signal.SIGTERM, terminate)
     register()
-    if not {"-m", "--multirun", "hydra.mode=MULTIRUN"} & set(sys.argv):
+    if not any(map(_asks_for_a_sweep, sys.argv[1:])):
         with composing():
             _main()
         return
@@ -100,6 +100,12 @@ def main() -> None:
             tell_end(sweep)
         stopped_by, failures = sweep.stopped_by, sweep.failures
     sys.exit(bool(failures) if stopped_by is None else 128 + stopped_by)
+
+
+def _asks_for_a_sweep(argument: str) -> bool:
+    """Hydra takes the beginning of an option for the whole."""
+    begun = argument.startswith("--m") and "--multirun".startswith(argument)
+    return begun or argument in ("-m", "hydra.mode=MULTIRUN")
 
 
 def tell_end(sweep: Sweep) -> None:

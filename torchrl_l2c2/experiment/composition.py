@@ -6,7 +6,7 @@ import dataclasses
 import os
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from itertools import product
@@ -81,6 +81,7 @@ def read(values: dict[str, Any]) -> tuple[ExperimentConfig, Path]:
     for name in ("outputs", "resume"):
         values[name] = folder_named(name, values[name])
     config = ExperimentConfig.from_dict(values)
+    check_budget(config, chosen.overrides.task)
     multirun = chosen.mode == RunMode.MULTIRUN
     folder = chosen.sweep.subdir if multirun else chosen.run.dir
     if folder == ".":
@@ -103,6 +104,25 @@ def check_preset(values: dict[str, Any], name: str | None) -> None:
         f"must have settings of task={task} with algorithm={algorithm}, and {name} has those of "
         f"{known}: choose one of these, or preset=none.",
     )
+
+
+def check_budget(config: ExperimentConfig, given: Sequence[str]) -> None:
+    """Refuses episodes beside frames, as a preset has them, by which the length goes then.
+
+    Args:
+        config (ExperimentConfig): the settings.
+        given (Sequence of str): what the command line says.
+
+    Raises:
+        SettingError: with what to give instead.
+    """
+    episodes = any(each.startswith("task.episodes=") for each in given)
+    if episodes and config.task.frames is not None:
+        raise SettingError(
+            "task.episodes",
+            f"is not read where there is task.frames, here {config.task.frames}: give "
+            "task.frames=... instead, or task.frames=null beside it.",
+        )
 
 
 @contextmanager

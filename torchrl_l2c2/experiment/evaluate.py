@@ -311,12 +311,13 @@ def main(arguments: Iterable[str] | None = None) -> None:
             check_video(chosen.record)
         if chosen.output:
             make_folder_of(chosen.output)
-        policy, env, max_steps = load_policy(
-            chosen.folder, seed=chosen.seed, noise_scale=chosen.noise, best=chosen.best
-        )
-        # Of the samples, too: without --seed they are those of the run's own test.
+        # Of all that is drawn: without --seed it is that of the run's own test.
         usual = read_config(chosen.folder)["seed"] + TEST_SEED
         with ProcessState(usual if chosen.seed is None else chosen.seed):
+            # Within, as some tasks draw from the global generators where they are made.
+            policy, env, max_steps = load_policy(
+                chosen.folder, seed=chosen.seed, noise_scale=chosen.noise, best=chosen.best
+            )
             result = evaluate_policy(
                 policy,
                 env,

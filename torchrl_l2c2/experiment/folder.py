@@ -39,7 +39,8 @@ To play test episodes with it:
     python -m torchrl_l2c2.experiment.evaluate FOLDER --episodes 100
 """
 # What the end of a training leaves, beside the test that marks a run as finished.
-OF_THE_END = ("video.mp4", "policy.pt", "learning_curves.png")
+OF_THE_END = ("video.mp4", "policy.pt", "learning_curves.png", "diagnosis.html")
+EXPORTED = tuple(f"export/{name}" for name in ("policy.onnx", "policy.pt2", "contract.json"))
 # What it writes on the way, which one that begins anew does not go on with.
 OF_THE_WAY = ("metrics.csv", "evaluations.json", "policy_best.pt")
 
@@ -62,8 +63,9 @@ def begin_folder(folder: Path, settings: dict[str, Any], *, begun: bool, ended: 
     if not ended or not is_tested(folder, settings):
         (folder / "evaluation.json").unlink(missing_ok=True)
     if not ended:
-        for name in (*OF_THE_END, *(() if begun else OF_THE_WAY)):
-            (folder / name).unlink(missing_ok=True)
+        names = (*OF_THE_END, *EXPORTED, *(() if begun else OF_THE_WAY))
+        for path in filter(Path.exists, (folder / name for name in names)):
+            path.unlink()
     write_json(folder / "config.json", settings)
     write_json(folder / "versions.json", {**versions(), "commit": code_commit()})
     write_atomically(folder / "README.txt", README.encode())

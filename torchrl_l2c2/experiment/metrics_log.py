@@ -61,16 +61,20 @@ class MetricsLog:
         """Cuts off what was written after the state was taken, so that no line comes twice.
 
         Raises:
-            ValueError: the file is shorter than it was.
+            ValueError: the file is shorter than it was, or another.
         """
         self.columns = state["columns"]
         if self.path is None or self.columns is None:
             return
-        size = self.path.stat().st_size if self.path.exists() else 0
-        if size < state["size"]:
+        content = self.path.read_bytes() if self.path.exists() else b""
+        written = content[: state["size"]]
+        # Programs for tables write the lines' ends, or the numbers, in a way of their own.
+        whole = written.startswith(_line(self.columns).encode()) and written.endswith(b"\n")
+        if len(written) < state["size"] or not whole:
             raise ValueError(
-                f"{self.path} has {size} bytes, the checkpoint was taken at {state['size']}: it "
-                "was changed since. Restore it, or choose another folder."
+                f"{self.path} has {len(content)} bytes and is not what the checkpoint was taken "
+                f"with, of {state['size']}: it was changed since. Restore it, or choose another "
+                "folder."
             )
         os.truncate(self.path, state["size"])
 

@@ -10,7 +10,7 @@ import argparse
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -106,15 +106,20 @@ def play_with_noise(
         raise ValueError(f"episodes must be at least 1, got {episodes}.")
     bar = partial(tqdm, unit="run", disable=None if progress else True, leave=False)
     scales = {}
-    for task in dict.fromkeys(run.config["task"]["env_id"] for run in runs):
-        together = [run for run in runs if run.config["task"]["env_id"] == task]
-        scales[task] = _visited_scale(bar(together, f"states of {task}"), episodes)
+    for task in dict.fromkeys(map(_observed, runs)):
+        together = [run for run in runs if _observed(run) == task]
+        scales[task] = _visited_scale(bar(together, f"states of {task[0]}"), episodes)
     played = []
     for run in bar(runs, "noise"):
-        scale = scales[run.config["task"]["env_id"]]
+        scale = scales[_observed(run)]
         summaries = {level: _test(run, level * scale, episodes) for level in levels}
         played.append(Played(run, summaries))
     return played
+
+
+def _observed(run: FinishedRun) -> tuple[Any, ...]:
+    """What is observed: a task's states may be shown in several ways."""
+    return tuple(run.config["task"].get(name) for name in ("env_id", "flatten", "images"))
 
 
 def noise_table(played: Sequence[Played]) -> Table:
@@ -198,8 +203,8 @@ def _visited_scale(runs: Iterable[FinishedRun], episodes: int) -> Tensor:
     """Standard deviation of each feature over the states that runs visit without noise."""
     states = []
     for run in runs:
-        policy, env, max_steps = load_policy(run.folder, noise_scale=0.0)
-        with ProcessState(run.seed):
+        with ProcessState(run.seed + TEST_SEED):
+            policy, env, max_steps = load_policy(run.folder, noise_scale=0.0)
             for episode in play_episodes(policy, env, episodes, max_steps=max_steps):
                 check_finite(episode, 0, test=True)
                 states.append(episode["observation"])
@@ -214,9 +219,10 @@ def _visited_scale(runs: Iterable[FinishedRun], episodes: int) -> Tensor:
 
 
 def _test(run: FinishedRun, scale: Tensor, episodes: int) -> dict[str, float]:
-    policy, env, max_steps = load_policy(run.folder, noise_scale=0.0)
-    noisy = _with_noise(env, scale, run.seed + TEST_SEED)
-    with ProcessState(run.seed):
+    # As the run's own test, which some tasks draw for where they are made.
+    with ProcessState(run.seed + TEST_SEED):
+        policy, env, max_steps = load_policy(run.folder, noise_scale=0.0)
+        noisy = _with_noise(env, scale, run.seed + TEST_SEED)
         summary = evaluate_policy(policy, noisy, episodes, max_steps=max_steps).summary()
     noisy.close()
     return dict(summary)

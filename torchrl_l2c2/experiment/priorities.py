@@ -29,7 +29,10 @@ def draw_by_priority(
     tree = sampler._sum_tree
     total, least = tree.query(0, stored), sampler._min_tree.query(0, stored)
     if total <= 0 or least <= 0:
-        raise RuntimeError(f"priorities must be positive, got a sum of {total}, a least of {least}")
+        raise RuntimeError(
+            f"priorities must be positive, got a sum of {total}, a least of {least}: a smaller "
+            f"replay.alpha than {sampler._alpha} keeps small errors apart from 0."
+        )
     mass = torch.rand(batch_size, generator=sampler._rng) * total
     rows = torch.from_numpy(tree.scan_lower_bound(mass.numpy())).clamp_max_(stored - 1)
     priorities = tree[rows.numpy()]

@@ -150,8 +150,9 @@ class Sweep:
                 raise SettingError(
                     "outputs",
                     f"must be another for job {number} than for job {other} of the sweep, which "
-                    f"both have {folder}: how long is trained and tested names no folder. Sweep "
-                    "over outputs, too, or give two commands.",
+                    f"both have {folder}: they have the same settings, or differ in such as name "
+                    "no folder (how long is trained and tested, threads, ...). Leave one out, "
+                    "sweep over outputs, too, or give two commands.",
                 ) from None
         except FileNotFoundError:  # The sweep has ended.
             return

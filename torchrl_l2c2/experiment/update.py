@@ -103,10 +103,16 @@ def make_update(
     if not skip_nonfinite:
         return update
 
+    # What a loss itself keeps of the batches it has seen, such as PPO-RPE's threshold.
+    kept = list(agent.loss.buffers())
+
     def checked_update(with_policy: bool, *drawn: Any) -> tuple[Tensor, Tensor | None] | None:
+        before = [buffer.clone() for buffer in kept]
         values, priority, gradients = differentiate(with_policy, *drawn)
         tensors = (values, *(g for g in gradients if g is not None))
         if not all(bool(tensor.isfinite().all()) for tensor in tensors):
+            for buffer, was in zip(kept, before, strict=True):
+                buffer.copy_(was)
             return None
         apply(with_policy, gradients)
         return values, priority

@@ -80,6 +80,16 @@ def action_bounds(env: EnvBase) -> tuple[Tensor, Tensor] | tuple[()]:
     return (spec.space.low, spec.space.high) if _bounded(spec) else ()
 
 
+def clip_bounds(env: EnvBase) -> tuple[Tensor, Tensor]:
+    """The least and the largest action, ``[A]`` each; infinite where there is none."""
+    spec = env.action_spec.to(torch.get_default_device())
+    low, high = spec.space.low, spec.space.high
+    if isinstance(spec, Bounded):
+        return low, high
+    # An unbounded one has the largest floats as its low and high.
+    return torch.full_like(low, -torch.inf), torch.full_like(high, torch.inf)
+
+
 # Of the convolutional layers; each halves the image.
 CHANNELS = (16, 32, 32)
 

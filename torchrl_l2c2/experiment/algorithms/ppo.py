@@ -177,10 +177,10 @@ class PPOConfig(AlgorithmConfig):
         self, policy: TensorDictModule, normalization: Normalization | None, env: EnvBase
     ) -> TensorDictModule:
         """The policy that a task sees: all that belongs to it is inside."""
-        from torchrl_l2c2.experiment.algorithms.networks import action_bounds
+        from torchrl_l2c2.experiment.algorithms.networks import clip_bounds
         from torchrl_l2c2.experiment.algorithms.normalization import ActingPolicy
 
         if normalization is None and not self.clip_actions:
             return policy
-        bounds = action_bounds(env) if self.clip_actions else ()
+        bounds = clip_bounds(env) if self.clip_actions else ()
         return ActingPolicy(policy, normalization, *bounds)

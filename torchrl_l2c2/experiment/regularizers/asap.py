@@ -39,7 +39,9 @@ class ASAPConfig(GainConfig):
         default=0.1, gt=0, description="smaller ones punish zigzags around one place more"
     )
     mean: Literal["loc", "action"] = Field(
-        default="loc", description="means compared before or after the squashing [inferred: loc]"
+        default="loc",
+        description="means compared before or after the squashing, which deterministic policies "
+        "(td3) have after it alone [inferred: loc]",
     )
 
     def wrap(self, loss: LossModule) -> LossModule:

@@ -28,7 +28,9 @@ class CAPSConfig(GainConfig):
         default=0.05, ge=0, description="gain of the distance between s and its noisy copy [paper]"
     )
     mean: Literal["loc", "action"] = Field(
-        default="loc", description="means compared before or after the squashing [inferred: loc]"
+        default="loc",
+        description="means compared before or after the squashing, which deterministic policies "
+        "(td3) have after it alone [inferred: loc]",
     )
 
     def wrap(self, loss: LossModule) -> LossModule:

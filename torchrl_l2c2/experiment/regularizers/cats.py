@@ -25,7 +25,9 @@ class CATSConfig(GainConfig):
         default=0.1, ge=0, description="gain of the distance between s and s' [inferred]"
     )
     mean: Literal["loc", "action"] = Field(
-        default="loc", description="means compared before or after the squashing [inferred: loc]"
+        default="loc",
+        description="means compared before or after the squashing, which deterministic policies "
+        "(td3) have after it alone [inferred: loc]",
     )
 
     def wrap(self, loss: LossModule) -> LossModule:

@@ -38,8 +38,9 @@ class L2C2Config(GainConfig):
     max_step: float | None = Field(
         default=None,
         gt=0,
-        description="longest step from s to s' that counts, in the observation's units: a reset or "
-        "a teleport is longer; null: all [paper]",
+        description="longest step from s to s' that counts, in the observation's units (with "
+        "algorithm.normalize_observations in its deviations): a reset or a teleport is longer; "
+        "null: all [paper]",
     )
     beta: float = Field(
         default=0.1,
@@ -69,7 +70,8 @@ class L2C2Config(GainConfig):
         default="hellinger",
         description="how policies are compared: hellinger [paper], half the squared distance of "
         "their means before the squashing, these means' squared error, a mean over the action's "
-        "dimensions, or the KL divergence; they need other gains",
+        "dimensions, or the KL divergence; they need other gains; of deterministic policies (td3) "
+        "the first two are half the squared distance of the actions",
     )
 
     tchebycheff_mu: float | None = Field(
