@@ -25,9 +25,8 @@ from torchrl_l2c2.experiment.errors import told_in_a_line
 from torchrl_l2c2.experiment.files import make_folder_of, to_json, write_json
 from torchrl_l2c2.experiment.frames import check_finite
 from torchrl_l2c2.experiment.process import ProcessState
-from torchrl_l2c2.experiment.saved import read_config
 from torchrl_l2c2.experiment.tasks import TaskConfig
-from torchrl_l2c2.experiment.trained import load_policy
+from torchrl_l2c2.experiment.trained import load_policy, seed_of_test
 from torchrl_l2c2.experiment.video import check_video, record_video
 from torchrl_l2c2.metrics import (
     action_fluctuation_ratio,
@@ -311,9 +310,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
             check_video(chosen.record)
         if chosen.output:
             make_folder_of(chosen.output)
-        # Of all that is drawn: without --seed it is that of the run's own test.
-        usual = read_config(chosen.folder)["seed"] + TEST_SEED
-        with ProcessState(usual if chosen.seed is None else chosen.seed):
+        with ProcessState(seed_of_test(chosen.folder, chosen.seed)):
             # Within, as some tasks draw from the global generators where they are made.
             policy, env, max_steps = load_policy(
                 chosen.folder, seed=chosen.seed, noise_scale=chosen.noise, best=chosen.best

@@ -70,20 +70,16 @@ def load_policy(
         >>> env.rollout(max_steps, policy)["action"].shape
         torch.Size([20, 1])
     """
-    folder = Path(folder)
-    if seed is not None and not 0 <= seed < 2**32:
-        raise SettingError("seed", f"must be at least 0 and below 2 ** 32, got {seed}.")
+    folder, seed = Path(folder), seed_of_test(folder, seed)
     if noise_scale is not None and not 0 <= noise_scale < math.inf:
         raise SettingError("noise_scale", f"must be at least 0 and finite, got {noise_scale}.")
-    if not (folder / "config.json").exists():
-        raise FileNotFoundError(f"{str(folder)!r} is not the folder of a run: no config.json.")
     config = ExperimentConfig.from_dict(read_config(folder))
     config = replace(config, device="cpu")
     _check_origin(config.task.env_id, folder)
     noise = config.task.noise_scale if noise_scale is None else noise_scale
     task = replace(config.task, noise_scale=noise)
     with torch.random.fork_rng(devices=[]):  # Weights are drawn, before they are read.
-        env = make_env(task, config.seed + TEST_SEED if seed is None else seed, render=render)
+        env = make_env(task, seed, render=render)
         agent = config.make_agent(env)
     saved = folder / ("policy_best.pt" if best else "policy.pt")
     if saved.exists():
@@ -98,6 +94,25 @@ def load_policy(
     else:
         raise FileNotFoundError(f"{str(folder)!r} holds neither policy.pt nor a checkpoint yet.")
     return agent.policy, env, config.task.time_limit
+
+
+def seed_of_test(folder: str | Path, seed: int | None = None) -> int:
+    """The seed of all that is drawn in the test of a run, or another one that is given.
+
+    Args:
+        folder (str or Path): of the run.
+        seed (int, optional): another one.
+
+    Raises:
+        FileNotFoundError: the folder is not a run's.
+        ValueError: its ``config.json`` is damaged.
+        SettingError: a seed that NumPy does not take.
+    """
+    if seed is not None and not 0 <= seed < 2**32:
+        raise SettingError("seed", f"must be at least 0 and below 2 ** 32, got {seed}.")
+    if not (Path(folder) / "config.json").exists():
+        raise FileNotFoundError(f"{str(folder)!r} is not the folder of a run: no config.json.")
+    return int(read_config(folder)["seed"]) + TEST_SEED if seed is None else seed
 
 
 def _check_origin(env_id: str, folder: Path) -> None:

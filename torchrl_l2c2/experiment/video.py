@@ -17,13 +17,12 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
 from torchrl_l2c2.experiment.collection import play_episodes
-from torchrl_l2c2.experiment.environments import TEST_SEED, control_rate, make_env, untransformed
+from torchrl_l2c2.experiment.environments import control_rate, make_env, untransformed
 from torchrl_l2c2.experiment.errors import told_in_a_line
 from torchrl_l2c2.experiment.files import make_folder_of
 from torchrl_l2c2.experiment.process import ProcessState
-from torchrl_l2c2.experiment.saved import read_config
 from torchrl_l2c2.experiment.tasks import TaskConfig
-from torchrl_l2c2.experiment.trained import load_policy
+from torchrl_l2c2.experiment.trained import load_policy, seed_of_test
 
 Picture = NDArray[np.uint8]
 # Of the files that H.264, the encoder's default, fits into.
@@ -120,10 +119,9 @@ def play_pictures(
         list: of each, the episode ``[T]``; its ``T + 1`` pictures, from the reset on; their rate,
         or ``None`` where the simulator does not say.
     """
-    usual = read_config(run)["seed"] + TEST_SEED
     with _without_a_screen():
-        # As the run's own test, which some tasks draw for where they are made.
-        with ProcessState(usual if seed is None else seed):
+        # Within, as some tasks draw from the global generators where they are made.
+        with ProcessState(seed_of_test(run, seed)):
             policy, env, max_steps = load_policy(
                 run, seed=seed, noise_scale=noise_scale, best=best, render=True
             )
