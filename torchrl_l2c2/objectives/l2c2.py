@@ -114,7 +114,7 @@ class L2C2Loss(RegularizedLoss):
             and relative to how wide the policies are; ``"mean"``
             (:func:`~torchrl_l2c2.policy_distances.mean_distance`) is neither; nor is ``"mse"``
             (:func:`~torchrl_l2c2.policy_distances.mean_squared_error`), a mean over the action's
-            dimensions; ``"kl"`` (:func:`~torchrl_l2c2.policy_distances.kl_divergence`), of the
+            dimensions; ``"kl"`` (:func:`~torchrl_l2c2.divergences.kl_divergence`), of the
             policy at :math:`s` from the other, is relative and unbounded. Each wants its own gains.
             A function takes two distributions ``[K, *B]`` and returns ``[K, *B]``; neither it nor
             ``"kl"`` takes deterministic policies. A module's parameters are not the loss's.
