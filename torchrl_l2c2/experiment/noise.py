@@ -19,7 +19,6 @@ from torchrl.envs import EnvBase, TransformedEnv
 from tqdm import tqdm
 
 from torchrl_l2c2.experiment.collection import play_episodes
-from torchrl_l2c2.experiment.environments import TEST_SEED
 from torchrl_l2c2.experiment.errors import told_in_a_line
 from torchrl_l2c2.experiment.evaluate import evaluate_policy
 from torchrl_l2c2.experiment.files import make_folder, write_atomically, write_json
@@ -33,7 +32,7 @@ from torchrl_l2c2.experiment.reports.figures import finish, styles, subplots
 from torchrl_l2c2.experiment.reports.groups import Group, group_records
 from torchrl_l2c2.experiment.reports.statistics import mean
 from torchrl_l2c2.experiment.reports.tables import Table, number_range
-from torchrl_l2c2.experiment.trained import load_policy
+from torchrl_l2c2.experiment.trained import load_policy, seed_of_test
 from torchrl_l2c2.transforms import ObservationNoise
 
 LEVELS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
@@ -203,7 +202,7 @@ def _visited_scale(runs: Iterable[FinishedRun], episodes: int) -> Tensor:
     """Standard deviation of each feature over the states that runs visit without noise."""
     states = []
     for run in runs:
-        with ProcessState(run.seed + TEST_SEED):
+        with ProcessState(seed_of_test(run.folder)):
             policy, env, max_steps = load_policy(run.folder, noise_scale=0.0)
             for episode in play_episodes(policy, env, episodes, max_steps=max_steps):
                 check_finite(episode, 0, test=True)
@@ -219,10 +218,11 @@ def _visited_scale(runs: Iterable[FinishedRun], episodes: int) -> Tensor:
 
 
 def _test(run: FinishedRun, scale: Tensor, episodes: int) -> dict[str, float]:
-    # As the run's own test, which some tasks draw for where they are made.
-    with ProcessState(run.seed + TEST_SEED):
+    seed = seed_of_test(run.folder)
+    # Within, as some tasks draw from the global generators where they are made.
+    with ProcessState(seed):
         policy, env, max_steps = load_policy(run.folder, noise_scale=0.0)
-        noisy = _with_noise(env, scale, run.seed + TEST_SEED)
+        noisy = _with_noise(env, scale, seed)
         summary = evaluate_policy(policy, noisy, episodes, max_steps=max_steps).summary()
     noisy.close()
     return dict(summary)
