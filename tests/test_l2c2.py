@@ -568,6 +568,29 @@ class TestWhichStatesAreMoved:
         away = neighbor["position"].squeeze(-1).abs()
         torch.testing.assert_close(neighbor["distance"], away + near.epsilon)
 
+    @pytest.mark.parametrize("following", [True, False])
+    def test_neighbors_of_a_part_are_told(self, following):
+        """What the loss would have moved and the transform does not, unless that was asked for."""
+
+        def batch():
+            batch = transitions(4)
+            batch["goal"] = torch.randn(4, 2)
+            if following:
+                batch["next", "goal"] = torch.randn(4, 2)
+            return NeighborTransform(NEAR)(batch)
+
+        actor = Actor(mlp(3 + 2, 2), in_keys=["observation", "goal"])
+        value = ValueOperator(mlp(3 + 2, 1), in_keys=["observation", "action"])
+        loss = L2C2Loss(DDPGLoss(actor, value), NEAR)
+        asked = L2C2Loss(DDPGLoss(actor, value), NEAR, moved_keys=["observation"])
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            asked.policy_regularizer(batch())
+            if following:
+                with pytest.raises(UserWarning, match=r"\['observation'\] alone.*\['goal'\]: add"):
+                    loss.policy_regularizer(batch())
+            loss.policy_regularizer(batch())  # Once is enough.
+
 
 class TestFraction:
     """Neighbors for a random share of the batch."""

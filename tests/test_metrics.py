@@ -239,6 +239,12 @@ def test_noise_sensitivity_of_a_linear_policy():
     assert found.item() == pytest.approx(0.5 * 0.04 * weight.square().sum().item(), rel=0.03)
 
 
+def test_noise_sensitivity_refuses_what_is_no_action():
+    """A TorchRL actor returns more than its action."""
+    with pytest.raises(TypeError, match="the mean actions alone, got a tuple"):
+        noise_sensitivity(lambda s: (s, s), torch.zeros(4, 3), 0.2)
+
+
 def test_noise_sensitivity_refuses_integers():
     """Noise on them would be rounded away."""
     with pytest.raises(TypeError, match=r"floating point, got torch\.uint8: noise on integers"):

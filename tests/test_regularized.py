@@ -7,6 +7,7 @@ import gc
 import math
 import pickle
 import threading
+import warnings
 
 import pytest
 import torch
@@ -68,10 +69,12 @@ from torchrl_l2c2 import (
     CAPSLoss,
     CATSLoss,
     L2C2Loss,
+    LCPLoss,
     Neighborhood,
     NeighborTransform,
     PPORPELoss,
     RegularizedLoss,
+    SR2LLoss,
     make_actor,
     make_critic,
 )
@@ -376,6 +379,30 @@ class TestAttributes:
             assert loss.l2c2_coeff.item() == 0.75
             assert not loss.l2c2_coeff.requires_grad
 
+    @pytest.mark.parametrize("name", ["entropy_coeff", "cats_lambda_temporal", "gamma"])
+    def test_a_gain_takes_no_others_name(self, name):
+        """Neither of the loss nor of a regularizer within it."""
+
+        class Further(RegularizedLoss):
+            def __init__(self, base_loss, coeff):
+                self.register_coefficient(name, coeff)
+
+        base = CATSLoss(SACLoss(gaussian_actor(), qvalue())) if name != "entropy_coeff" else None
+        if name == "gamma":
+            base.register_buffer("gamma", torch.tensor(0.9))
+        with pytest.raises(ValueError, match=f"has '{name}' already"):
+            Further(base or PPOLoss(gaussian_actor(), critic()), 1.0)
+
+    def test_a_gain_by_its_constructors_name_is_told(self):
+        """Which would be an attribute like any other, and scale nothing."""
+        loss = CATSLoss(ddpg(), lambda_temporal=0.1)
+        with pytest.warns(UserWarning, match="scales nothing .* is 'cats_lambda_temporal'"):
+            loss.lambda_temporal = 5.0
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            loss.cats_lambda_temporal = 5.0
+            loss.anything = 5.0
+
     def test_load_hooks_outlive_the_wrapped_loss(self):
         """Hooks of the plain loss that name their module work when only the new one is left."""
         loss = L2C2Loss(IQLLoss(gaussian_actor(), qvalue(), critic(), num_qvalue_nets=1))
@@ -395,9 +422,30 @@ class TestWhatIsRefused:
             DTLoss(actor),
             OnlineDTLoss(gaussian_actor(), alpha_init=1.0, target_entropy=-1.0),
         ):
-            for regularizer in (L2C2Loss, CAPSLoss):
+            for regularizer in (L2C2Loss, CAPSLoss, SR2LLoss):
                 with pytest.raises(TypeError, match="is not trained on transitions"):
                     regularizer(loss)
+
+    def test_losses_of_ones_own_without_successors(self):
+        """They have no neighborhood of a transition; what needs none takes them."""
+
+        class Imitation(LossModule):
+            def __init__(self, actor):
+                super().__init__()
+                self.in_keys, self.out_keys = ["observation", "action"], ["loss_imitation"]
+                self.convert_to_functional(actor, "actor_network")
+
+            def forward(self, tensordict):
+                with self.actor_network_params.to_module(self.actor_network):
+                    policy = self.actor_network.get_dist(tensordict)
+                return TensorDict(loss_imitation=-policy.log_prob(tensordict["action"]).mean())
+
+        loss, batch = Imitation(gaussian_actor()), transitions(4).exclude("next")
+        assert LCPLoss(loss)(batch)["loss_lcp"] > 0
+        assert SR2LLoss(loss)(batch)["loss_sr2l"] > 0
+        for within in (loss, LCPLoss(loss)):
+            with pytest.raises(TypeError, match=r"^Imitation is not trained on transitions"):
+                L2C2Loss(within, beta=0.0)
 
     def test_recurrent_policies(self):
         """A policy with a hidden state has no value at a neighbor alone."""
@@ -598,6 +646,60 @@ class TestNetworks:
         found = torch.autograd.grad(terms["loss_l2c2_critic"], weight, allow_unused=True)[0]
         assert (found is None) == separate
         assert ("next", "observation") in loss.in_keys and ("next", "hidden") not in loss.in_keys
+
+    @pytest.mark.parametrize(
+        ("make", "network"),
+        [
+            (lambda actor, v, q: PPOLoss(actor, v, separate_losses=False), "critic"),
+            (lambda actor, v, q: PPOLoss(actor, v, separate_losses=True), "critic"),
+            (lambda actor, v, q: ClipPPOLoss(actor, v), "critic"),
+            (lambda actor, v, q: A2CLoss(actor, v, separate_losses=False), "critic"),
+            (lambda actor, v, q: ReinforceLoss(actor, v), "critic"),
+            (lambda actor, v, q: PPORPELoss(actor, v), "critic"),
+            (lambda actor, v, q: SACLoss(actor, q, target_entropy=-2.0), "qvalue"),
+            (lambda actor, v, q: IQLLoss(actor, qvalue(), value_network=v), "value"),
+        ],
+    )
+    def test_a_value_trains_a_trunk_where_the_plain_loss_does(self, make, network):
+        """Those of SAC, A2C and others read the trunk's output from the batch, and train none."""
+        torch.manual_seed(0)
+        trunk = TensorDictModule(mlp(OBSERVATION, 8), ["observation"], ["hidden"])
+        net = nn.Sequential(mlp(8, 2 * ACTION), NormalParamExtractor())
+        actor = ProbabilisticActor(
+            TensorDictSequential(trunk, TensorDictModule(net, ["hidden"], ["loc", "scale"])),
+            in_keys=["loc", "scale"],
+            distribution_class=TanhNormal,
+            return_log_prob=True,
+        )
+        value = ValueOperator(mlp(8, 1), in_keys=["hidden"])
+        of_actions = ValueOperator(mlp(8 + ACTION, 1), in_keys=["hidden", "action"])
+        batch = on_policy(6)
+        batch["hidden"] = trunk.module(batch["observation"]).detach()
+        batch["next", "hidden"] = trunk.module(batch["next", "observation"]).detach()
+        loss = L2C2Loss(make(actor, value, of_actions), NEAR)
+        weight = loss.actor_network_params["module", "0", "module", "0", "module", "0", "weight"]
+        terms = loss(batch)
+        if "loss_critic" not in terms.keys() and network == "critic":
+            terms["loss_critic"] = terms["loss_value"]  # REINFORCE's name for it
+        own, added = (
+            torch.autograd.grad(terms[key], weight, allow_unused=True, retain_graph=True)[0]
+            for key in (f"loss_{network}", f"loss_l2c2_{network}")
+        )
+        assert (added is None) == (own is None)
+
+    @pytest.mark.parametrize("given", ["scaled", "hidden"])
+    def test_the_action_is_what_a_policy_acts_with(self, given):
+        """And not what else it writes for the value function, which DDPG does not tell apart."""
+        torch.manual_seed(0)
+        before = TensorDictModule(nn.Linear(OBSERVATION, OBSERVATION), ["observation"], [given])
+        actor = TensorDictSequential(before, TensorDictModule(mlp(3, ACTION), [given], ["action"]))
+        value = ValueOperator(mlp(OBSERVATION + ACTION, 1), in_keys=[given, "action"])
+        batch = transitions(6)
+        steps = (batch["observation"], batch["next", "observation"])
+        acts = [actor(TensorDict(observation=state))["action"].detach() for state in steps]
+        loss = CATSLoss(DDPGLoss(actor, value), 1.0)
+        found = loss.policy_regularizer(batch)["loss_cats"]
+        torch.testing.assert_close(found, (acts[1] - acts[0]).square().sum(-1).mean())
 
     def test_running_statistics_are_the_losss_own(self):
         """Evaluating neighbors does not count as another batch in normalization layers."""

@@ -181,6 +181,21 @@ class TestGradCAPS:
         term = grad_caps_term(torch.zeros(1, 1), torch.zeros(1, 1), torch.ones(1, 1), 0.5)
         assert term.item() == pytest.approx((1.0 / (math.tanh(1.0) + 0.5)) ** 2)
 
+    @pytest.mark.parametrize("kind", [GradCAPSLoss, ASAPLoss])
+    def test_frames_that_are_not_of_the_state(self, kind):
+        """As from before a normalization: told at the first batch."""
+        batch = self.batch()
+        batch["frames"] = 2.0 * batch["frames"]
+        with pytest.raises(ValueError, match="second half of 'frames' is not 'observation'"):
+            kind(linear_base()).policy_regularizer(batch)
+
+    def test_states_that_are_not_a_step_apart(self):
+        """Behind a multi-step transform the line would be a zigzag."""
+        batch = self.batch()
+        batch["steps_to_next_obs"] = torch.tensor([[3], [1]])
+        with pytest.raises(ValueError, match=r"up to 3 steps away.*leave MultiStepTransform out"):
+            GradCAPSLoss(linear_base()).policy_regularizer(batch)
+
     def test_catframes_gives_what_it_needs(self):
         """The state before, and the state itself in the first step of an episode."""
         frames = CatFrames(N=2, dim=-1, in_keys=["observation"], out_keys=["frames"])

@@ -147,7 +147,8 @@ class GradientGain(_BoundedGain):
         limit (float): the gain stays between the first that was measured divided by this, and
             multiplied by it, greater than 1: a term whose gradient vanishes raises it no further.
             Defaults to ``1000``.
-        value (float): the gain until something is measured, greater than 0. Defaults to ``1.0``.
+        value (float): the gain until something is measured, greater than 0: what the loss's
+            coefficient has to be at the first measurement. Defaults to ``1.0``.
 
     Raises:
         TypeError: if a value is not a real number.

@@ -101,7 +101,7 @@ def noise_sensitivity(
         Tensor: a single number, the mean over ``[*B]``.
 
     Raises:
-        TypeError: the observations are not floating point.
+        TypeError: the observations are not floating point, or the policy returns no tensor.
         ValueError: the scale is not a finite number greater than 0, or actions lack their
             dimension.
 
@@ -126,7 +126,14 @@ def noise_sensitivity(
         dtype=observations.dtype,
         device=observations.device,
     )
-    change = policy(observations + scale * noise) - policy(observations)
+    actions = policy(observations)
+    if not isinstance(actions, torch.Tensor):
+        raise TypeError(
+            f"noise_sensitivity: policy must return the mean actions alone, got a "
+            f"{type(actions).__name__}: of a TorchRL actor take the 'action' that it writes under "
+            "ExplorationType.DETERMINISTIC."
+        )
+    change = policy(observations + scale * noise) - actions
     batch = change.shape[:-1]
     if (not batch and observations.ndim > 1) or observations.shape[: len(batch)] != batch:
         raise ValueError(

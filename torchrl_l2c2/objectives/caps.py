@@ -52,8 +52,8 @@ class CAPSLoss(RegularizedLoss):
     Keyword Args:
         mean (str): ``"loc"`` compares means before the squashing, and so restrains saturated
             policies as well; ``"action"`` compares deterministic actions, which hardly move once
-            they are saturated. The same for policies that are not squashed. [inferred] Defaults
-            to ``"loc"``.
+            they are saturated. The same for policies that are not squashed, and for deterministic
+            ones, which give their action alone. [inferred] Defaults to ``"loc"``.
 
     Raises:
         TypeError: the loss has no policy or cannot be regularized, or an argument has the wrong

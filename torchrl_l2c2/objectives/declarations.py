@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 from typing import Any
@@ -43,6 +44,7 @@ class DeclaredTerms(LossMixin):
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name not in self._coefficients:
+            self._tell_gains_like(name)
             super().__setattr__(name, value)
             return
         try:
@@ -59,6 +61,15 @@ class DeclaredTerms(LossMixin):
             )
         self._buffers[name].fill_(number)
         self._coefficients[name].fill_(number)
+
+    def _tell_gains_like(self, name: str) -> None:
+        """Warns of a new attribute that has the end of a gain's name, as constructors do."""
+        gains = [gain for gain in self._coefficients if gain.endswith(f"_{name}")]
+        if gains and not hasattr(self, name):
+            warnings.warn(
+                f"{name!r} scales nothing in a {type(self).__name__}: the gain is {gains[0]!r}.",
+                stacklevel=3,
+            )
 
     def declare_terms(
         self,
@@ -107,7 +118,13 @@ class DeclaredTerms(LossMixin):
             value: a finite number of at least 0, or a tensor of one, now and whenever it is
                 assigned to.
             used: whether there is a term that it scales. If not, assigning to it is an error.
+
+        Raises:
+            TypeError: the value is no number.
+            ValueError: it is negative or not finite, or the loss has something of that name.
         """
+        if name in self._coefficients or hasattr(self, name):
+            raise ValueError(f"the loss has {name!r} already: choose another name.")
         value = as_number(name, value)
         check_real(name, value, at_least=0)
         self._coefficients = {**self._coefficients, name: torch.tensor(float(value))}

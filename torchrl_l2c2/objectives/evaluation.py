@@ -197,7 +197,7 @@ class EvaluatedNetworks:
         rows = self._rows(network, tensordict, states, with_batch=known is None)
         if wiring.trunk:
             hidden = self._evaluate(loss, POLICY_NETWORK, rows).select(*wiring.trunk)
-            rows.update(hidden.detach() if getattr(loss, "separate_losses", False) else hidden)
+            rows.update(hidden if wiring.trains_trunk else hidden.detach())
         out = self._evaluate(loss, network, rows).select(*keys)
         if known is None:
             return _split(out, dim, [1, num], tensordict)

@@ -33,10 +33,10 @@ class GradCAPSLoss(RegularizedLoss):
 
         CatFrames(N=2, dim=-1, in_keys=["observation"], out_keys=["frames"])
 
-    appended to the environment: the first half of ``frames`` is that observation, in the first step
-    of an episode the state itself. Or it is an entry of its own, such as the
-    ``"previous_observation"`` that the collectors of this package's experiment keep, named by
-    ``previous_key``.
+    appended to the environment, behind what normalizes the observation: the first half of
+    ``frames`` is that observation, in the first step of an episode the state itself. Or it is an
+    entry of its own, such as the ``"previous_observation"`` that the collectors of this package's
+    experiment keep, named by ``previous_key``.
 
     Args:
         base_loss (LossModule): the loss; see :class:`RegularizedLoss` for how it is wrapped. Its
@@ -57,7 +57,8 @@ class GradCAPSLoss(RegularizedLoss):
         TypeError: the loss has no policy or cannot be regularized, or an argument has the wrong
             type.
         ValueError: an argument is out of its range; in use, the policy reads several observations,
-            or the frames are not two of them.
+            or the frames are not two of them; in the first batch that is not compiled, the second
+            of them is not the state, or the next states are several steps away.
         KeyError: in use, if the batch has no frames.
 
     Examples:
@@ -92,6 +93,7 @@ class GradCAPSLoss(RegularizedLoss):
         self.grad_caps_previous_key = previous_key
         if previous_key is not None:
             self.grad_caps_previous_key = read_key("previous_key", previous_key)
+        self._grad_caps_checked = False
         self.register_coefficient("grad_caps_lambda_temporal", lambda_temporal)
         self.declare_policy()
         self.declare_terms(policy=["loss_grad_caps"])
@@ -127,6 +129,9 @@ class GradCAPSLoss(RegularizedLoss):
             )
         ((key, (state, successor)),) = transitions.items()
         before = self._before(tensordict, key, state).detach().to(state.dtype)
+        if not (self._grad_caps_checked or torch.compiler.is_compiling()):
+            self._check_successive(tensordict, key, state)
+            self._grad_caps_checked = True  # Once, as a GPU would have to be waited for.
         states = torch.stack((before, finite_successor(state, successor)))
         return TensorDict({key: states}, batch_size=[2, *tensordict.batch_size])
 
@@ -147,6 +152,23 @@ class GradCAPSLoss(RegularizedLoss):
                 "with CatFrames(N=2, dim=-1)."
             )
         return frames[..., : state.shape[-1]]
+
+    def _check_successive(self, tensordict: TensorDictBase, key: NestedKey, state: Tensor) -> None:
+        """Refuses states that are not a step apart, or not in the same units."""
+        steps = tensordict.get("steps_to_next_obs", None)
+        if steps is not None and (steps > 1).any():
+            raise ValueError(
+                f"next states are up to {int(steps.max())} steps away, and three successive states "
+                "are compared: leave MultiStepTransform out."
+            )
+        if self.grad_caps_previous_key is not None:
+            return
+        current = tensordict.get(self.grad_caps_frames_key)[..., state.shape[-1] :]
+        if not torch.allclose(current.to(state.dtype), state, rtol=0.01, atol=0.001):
+            raise ValueError(
+                f"the second half of {self.grad_caps_frames_key!r} is not {key!r}: put CatFrames "
+                "behind what normalizes or perturbs it, and CatFrames(dim=-1) in the order of time."
+            )
 
     def _previous(
         self, tensordict: TensorDictBase, previous_key: NestedKey, state: Tensor

@@ -24,6 +24,7 @@ from torchrl_l2c2.objectives.neighbors import (
     read_moved_keys,
     read_neighbors,
     warn_of_other_neighbors,
+    warn_of_unmoved,
 )
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
 from torchrl_l2c2.objectives.transitions import next_key
@@ -58,17 +59,17 @@ class L2C2Loss(RegularizedLoss):
     it is the squared Hellinger distance, summed over the actions.
 
     Gradients flow into the policy's parameters from the one term, into the value function's from
-    the other, through both :math:`s` and :math:`\tilde s`, and nowhere else: not into targets,
-    nor from a value into the policy except through a trunk that the plain loss trains so as well.
+    the other, through both :math:`s` and :math:`\tilde s`, and nowhere else: not into targets, nor
+    from a value into the policy except through a trunk that the plain loss trains so as well.
     Both terms are reduced as the loss reduces its own: with its ``reduction``, its masks and, where
     it uses them, the weights of prioritized replay, in TorchRL's weighted mean or sum. Beside
     :class:`PPORPELoss`, which scales its own terms down by the weights, theirs have a mean of 1, so
     that the terms keep their full gain [inferred: the paper weights neither or both].
 
     Neighbors are read from the batch where :class:`~torchrl_l2c2.NeighborTransform` has written
-    them (give it the same neighborhood and ``num_samples``; a difference is told once, as a
-    warning), and otherwise drawn from the observations and next
-    observations with torch's global generator. Drawn here, those floating-point inputs of the
+    them (give it the same neighborhood, ``num_samples`` and observations; a difference is told
+    once, as a warning), and otherwise drawn from the observations and next observations with
+    torch's global generator. Drawn here, those floating-point inputs of the
     regularized networks are moved that have a successor in the batch, or ``moved_keys``, and the
     distance is the largest of theirs.
 
@@ -137,13 +138,11 @@ class L2C2Loss(RegularizedLoss):
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from torchrl.modules import MLP, Actor, ValueOperator
+        >>> from torchrl.modules import Actor, ValueOperator
         >>> from torchrl.objectives import DDPGLoss, SoftUpdate
         >>> from torchrl_l2c2 import L2C2Loss, Neighborhood
         >>> actor = Actor(torch.nn.Linear(3, 1))
-        >>> value = ValueOperator(
-        ...     MLP(in_features=4, out_features=1), in_keys=["observation", "action"]
-        ... )
+        >>> value = ValueOperator(torch.nn.Bilinear(3, 1, 1), in_keys=["observation", "action"])
         >>> loss = L2C2Loss(DDPGLoss(actor, value), Neighborhood(sigma=1.0), beta=0.1)
         >>> isinstance(loss, DDPGLoss), isinstance(loss, L2C2Loss)
         (True, True)
@@ -295,6 +294,8 @@ class L2C2Loss(RegularizedLoss):
             # Of the first transition; a batch may be a single one, with no dimension.
             first = drawn.unsqueeze(-1).flatten(1)[:, :1]
             self._compare(first.flatten().tolist(), len(distance))
+            if self.l2c2_moved_keys is None:
+                warn_of_unmoved(states, tensordict, self._evaluation.wiring.values())
         check_moved(states, self.l2c2_moved_keys)
         return Neighbors(states, distance, rows)
 

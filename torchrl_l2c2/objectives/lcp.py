@@ -12,6 +12,7 @@ from torchrl.objectives import LossModule
 from torchrl_l2c2._checks import check_takes_gradients
 from torchrl_l2c2.distances import log_prob_of
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
+from torchrl_l2c2.objectives.wiring import POLICY_NETWORK
 
 
 class LCPLoss(RegularizedLoss):
@@ -73,7 +74,9 @@ class LCPLoss(RegularizedLoss):
             assert isinstance(policy, Distribution)
             actions = tensordict.unsqueeze(0)
             if not isinstance(policy, CompositeDistribution):
-                actions = actions.get(self.tensor_keys.action)
+                # Of a loss that does not name it, what the policy writes.
+                written = self._evaluation.wiring[POLICY_NETWORK].output
+                actions = actions.get(getattr(self.tensor_keys, "action", written))
             log_prob = log_prob_of(policy, actions)
             term = lcp_term(log_prob, list(states.values()), tensordict.batch_dims + 1)
         term = self.reduce_term(term.squeeze(0), tensordict)

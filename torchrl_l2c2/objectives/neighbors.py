@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from math import isclose
 from typing import Literal, NamedTuple
@@ -14,6 +14,8 @@ from torch import Tensor
 
 from torchrl_l2c2._checks import check_of_each, read_key
 from torchrl_l2c2.neighborhood import Neighborhood
+from torchrl_l2c2.objectives.transitions import is_floating_point, next_key
+from torchrl_l2c2.objectives.wiring import Wiring
 
 
 class Neighbors(NamedTuple):
@@ -153,6 +155,34 @@ def check_moved(neighbors: TensorDictBase, moved_keys: Sequence[NestedKey] | Non
         raise ValueError(
             f"the batch has neighbors of {moved}, and moved_keys names {list(moved_keys)}: give "
             "the NeighborTransform these in_keys, or leave moved_keys out."
+        )
+
+
+def warn_of_unmoved(
+    neighbors: TensorDictBase, tensordict: TensorDictBase, networks: Iterable[Wiring]
+) -> None:
+    """Says which observations neighbors in a batch leave as they are, though they have successors.
+
+    Args:
+        neighbors (TensorDictBase): the states, ``[K, *B]``.
+        tensordict (TensorDictBase): the batch, ``[*B]``.
+        networks (Iterable of Wiring): those that are evaluated.
+
+    Warns:
+        UserWarning: there are some, which a loss that draws neighbors itself would move.
+    """
+    moved = list(neighbors.keys(include_nested=True, leaves_only=True))
+    others = {key for network in networks for key in network.states} - set(moved)
+    batch = tensordict.select(*others, strict=False)
+    following = tensordict.select(*map(next_key, others), strict=False)
+    floating = (key for key in others if is_floating_point(batch.get(key, None)))
+    still = [key for key in floating if following.get(next_key(key), None) is not None]
+    if still:
+        warnings.warn(
+            f"neighbors in the batch move {moved} alone, and the networks also read "
+            f"{sorted(still, key=str)}: add it to the in_keys of NeighborTransform, or say "
+            f"moved_keys={moved} to L2C2Loss.",
+            stacklevel=4,
         )
 
 

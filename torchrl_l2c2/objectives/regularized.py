@@ -17,7 +17,8 @@ from torchrl_l2c2.objectives.shared_evaluation import SharedEvaluation
 from torchrl_l2c2.objectives.specialization import SpecializedLoss
 from torchrl_l2c2.objectives.transitions import (
     as_masked,
-    check_is_trained_on_transitions,
+    check_evaluates_states,
+    check_reads_next,
     find_states,
     find_transitions,
     next_key,
@@ -67,7 +68,7 @@ class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
 
     Examples:
         >>> import torch
-        >>> from torchrl.modules import MLP, Actor, ValueOperator
+        >>> from torchrl.modules import Actor, ValueOperator
         >>> from torchrl.objectives import DDPGLoss
         >>> from torchrl_l2c2 import RegularizedLoss
         >>> class StillnessLoss(RegularizedLoss):
@@ -83,9 +84,7 @@ class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
         ...         cost = self.reduce_term(action.square().sum(-1).mean(0), tensordict)
         ...         return terms.set("loss_stillness", self.scaled(cost, "stillness_coeff"))
         >>> actor = Actor(torch.nn.Linear(3, 1))
-        >>> value = ValueOperator(
-        ...     MLP(in_features=4, out_features=1), in_keys=["observation", "action"]
-        ... )
+        >>> value = ValueOperator(torch.nn.Bilinear(3, 1, 1), in_keys=["observation", "action"])
         >>> loss = StillnessLoss(DDPGLoss(actor, value), coeff=0.1)
         >>> type(loss).__name__, isinstance(loss, DDPGLoss), loss.out_keys[-1]
         ('StillnessLoss[DDPGLoss]', True, 'loss_stillness')
@@ -99,7 +98,7 @@ class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
 
     def __new__(cls, base_loss: LossModule, *args: Any, **kwargs: Any) -> RegularizedLoss:
         self = super().__new__(cls, base_loss)
-        check_is_trained_on_transitions(base_loss)
+        check_evaluates_states(base_loss)
         regularized = isinstance(base_loss, RegularizedLoss)
         self._evaluation = EvaluatedNetworks(base_loss._evaluation.wiring if regularized else None)
         return self
@@ -153,8 +152,8 @@ class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
         """Declares which networks, by their names, are evaluated; with successors at next states.
 
         Raises:
-            TypeError: one is recurrent, does not declare its keys, or has several distributions; or
-                a string in the place of a list.
+            TypeError: one is recurrent, does not declare its keys, or has several distributions;
+                the loss reads no successors; or a string in the place of a list.
             ValueError: the loss has no network of that name.
         """
         networks = listed_names(networks)
@@ -163,6 +162,7 @@ class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
             if getattr(self, name, None) is None:
                 raise ValueError(f"the loss has no network {name!r}, but {there}.")
         if successors:
+            check_reads_next(self)
             self._followed = (*self._followed, *networks)
         self._wire([*self._evaluation.wiring, *networks])
 
@@ -300,7 +300,7 @@ class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
         return None
 
     def made_once(self, name: str, make: Callable[[], Made]) -> Made:
-        """What ``make()`` gives, made once in a forward pass for both methods; else anew."""
+        """What ``make()`` gives: in a forward pass once for all who ask by a name, else anew."""
         if (shared := self._evaluation.forward_pass) is None:
             return make()
         if name not in shared.made:

@@ -8,13 +8,17 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import (
+    ACTLoss,
     BCLoss,
+    DiffusionBCLoss,
     DreamerActorLoss,
     DreamerV3ActorLoss,
     DreamerV3Loss,
     DreamerV3ValueLoss,
     DreamerValueLoss,
+    DTLoss,
     LossModule,
+    OnlineDTLoss,
 )
 
 IMAGINING = (
@@ -26,9 +30,12 @@ IMAGINING = (
 )
 """Losses that evaluate their networks along trajectories of a learned model."""
 
+OF_SEQUENCES = (ACTLoss, DTLoss, DiffusionBCLoss, OnlineDTLoss)
+"""Losses whose policies read or write sequences."""
 
-def check_is_trained_on_transitions(loss: LossModule) -> None:
-    """Refuses losses whose networks are not evaluated at observed states with a successor.
+
+def check_evaluates_states(loss: LossModule) -> None:
+    """Refuses losses whose networks are not evaluated at single observed states.
 
     Args:
         loss (LossModule): the loss.
@@ -39,7 +46,7 @@ def check_is_trained_on_transitions(loss: LossModule) -> None:
     # Here, as it takes a while to import and few have a use for it.
     from torchrl.objectives.llm import DistillationLoss, GRPOLoss, SFTLoss
 
-    name, in_keys = type(loss).__name__, getattr(loss, "in_keys", [])
+    name = type(loss).__name__
     if isinstance(loss, DistillationLoss | GRPOLoss | SFTLoss):
         raise TypeError(
             f"{name} trains a language model: its states are texts, made of tokens, and between "
@@ -50,12 +57,31 @@ def check_is_trained_on_transitions(loss: LossModule) -> None:
             f"{name} evaluates its networks along trajectories that a learned model imagines, not "
             "at single observed states, so that there is no neighborhood to regularize them in."
         )
+    if isinstance(loss, OF_SEQUENCES):
+        raise TypeError(
+            f"{name} is not trained on transitions: its policy reads or writes sequences, and "
+            "there is no neighborhood of a single state to regularize it in."
+        )
+
+
+def check_reads_next(loss: LossModule) -> None:
+    """Refuses losses that are not trained on states with a successor.
+
+    Args:
+        loss (LossModule): the loss.
+
+    Raises:
+        TypeError: it reads nothing that follows.
+    """
+    in_keys = getattr(loss, "in_keys", [])
+    name = getattr(loss, "_parts", (type(loss),))[-1].__name__  # without its regularizers
     # Demonstrations have next states, which behavior cloning alone does not read.
     reads_next = any(isinstance(key, tuple) and key[0] == "next" for key in in_keys)
     if in_keys and not (reads_next or isinstance(loss, BCLoss)):
         raise TypeError(
             f"{name} is not trained on transitions (it reads {sorted(in_keys, key=str)}): "
-            "without a next observation there is nothing to regularize between."
+            "without a next observation there is nothing to regularize between. LCPLoss and "
+            "SR2LLoss need none."
         )
 
 
@@ -121,7 +147,7 @@ def find_states(
         )
     tensordict = tensordict.select(*keys, strict=False).detach()
     found = {key: tensordict.get(key, None) for key in keys}
-    floating = {key: state for key, state in found.items() if _is_floating_point(state)}
+    floating = {key: state for key, state in found.items() if is_floating_point(state)}
     if not floating:
         kinds = {key: getattr(s, "dtype", type(s).__name__) for key, s in found.items()}
         raise TypeError(
@@ -177,5 +203,6 @@ def _check_successor(key: NestedKey, state: Tensor, successor: Tensor) -> None:
         )
 
 
-def _is_floating_point(value: object) -> bool:
+def is_floating_point(value: object) -> bool:
+    """Whether an entry of a batch is a tensor of floating-point numbers."""
     return isinstance(value, Tensor) and value.is_floating_point()

@@ -11,7 +11,7 @@ from torch import nn
 from torch.nn.modules.batchnorm import _BatchNorm
 from torch.nn.modules.dropout import _DropoutNd
 from torchrl.modules import Delta, GRUModule, LSTMModule, TanhDelta
-from torchrl.objectives import LossModule
+from torchrl.objectives import IQLLoss, LossModule, PPOLoss, ReinforceLoss
 
 POLICY_NETWORK = "actor_network"
 """The name under which losses hold their policy."""
@@ -32,6 +32,7 @@ class Wiring:
     inputs: tuple[NestedKey, ...]  # what the evaluation reads from the batch
     states: tuple[NestedKey, ...]  # those inputs that are states
     trunk: tuple[NestedKey, ...]  # inputs that are hidden outputs of the policy network
+    trains_trunk: bool  # whether gradients of its own term reach the policy through these
     output: NestedKey | None  # a value function's value, a deterministic policy's action
     stochastic: bool
     has_buffers: bool
@@ -69,6 +70,7 @@ def wiring_of(loss: LossModule, network: str) -> Wiring:
         inputs=tuple(key for key in inputs if key not in trunk),
         states=tuple(k for k in inputs if k not in made.union(actions) and not _is_private(k)),
         trunk=tuple(trunk),
+        trains_trunk=_trains_trunk(loss, network),
         output=output,
         stochastic=stochastic,
         has_buffers=_has_buffers(loss, network),
@@ -81,7 +83,20 @@ def _unnamed_action(loss: LossModule, actor: Any, made: set[NestedKey]) -> Neste
     networks: list[Any] = [getattr(loss, name, None) for name in VALUE_NETWORKS]
     read = {key for network in networks if network is not None for key in network.in_keys}
     written: list[NestedKey] = list(actor.out_keys)
-    return next((key for key in written if key in made & read), written[-1])
+    # What a policy hands on to the values beside its action, such as a trunk, it writes before.
+    found = [key for key in written if key in made & read]
+    return "action" if "action" in found else (found or written)[-1]
+
+
+def _trains_trunk(loss: LossModule, network: str) -> bool:
+    """Whether a value function trains the policy by its hidden outputs in the plain loss.
+
+    That is where the loss evaluates the policy before, in the same batch; others read what the
+    batch holds.
+    """
+    of_values = isinstance(loss, IQLLoss) and network == "value_network"
+    whole = not getattr(loss, "separate_losses", False)
+    return of_values or (isinstance(loss, PPOLoss | ReinforceLoss) and whole)
 
 
 def _is_private(key: NestedKey) -> bool:
