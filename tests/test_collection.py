@@ -22,9 +22,14 @@ from torchrl.envs import (
 
 from torchrl_l2c2 import make_actor
 from torchrl_l2c2.experiment import (
+    AdamConfig,
     EpisodeCollector,
+    Experiment,
+    ExperimentConfig,
     MultiEpisodeCollector,
+    SACConfig,
     TaskConfig,
+    UniformReplayConfig,
     make_env,
 )
 from torchrl_l2c2.experiment.collection import play_episodes
@@ -127,6 +132,32 @@ def test_an_episode_that_was_interrupted_is_not_gone_on_with(monkeypatch):
         collector.rollout()
     episode = collector.rollout()
     assert len(episode) == 9 and episode["next", "done"].sum() == 1
+
+
+def test_an_episode_is_not_gone_on_with_between_its_updates(monkeypatch):
+    """Of an algorithm that learns after every frame, and is interrupted twice in a notebook."""
+    task = TaskConfig("pendulum", "Pendulum-v1", episodes=3, max_steps=9)
+    run = Experiment(
+        ExperimentConfig(
+            task=task,
+            algorithm=SACConfig(hidden=(8,)),
+            replay=UniformReplayConfig(),
+            optimizer=AdamConfig(),
+            compile=False,
+        )
+    )
+    remember, calls = run.learner.remember_frame, iter(range(100))
+
+    def interrupted(frame):
+        remember(frame)
+        if next(calls) == 12:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(run.learner, "remember_frame", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run.train()
+    assert [row["frames"] for row in run.train()] == [9, 22, 31]  # 4 were lost
+    assert {row["length"] for row in run.metrics} == {9}
 
 
 @pytest.mark.parametrize("key", ["observation", "following", "action", "reward"])

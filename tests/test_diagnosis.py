@@ -19,6 +19,7 @@ from torchrl_l2c2.experiment import (
     Experiment,
     ExperimentConfig,
     L2C2Config,
+    NoRegularizerConfig,
     PPOConfig,
     PPORPEConfig,
     RolloutReplayConfig,
@@ -28,7 +29,7 @@ from torchrl_l2c2.experiment import (
     load_policy,
     make_env,
 )
-from torchrl_l2c2.experiment.diagnose import main
+from torchrl_l2c2.experiment.diagnose import _names, main
 from torchrl_l2c2.experiment.diagnosis import (
     THRESHOLDS,
     Diagnosis,
@@ -43,6 +44,7 @@ from torchrl_l2c2.experiment.diagnosis import (
 from torchrl_l2c2.experiment.diagnosis.film import film
 from torchrl_l2c2.experiment.diagnosis.page import page
 from torchrl_l2c2.experiment.diagnosis.run import _batch
+from torchrl_l2c2.experiment.files import make_folder_of, write_json
 from torchrl_l2c2.experiment.learner import Learner
 from torchrl_l2c2.metrics import action_variation, previous_action_gain
 
@@ -553,6 +555,33 @@ class TestCommand:
         rows = picture.split('<g id="axes_')[1:]
         ticks = [sorted(re.findall(r">([^<>a-z]*\d)</text>", row)) for row in rows]
         assert len(rows) == 2 and ticks[0] == ticks[1] != []
+
+    def test_runs_are_called_as_in_tables(self, tmp_path):
+        """By what they are, not by their folders; by these where their methods are alike."""
+
+        def folder(name, **settings):
+            path = tmp_path / name / "config.json"
+            make_folder_of(path)
+            write_json(path, ExperimentConfig(**settings).to_dict())
+            return str(tmp_path / name)
+
+        tuned = L2C2Config(policy_distance="mean", lambda_min=10.0, lambda_max=1000.0)
+        first = folder("0ddc7233/seed_0", regularizer=tuned)
+        second = folder("none/seed_0", regularizer=NoRegularizerConfig())
+        assert _names([first, second]) == ["L2C2, means 10", "vanilla"]
+        other = folder("sigma-2/seed_0", regularizer=replace(tuned, sigma=2.0))
+        assert _names([first, other]) == ["0ddc7233", "sigma-2"]
+
+    def test_ctrl_c_is_one_line(self, run, monkeypatch, capsys):
+        """Of every command that tells its errors so."""
+
+        def stopped(*_, **__):
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr("torchrl_l2c2.experiment.diagnose.diagnose_run", stopped)
+        with pytest.raises(SystemExit) as ended:
+            main([str(run)])
+        assert ended.value.code == 130 and capsys.readouterr().err == "interrupted.\n"
 
     def test_what_is_wrong_is_one_line(self, run, tmp_path, capsys):
         """A folder that is no run; the same run twice; names that are too few."""

@@ -25,7 +25,14 @@ from torchrl_l2c2.experiment import (
     SACConfig,
     TaskConfig,
 )
-from torchrl_l2c2.experiment.composition import CONF, check_budget, check_preset, tell_tuned
+from torchrl_l2c2.experiment.composition import (
+    CONF,
+    check_budget,
+    check_folders,
+    check_preset,
+    check_simulator,
+    tuned,
+)
 from torchrl_l2c2.experiment.config import GROUPS
 from torchrl_l2c2.experiment.manual import manual, page
 from torchrl_l2c2.experiment.regularizers import BEGIN_TUNED, REGULARIZERS, TUNED, TUNED_ON
@@ -247,33 +254,56 @@ def test_episodes_beside_a_presets_frames_are_refused():
     check_budget(ExperimentConfig.from_dict(composed(*chosen, "task.frames=null")), chosen)
 
 
+def test_another_simulator_is_no_named_task():
+    """It would have the task's length, noise and place in tables."""
+    config = ExperimentConfig.from_dict(composed("task=reacher", "task.env_id=Pendulum-v1"))
+    with pytest.raises(SettingError, match=r"of task=reacher is .*: task=gymnasium task.env_id="):
+        check_simulator(config)
+    check_simulator(ExperimentConfig.from_dict(composed("task=reacher")))
+    own = composed("task=gymnasium", "task.env_id=Pendulum-v1")
+    check_simulator(ExperimentConfig.from_dict(own))
+
+
+@pytest.mark.parametrize("name", ["hydra.sweep.dir", "hydra.run.dir"])
+def test_hydras_folders_are_none_of_a_sweep(name):
+    """Runs would go elsewhere, and older ones there pass for its own."""
+    given = {"hydra.sweep.dir": "outputs", "hydra.sweep.subdir": ".", "hydra.run.dir": "."}
+    hydra = OmegaConf.create({"hydra": {"sweep": {}, "run": {}}})
+    for key, value in given.items():
+        OmegaConf.update(hydra, key, value)
+    check_folders(hydra.hydra, "outputs")
+    OmegaConf.update(hydra, name, "mine")
+    with pytest.raises(SettingError, match=f"{name}.*'mine': give outputs=mine"):
+        check_folders(hydra.hydra, "outputs")
+    if name == "hydra.sweep.dir":
+        hydra.hydra.sweep.subdir = "a"  # A folder of each run, which is read.
+        check_folders(hydra.hydra, "outputs")
+
+
 @pytest.mark.parametrize("algorithm", TUNED)
 @pytest.mark.parametrize("name", BEGIN_TUNED)
-def test_l2c2_begins_from_what_was_found_for_the_algorithm(name, algorithm, capsys):
+def test_l2c2_begins_from_what_was_found_for_the_algorithm(name, algorithm):
     """What is given goes before; a run says what it has; l2c2_paper is the paper's."""
     chosen = [f"algorithm={algorithm}", f"regularizer={name}"]
     config = ExperimentConfig.from_dict(composed(*chosen))
     own = {**TUNED[algorithm], **BEGIN_TUNED[name]}
     found = dataclasses.replace(REGULARIZERS[name], **own)
     assert config.regularizer == found != REGULARIZERS[name]
-    tell_tuned(config)
-    told = capsys.readouterr().out
+    told = tuned(config)
     assert f"lambda_min={found.lambda_min}, " in told
     assert f"for {algorithm} on {TUNED_ON[algorithm]}" in told
     other = ExperimentConfig.from_dict(composed(*chosen, "regularizer.beta=0.5"))
     assert other.regularizer == dataclasses.replace(found, beta=0.5)
     paper = ExperimentConfig.from_dict(composed(chosen[0], "regularizer=l2c2_paper"))
     assert dataclasses.replace(paper.regularizer, name="l2c2") == L2C2Config()
-    for config in (paper, ExperimentConfig()):
-        tell_tuned(config)
-    assert not capsys.readouterr().out
+    assert tuned(paper) is tuned(ExperimentConfig()) is None
 
 
 @pytest.mark.parametrize("chosen", [("algorithm=dqn",), ("task=pendulum",)], ids=str)
-def test_l2c2_says_where_nothing_was_found_for_it(chosen, capsys):
+def test_l2c2_says_where_nothing_was_found_for_it(chosen):
     """With another algorithm, or the paper's on another task."""
-    tell_tuned(ExperimentConfig.from_dict(composed(*chosen, "regularizer=l2c2")))
-    assert "others were found for ppo, sac, td3 alone" in capsys.readouterr().out
+    told = tuned(ExperimentConfig.from_dict(composed(*chosen, "regularizer=l2c2")))
+    assert "others were found for ppo, sac, td3 alone" in told
 
 
 @pytest.mark.parametrize("task", PAPER_TASKS)

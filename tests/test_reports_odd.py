@@ -21,6 +21,7 @@ from torchrl_l2c2.experiment.reports.figures import draw_plane, styles
 from torchrl_l2c2.experiment.reports.front import front_table
 from torchrl_l2c2.experiment.reports.groups import baseline_of, by_task, group_records
 from torchrl_l2c2.experiment.reports.pairwise import pairwise_tables
+from torchrl_l2c2.experiment.reports.paper_table import paper_table
 from torchrl_l2c2.experiment.reports.records import read_records, write_records
 from torchrl_l2c2.experiment.reports.score import readings
 
@@ -56,6 +57,36 @@ def of(records, task, method="l2c2"):
     return [r for r in records if (r.task, r.method) == (task, method)]
 
 
+class TestLatePolicies:
+    def test_of_a_cut_training_they_are_its_own_share(self, tmp_path):
+        """As of the uncut one, and not the last tenth whatever was asked for."""
+        config = make_config(episodes=20, late_share=0.2)
+        make_run(tmp_path / "0", config, 100.0, 0.1)
+        (run,) = read_runs(tmp_path)
+        # Two of five episodes are late: of returns of 100 and a million less.
+        shorter, last = (run.until(length).record.late_sampled_return for length in (10, 19))
+        assert shorter == -1e6
+        assert last == pytest.approx((3 * -1e6 + 99.0) / 4)
+
+    def test_of_several_shares_they_are_told(self, tmp_path):
+        """They are pooled, as the training is the same."""
+        for seed, share in enumerate((0.1, 0.1, 1.0)):
+            make_run(tmp_path / str(seed), make_config(seed=seed, late_share=share), 100.0, 0.1)
+        (note,) = find_runs([tmp_path]).notes
+        folder = tmp_path / "2"
+        assert note == f"1 pooled with runs of another late_share: {folder} (late_share=1.0)"
+
+    def test_untrained_runs_are_told(self, tmp_path):
+        """Their policies are as they were made."""
+        for seed in range(2):
+            make_run(tmp_path / str(seed), make_config(seed=seed), 100.0, 0.1)
+        path = tmp_path / "1" / "evaluation.json"
+        training = {"episodes": 20, "frames": 2000, "updates": 0, "untrained": "no update"}
+        path.write_text(json.dumps({**json.loads(path.read_text()), "training": training}))
+        (note,) = find_runs([tmp_path]).notes
+        assert note.startswith("1 untrained (") and note.endswith(str(tmp_path / "1"))
+
+
 class TestPictures:
     def test_a_name_has_one_look_in_all_panels(self, field):
         """There is one legend for them."""
@@ -75,6 +106,13 @@ class TestPictures:
 
 
 class TestTables:
+    def test_another_simulator_is_none_of_the_papers(self, tmp_path):
+        """Whatever the task is called."""
+        config = make_config()
+        task = replace(config.task, env_id="Pendulum-v1")
+        make_run(tmp_path / "0", replace(config, task=task), 100.0, 0.1)
+        assert paper_table(group_records([run.record for run in read_runs(tmp_path)])) is None
+
     def test_runs_of_another_length_are_not_compared(self, field):
         """Each against each: CATS trained ten times as long is beside nobody."""
         longer = [

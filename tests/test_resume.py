@@ -37,7 +37,7 @@ from torchrl_l2c2.experiment.checkpoints import (
     load_checkpoint,
     save_checkpoint,
 )
-from torchrl_l2c2.experiment.command import _end_logged, run
+from torchrl_l2c2.experiment.command import _end_logged, _warnings_logged, run
 from torchrl_l2c2.experiment.config import GROUPS
 from torchrl_l2c2.experiment.continuation import check_same_settings
 from torchrl_l2c2.experiment.errors import OtherRunError
@@ -45,7 +45,7 @@ from torchrl_l2c2.experiment.files import write_json
 from torchrl_l2c2.experiment.naming import run_name
 from torchrl_l2c2.experiment.reports import results
 from torchrl_l2c2.experiment.reports.differences import fingerprint
-from torchrl_l2c2.experiment.reports.runs import find_runs, finished_run
+from torchrl_l2c2.experiment.reports.runs import find_runs, finished_run, read_runs
 from torchrl_l2c2.experiment.trained import load_policy
 
 ROOT = Path(__file__).parent.parent
@@ -218,6 +218,24 @@ def finished(folder, **settings):
     run.train()
     run.finish(run.test())
     run.close()
+
+
+def test_a_part_of_a_training_is_a_run_of_its_length(tmp_path):
+    """In a notebook; the command then trains the rest, and tests of the part go with it."""
+    run = Experiment(small(), tmp_path)
+    run.train(2)
+    run.finish(run.test())
+    assert read_runs(tmp_path)[0].record.length == "2 episodes"
+    assert finished_run(tmp_path, small().to_dict()) is None
+    run.train()
+    assert not (tmp_path / "evaluation.json").exists() and not (tmp_path / "policy.pt").exists()
+    run.finish(run.test())
+    assert read_runs(tmp_path)[0].record.length == "6 episodes"
+    assert finished_run(tmp_path, small().to_dict()) is not None
+    run.train(8)  # beyond the settings'
+    run.finish(run.test())
+    run.close()
+    assert read_runs(tmp_path)[0].record.length == "8 episodes"
 
 
 def test_what_changes_no_number_leaves_a_run_finished(ended):
@@ -520,6 +538,14 @@ def test_a_full_disk_names_the_file_and_the_last_good_checkpoint(tmp_path, monke
     experiment.close()
     monkeypatch.undo()
     assert len(Experiment(config, tmp_path).train()) == 3
+
+
+def test_a_warning_is_a_line_in_the_log_too(tmp_path, capsys):
+    """And not Python's, with a line of its source."""
+    with _warnings_logged(tmp_path):
+        warnings.warn("hardly regularized", stacklevel=1)
+    assert capsys.readouterr().err == "warning: hardly regularized\n"
+    assert (tmp_path / "train.log").read_text().endswith(" warning: hardly regularized\n")
 
 
 def test_an_error_that_there_is_no_room_to_log_is_told(tmp_path):

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,7 @@ from small import own_nodes  # noqa: E402
 
 from tests.test_front import forget  # noqa: E402
 from tests.test_reports import make_config, make_run  # noqa: E402
+from torchrl_l2c2.experiment import L2C2Config  # noqa: E402
 from torchrl_l2c2.experiment.search import Search, main  # noqa: E402
 from torchrl_l2c2.experiment.search_space import check_settings, read_space  # noqa: E402
 
@@ -137,6 +139,28 @@ def test_a_trial_without_late_tests_is_scored_by_its_last_policies(tmp_path):
     (tmp_path / "trial_0002").mkdir()
     with pytest.raises(RuntimeError, match=r"trial_0002 has no results; .* test_episodes of"):
         search.tell(2)
+
+
+def test_a_trial_that_failed_counts_for_nothing(tmp_path, monkeypatch, capsys):
+    """The seeds of it that did not fail would flatter it, in the front as for Optuna."""
+    ends = {0: 0, 1: 1, 2: 0}  # exit statuses; one run of the second trial has ended
+
+    def sweep(command):
+        number = int(command[-1][-4:])
+        for seed in (0, 1)[: 1 if ends[number] else 2]:
+            config = make_config(regularizer="l2c2", seed=seed)
+            own = L2C2Config(lambda_min=0.1 * (number + 1), lambda_max=10.0)
+            place = tmp_path / f"trial_{number:04d}" / str(seed)
+            make_run(place, replace(config, regularizer=own), 99.0 * number, 0.05)
+        return ends[number]
+
+    monkeypatch.setattr("torchrl_l2c2.experiment.search.run_sweep", sweep)
+    main([*GAINS, "--output", str(tmp_path), "--trials", "3"])
+    told = capsys.readouterr().out
+    assert "trial_0001: failed, and counts for nothing" in told
+    page = (tmp_path / "report" / "report.html").read_text()
+    assert "Hellinger 0.1" in told + page and "Hellinger 0.3" in told
+    assert "Hellinger 0.2" not in told + page
 
 
 @pytest.mark.parametrize(

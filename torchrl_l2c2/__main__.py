@@ -15,6 +15,8 @@ Commands, with the extra "experiment": pip install "torchrl-l2c2[experiment]"
   python -m torchrl_l2c2.experiment task=hopper      trains; --help lists every setting
   python -m torchrl_l2c2.experiment -m seed=0,1,2    trains several, one after another
   python -m torchrl_l2c2.experiment.evaluate FOLDER  plays test episodes with a run's policy
+  python -m torchrl_l2c2.experiment.video FOLDER     a video of an episode
+  python -m torchrl_l2c2.experiment.export FOLDER    its policy as ONNX
   python -m torchrl_l2c2.experiment.diagnose FOLDER  a page of why its policy shakes
   python -m torchrl_l2c2.experiment.noise FOLDER     how the policies below it bear noise
   python -m torchrl_l2c2.experiment.reports FOLDER   tables and pictures of the runs below a folder

@@ -29,11 +29,11 @@ from torchrl_l2c2.experiment.composition import (
     read,
     register,
     tell_sweep,
-    tell_tuned,
+    tuned,
 )
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.errors import EXPECTED, show_cause
-from torchrl_l2c2.experiment.progress import log
+from torchrl_l2c2.experiment.progress import log, say
 from torchrl_l2c2.experiment.settings import SettingError
 from torchrl_l2c2.experiment.signals import (
     Interrupted,
@@ -216,7 +216,8 @@ def run(
     chosen = (config.task, config.algorithm, config.regularizer)
     named = f"{', '.join(group.name for group in chosen)}, seed {config.seed}: {folder}"
     print(f"{standing}: {named}" if standing else named, flush=True)
-    tell_tuned(config)
+    if (told := tuned(config)) is not None:
+        print(told, flush=True)
     wait_for_folder(folder, patience)
     check_elsewhere(values["resume"])
     finished = finished_run(folder, config.to_dict())
@@ -252,7 +253,13 @@ def _train(
 
     keep_freed_memory()
     going_on = {name: values[name] for name in ("resume", "allow_other_versions")}
-    with closing(Experiment(config, folder, **going_on)) as experiment, _end_logged(folder):
+    with (
+        _warnings_logged(folder),
+        closing(Experiment(config, folder, **going_on)) as experiment,
+        _end_logged(folder),
+    ):
+        if (told := tuned(config)) is not None:
+            log(folder, told)
         experiment.train(progress=standing or True)
         if not config.test_episodes:
             save_policy(experiment.agent.policy, folder / "policy.pt")
@@ -272,6 +279,18 @@ def _show(finished: FinishedRun) -> None:
     if not picture.exists():
         draw_learning_curves([finished], picture)
     print(f"picture: {picture}", flush=True)
+
+
+@contextmanager
+def _warnings_logged(folder: Path) -> Iterator[None]:
+    """Warnings are lines like others, above the bar and in ``train.log``."""
+
+    def tell(message: Warning | str, *_: Any, **__: Any) -> None:
+        say(folder, f"warning: {message}")
+
+    with warnings.catch_warnings():
+        warnings.showwarning = tell
+        yield
 
 
 @contextmanager

@@ -24,7 +24,7 @@ from torchrl_l2c2.experiment.manual import manual
 from torchrl_l2c2.experiment.naming import run_name
 from torchrl_l2c2.experiment.regularizers import BEGIN_TUNED, TUNED, TUNED_ON
 from torchrl_l2c2.experiment.settings import SettingError, describe
-from torchrl_l2c2.experiment.tasks import PAPER_TASKS
+from torchrl_l2c2.experiment.tasks import PAPER_TASKS, TASKS
 
 PACKAGE = Path(__file__).parents[1]
 # Beside the package in a clone, within it when installed.
@@ -82,7 +82,10 @@ def read(values: dict[str, Any]) -> tuple[ExperimentConfig, Path]:
         values[name] = folder_named(name, values[name])
     config = ExperimentConfig.from_dict(values)
     check_budget(config, chosen.overrides.task)
+    check_simulator(config)
     multirun = chosen.mode == RunMode.MULTIRUN
+    if multirun:
+        check_folders(chosen, values["outputs"])
     folder = chosen.sweep.subdir if multirun else chosen.run.dir
     if folder == ".":
         return config, Path(values["outputs"]) / run_name(config)
@@ -123,6 +126,42 @@ def check_budget(config: ExperimentConfig, given: Sequence[str]) -> None:
             f"is not read where there is task.frames, here {config.task.frames}: give "
             "task.frames=... instead, or task.frames=null beside it.",
         )
+
+
+def check_simulator(config: ExperimentConfig) -> None:
+    """Refuses another simulator under the name of a task, whose settings are of its own.
+
+    Raises:
+        SettingError: with what to give instead.
+    """
+    task = config.task
+    if task.name in TASKS and task.env_id != (own := TASKS[task.name].env_id):
+        raise SettingError(
+            "task.env_id",
+            f"of task={task.name} is {own}, got {task.env_id}: task=gymnasium "
+            f"task.env_id={task.env_id} is a task by itself.",
+        )
+
+
+def check_folders(chosen: Any, outputs: str) -> None:
+    """Refuses Hydra's names for where runs go, which a sweep does not read.
+
+    Args:
+        chosen (HydraConf): what Hydra was told.
+        outputs (str): where the sweep's runs go.
+
+    Raises:
+        SettingError: with what to give instead.
+    """
+    whole = chosen.sweep.subdir == "." and chosen.sweep.dir != outputs
+    for name, given in {
+        "hydra.sweep.dir": chosen.sweep.dir if whole else None,
+        "hydra.run.dir": None if chosen.run.dir == "." else chosen.run.dir,
+    }.items():
+        if given is not None:
+            raise SettingError(
+                name, f"is not where a sweep's runs go, got {given!r}: give outputs={given}."
+            )
 
 
 @contextmanager
@@ -214,25 +253,25 @@ def folder_named(setting: str, given: Any) -> str | None:
     return named
 
 
-def tell_tuned(config: ExperimentConfig) -> None:
-    """Says where L2C2's settings begin with the algorithm, and where none were found for it."""
+def tuned(config: ExperimentConfig) -> str | None:
+    """Where L2C2's settings begin with the algorithm, or that none were found for it; in a line."""
     regularizer, algorithm = config.regularizer, config.algorithm.name
     if regularizer.name not in BEGIN_TUNED:
-        return
+        return None
     if algorithm in TUNED:
         chosen = ", ".join(f"{name}={getattr(regularizer, name)}" for name in TUNED[algorithm])
         where = (
             f"found for {algorithm} on {TUNED_ON[algorithm]}, or given; larger rewards may want "
             "larger gains; regularizer=l2c2_paper is the paper's"
         )
-        print(f"regularizer={regularizer.name}: {chosen} ({where})", flush=True)
-    elif algorithm != ExperimentConfig().algorithm.name or config.task.name not in PAPER_TASKS:
+        return f"regularizer={regularizer.name}: {chosen} ({where})"
+    if algorithm != ExperimentConfig().algorithm.name or config.task.name not in PAPER_TASKS:
         found = ", ".join(TUNED)
-        print(
+        return (
             f"regularizer={regularizer.name}: the paper's gains, which are for its own tasks and "
-            f"algorithm; others were found for {found} alone",
-            flush=True,
+            f"algorithm; others were found for {found} alone"
         )
+    return None
 
 
 def tell_sweep() -> None:

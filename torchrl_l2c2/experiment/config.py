@@ -123,7 +123,7 @@ class ExperimentConfig:
         default=100,
         ge=0,
         description="episodes played with the policy's mean, and as many with samples, after "
-        "training; 0: none, and no evaluation.json",
+        "training; 0: none, and no evaluation.json, so that reports pass the run over",
     )
     evaluate_every: int = Field(
         default=0,

@@ -17,7 +17,9 @@ from torchrl_l2c2.experiment.diagnosis import (
 from torchrl_l2c2.experiment.environments import TEST_SEED
 from torchrl_l2c2.experiment.errors import told_in_a_line
 from torchrl_l2c2.experiment.files import make_folder_of, write_atomically
-from torchrl_l2c2.experiment.reports.names import method_name
+from torchrl_l2c2.experiment.reports.differences import differences
+from torchrl_l2c2.experiment.reports.names import method_name, name_with_settings
+from torchrl_l2c2.experiment.saved import read_config
 
 
 def main(arguments: Iterable[str] | None = None) -> None:
@@ -83,7 +85,7 @@ def _told(one: Diagnosis) -> str:
 
 
 def _names(folders: Sequence[str]) -> list[str]:
-    """The ends of the folders' paths that tell them apart, without what these have in common.
+    """What tells runs apart of task, algorithm, method and seed, or else of their folders' paths.
 
     Methods have the names that they have in tables.
 
@@ -95,17 +97,32 @@ def _names(folders: Sequence[str]) -> list[str]:
         >>> _names(["/a/sac/none/seed_0"])
         ['sac/vanilla/seed_0']
     """
-    paths = [tuple(map(method_name, Path(folder).resolve().parts)) for folder in folders]
-    if len(paths) == 1:
-        return ["/".join(paths[0][-3:])]
+    paths = [Path(folder).resolve().parts for folder in folders]
     if len(set(paths)) < len(paths):
         raise ValueError("a run is named twice; its page would show the same thing twice.")
+    told = [_by_settings(Path(folder)) for folder in folders]
+    # Settings that no method's name tells are in the folders' own.
+    paths = told if len(set(told)) == len(told) else [tuple(map(method_name, p)) for p in paths]
+    if len(paths) == 1:
+        return ["/".join(paths[0][-3:])]
     longest = max(map(len, paths))
     length = next(n for n in range(1, longest + 1) if len({p[-n:] for p in paths}) == len(paths))
     ends = [path[-length:] for path in paths]
     while len({end[-1] for end in ends}) == 1:
         ends = [end[:-1] for end in ends]
     return ["/".join(end) for end in ends]
+
+
+def _by_settings(folder: Path) -> tuple[str, ...]:
+    """Task, algorithm, method and seed; of a folder without settings those that its path has."""
+    try:
+        config = read_config(folder)
+        chosen = (config[group]["name"] for group in ("task", "algorithm", "regularizer"))
+        task, algorithm, method = chosen
+        name, _ = name_with_settings(method, differences(config))
+    except (OSError, ValueError, KeyError):
+        return tuple(map(method_name, folder.resolve().parts[-4:]))
+    return task, algorithm, name, f"seed_{config['seed']}"
 
 
 if __name__ == "__main__":

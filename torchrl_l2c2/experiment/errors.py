@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 import traceback
 from collections.abc import Iterator
@@ -30,7 +31,7 @@ def show_cause(error: Exception) -> None:
 
 @contextmanager
 def told_in_a_line() -> Iterator[None]:
-    """Ends a command with one line where what went wrong says so by itself.
+    """Ends a command with one line where what went wrong says so by itself, or Ctrl-C ends it.
 
     Raises:
         SystemExit: with that line.
@@ -40,3 +41,6 @@ def told_in_a_line() -> Iterator[None]:
     except EXPECTED as error:
         show_cause(error)
         sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        print("interrupted.", file=sys.stderr)
+        sys.exit(128 + signal.SIGINT)

@@ -11,6 +11,7 @@ import statistics
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
 from functools import partial
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -86,6 +87,10 @@ class Evaluation:
             "action_variation_std": statistics.pstdev(self.action_variations),
             **{f"{name}_mean": statistics.fmean(each) for name, each in self.measures.items()},
         }
+
+    def to_dict(self) -> dict[str, Any]:
+        """As ``evaluation.json`` has it."""
+        return {"summary": self.summary(), "episodes": asdict(self)}
 
 
 def evaluate_policy(
@@ -333,8 +338,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
                 best=chosen.best,
             )
         if chosen.output:
-            played = {"arguments": vars(chosen), "summary": result.summary()}
-            write_json(chosen.output, {**played, "episodes": asdict(result)})
+            write_json(chosen.output, {"arguments": vars(chosen), **result.to_dict()})
 
 
 if __name__ == "__main__":

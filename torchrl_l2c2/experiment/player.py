@@ -112,6 +112,11 @@ class Player:
         self._count(1)
         return frame
 
+    def drop_episode(self) -> None:
+        """What :meth:`step` has played of an episode is of none; the next frame begins another."""
+        assert isinstance(self.collector, EpisodeCollector)
+        self.collector.reset()
+
     def _batches(self) -> list[TensorDictBase]:
         """What the collector plays at once, checked and counted."""
         played = self._simulate(self.collector.rollout)

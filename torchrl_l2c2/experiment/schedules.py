@@ -21,10 +21,14 @@ def by_step(player: Player, learner: Learner, algorithm: OffPolicyConfig) -> Ite
     """Updates after every frame."""
     while True:
         frames: list[Frame] = []
-        while not (frames and frames[-1].done):
-            frames.append(player.step())
-            learner.remember_frame(frames[-1])
-            _learn(learner, algorithm, 1, player.frames)
+        try:
+            while not (frames and frames[-1].done):
+                frames.append(player.step())
+                learner.remember_frame(frames[-1])
+                _learn(learner, algorithm, 1, player.frames)
+        except KeyboardInterrupt:
+            player.drop_episode()
+            raise
         yield player.measured(stack_frames(frames), player.frames)
 
 

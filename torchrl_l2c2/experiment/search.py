@@ -132,6 +132,13 @@ class Search:
         self.study.tell(number, list(values.values()), skip_if_finished=True)
         return values
 
+    def complete(self) -> list[Path]:
+        """The folders of the trials whose runs have all finished."""
+        from optuna.trial import TrialState
+
+        done = self.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+        return [self._of(trial.number) for trial in done]
+
     def tell_failure(self, number: int) -> None:
         """A trial some of whose runs failed; those that did not would flatter it."""
         from optuna.trial import TrialState
@@ -223,12 +230,13 @@ def main(arguments: Iterable[str] | None = None) -> None:
             status = run_sweep(search.command(number, values))
             if status == 1:
                 search.tell_failure(number)
+                print(f"{search.name(number)}: failed, and counts for nothing", flush=True)
             elif status:
                 sys.exit(status if status > 0 else 128 - status)
             else:
                 scores = (f"{name} {score:.4g}" for name, score in search.tell(number).items())
                 print(f"{search.name(number)}: {', '.join(scores)}", flush=True)
-        _report(search.folder)
+        _report(search)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -246,8 +254,8 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _report(folder: Path) -> None:
-    found = find_runs([folder])
+def _report(search: Search) -> None:
+    folder, found = search.folder, find_runs(search.complete())
     records = [run.record for run in found.runs]
     if not records:
         raise RuntimeError(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
@@ -104,6 +104,10 @@ class TaskConfig:
     def budget(self) -> Budget:
         """How long to train."""
         return Budget(self.episodes) if self.frames is None else Budget(self.frames, "frame")
+
+    def for_episodes(self, episodes: int) -> TaskConfig:
+        """The task with a training of so many episodes."""
+        return replace(self, episodes=episodes, frames=None)
 
     def make_env(self, seed: int) -> EnvBase:
         """The task's environment, noisy and seeded: :func:`~.environments.make_env`."""

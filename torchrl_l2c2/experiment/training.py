@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 import warnings
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -128,8 +128,8 @@ class Experiment:
         with a checkpoint; a second one ends it at once.
 
         Args:
-            episodes (int, optional): how many there are to be in all. Default: the task's, or its
-                frames.
+            episodes (int, optional): how many there are to be in all, which ``config.json`` has
+                then. Default: the task's, or its frames.
             progress (bool or str): whether to show a progress bar; a text goes before it.
 
         Returns:
@@ -147,8 +147,8 @@ class Experiment:
             UserWarning: no update was made, or every action was random: there is no trained policy;
                 or a regularizer's terms are too small to matter.
         """
-        full = self.config.task.budget
-        budget = full if episodes is None else Budget(episodes)
+        task = self.config.task if episodes is None else self.config.task.for_episodes(episodes)
+        full, budget = self.config.task.budget, task.budget
         check_length(budget, full, self._spent(budget))
         full = full.at_least(budget)  # Of which a part is trained now.
         algorithm, saved = self.config.algorithm, time.monotonic()
@@ -163,6 +163,9 @@ class Experiment:
             folder=self.folder,
         )
         ended = self._ended(budget)
+        if self.folder is not None:
+            settings = replace(self.config, task=task).to_dict()
+            begin_folder(self.folder, settings, begun=True, ended=ended)
         with self._process, bar, stop_on_signals() as signals, checkpoint_named(self.folder):
             # What goes on for longer begins at another rate than it had ended with.
             anneal(self.config.optimizer, self.agent.optimizer, self._spent(full) / full.total)
@@ -271,11 +274,8 @@ class Experiment:
         if self.folder is None:
             raise ValueError("this experiment has no folder to write to; give it one when made.")
         save_policy(self.agent.policy, self.folder / "policy.pt")
-        written: dict[str, dict[str, Any]] = {
-            name: {"summary": test.summary(), "episodes": asdict(test)}
-            for name, test in {"mean": result, "sampled": sampled}.items()
-            if test is not None
-        }
+        tests = {"mean": result, "sampled": sampled}
+        written = {name: test.to_dict() for name, test in tests.items() if test is not None}
         written["mean"]["training"] = {
             "episodes": len(self.metrics),
             "frames": self.player.frames,

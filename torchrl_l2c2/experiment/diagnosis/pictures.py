@@ -221,12 +221,21 @@ def _shares(axes: Sequence[Any], one: Diagnosis) -> None:
         axis.barh(names, values, height, align="edge", label=label, color=color)
         for place, value in enumerate(values):
             if not math.isnan(value):
-                axis.annotate(
-                    f" {100 * value:.2g}%", (value, place + height / 2), va="center", fontsize=8
-                )
+                told = f" {_percent(value)}"
+                axis.annotate(told, (value, place + height / 2), va="center", fontsize=8)
     axis.margins(x=0.2)
     axis.set_xlabel("share")
     axis.legend(frameon=False, fontsize=8, loc="best")
+
+
+def _percent(value: float) -> str:
+    """A share with two digits, without an exponent where it is large.
+
+    Examples:
+        >>> [_percent(value) for value in (0.0012, 0.123, 0.999, 1.53)]
+        ['0.12%', '12%', '100%', '153%']
+    """
+    return f"{100 * value:.2g}%" if value < 0.995 else f"{100 * value:.0f}%"
 
 
 def _draw(down: int, height: float, fill: Callable[..., None], *of: Any) -> bytes:

@@ -76,7 +76,12 @@ def deployed_table(groups: Sequence[Group]) -> Table | None:
 
 
 def _of_paper(groups: Sequence[Group]) -> list[Group]:
-    return [g for g in groups if is_of_paper(g.first.task, g.first.algorithm)]
+    return [
+        g
+        for g in groups
+        if is_of_paper(g.first.task, g.first.algorithm)
+        and "task.env_id" not in g.first.other_settings
+    ]
 
 
 def _over_tasks(groups: Sequence[Group], test: str) -> list[tuple[str, str, list[str]]]:

@@ -27,7 +27,7 @@ from torchrl_l2c2.experiment.saved import (
     read_rows,
 )
 
-LATE = 0.1  # of training, where no late policies were tested
+LATE = 0.1  # of training, where no late policies were to be tested
 
 
 @dataclass(frozen=True)
@@ -91,6 +91,11 @@ class FinishedRun:
     def test_episodes(self) -> int:
         """Of the test with mean actions."""
         return int(self.evaluation.get("summary", {}).get("episodes", 0))
+
+    @property
+    def is_untrained(self) -> bool:
+        """Whether no update was made, or every action was random."""
+        return bool((self.evaluation.get("training") or {}).get("untrained"))
 
     def column(self, name: str) -> list[float]:
         """A column of the metrics, a number per episode; NaN where it was not measured."""
@@ -167,7 +172,10 @@ class FinishedRun:
         return {f"last_{acting}_{k}": math.nan if v is None else v for k, v in found.items()}
 
     def _late(self) -> dict[str, float]:
-        """Of the late policies, which played test episodes; of training's last tenth without."""
+        """Of the late policies, with their test episodes where these were played.
+
+        Without ``late_share`` of training's last tenth.
+        """
         config = ExperimentConfig.from_dict(self.config)
         budget, tests = config.task.budget, self.column("test_return")
         # A longer run has tests of the shorter one's end, too.
@@ -177,7 +185,8 @@ class FinishedRun:
             if budget.is_late(budget.spent(row + 1, int(frames)), config.late_share)
             and not math.isnan(tests[row])
         ]
-        late = late or list(range(len(tests)))[-max(1, round(len(tests) * LATE)) :]
+        share = config.late_share or LATE
+        late = late or list(range(len(tests)))[-max(1, round(len(tests) * share)) :]
 
         def average(name: str) -> float:
             values = self.column(name)
@@ -253,6 +262,10 @@ def find_runs(folders: Iterable[str | Path], *, required: bool = False) -> Found
         "unfinished (running, interrupted or failed)": [str(path) for path in places["unfinished"]],
         "unreadable": unread,
         "the same settings and seed as a newer one, left out": repeated,
+        "untrained (without an update, or with random actions alone)": [
+            str(run.folder) for run in newest if run.is_untrained
+        ],
+        "pooled with runs of another late_share": _of_other_shares(newest),
     }
     notes = [f"{len(names)} {what}: {', '.join(names)}" for what, names in named.items() if names]
     if required and not newest:
@@ -297,6 +310,21 @@ def _check_numbers(path: Path, metrics: Sequence[dict[str, str]]) -> None:
                 raise ValueError(
                     f"{path}, line {line}: {name} is no number, but {cell!r:.40}: {REMEDY}"
                 ) from None
+
+
+def _of_other_shares(runs: Sequence[FinishedRun]) -> list[str]:
+    """Runs whose late policies are those of another share of training than most others' are."""
+    shares: dict[tuple[Any, ...], list[tuple[float, Path]]] = {}
+    for run in runs:
+        share = run.config.get("late_share", LATE)
+        shares.setdefault(run.record.identity[:-1], []).append((share, run.folder))
+    usual = {kind: statistics.mode(share for share, _ in each) for kind, each in shares.items()}
+    return [
+        f"{folder} (late_share={share})"
+        for kind, each in shares.items()
+        for share, folder in each
+        if share != usual[kind]
+    ]
 
 
 def _newest(runs: Sequence[FinishedRun]) -> tuple[list[FinishedRun], list[str]]:
