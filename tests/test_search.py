@@ -157,7 +157,7 @@ def test_a_trial_that_failed_counts_for_nothing(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("torchrl_l2c2.experiment.search.run_sweep", sweep)
     main([*GAINS, "--output", str(tmp_path), "--trials", "3"])
     told = capsys.readouterr().out
-    assert "trial_0001: failed, and counts for nothing" in told
+    assert "failed, and count for nothing: trial_0001" in told
     page = (tmp_path / "report" / "report.html").read_text()
     assert "Hellinger 0.1" in told + page and "Hellinger 0.3" in told
     assert "Hellinger 0.2" not in told + page

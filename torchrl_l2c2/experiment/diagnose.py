@@ -117,8 +117,8 @@ def _by_settings(folder: Path) -> tuple[str, ...]:
     """Task, algorithm, method and seed; of a folder without settings those that its path has."""
     try:
         config = read_config(folder)
-        chosen = (config[group]["name"] for group in ("task", "algorithm", "regularizer"))
-        task, algorithm, method = chosen
+        groups = ("task", "algorithm", "regularizer")
+        task, algorithm, method = (config[group]["name"] for group in groups)
         name, _ = name_with_settings(method, differences(config))
     except (OSError, ValueError, KeyError):
         return tuple(map(method_name, folder.resolve().parts[-4:]))

@@ -18,7 +18,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from filelock import FileLock
@@ -132,12 +132,12 @@ class Search:
         self.study.tell(number, list(values.values()), skip_if_finished=True)
         return values
 
-    def complete(self) -> list[Path]:
-        """The folders of the trials whose runs have all finished."""
+    def ended(self, how: Literal["COMPLETE", "FAIL"]) -> list[Path]:
+        """The folders of the trials whose runs have all finished, or of those that failed."""
         from optuna.trial import TrialState
 
-        done = self.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-        return [self._of(trial.number) for trial in done]
+        trials = self.study.get_trials(deepcopy=False, states=(TrialState[how],))
+        return [self._of(trial.number) for trial in trials]
 
     def tell_failure(self, number: int) -> None:
         """A trial some of whose runs failed; those that did not would flatter it."""
@@ -230,7 +230,6 @@ def main(arguments: Iterable[str] | None = None) -> None:
             status = run_sweep(search.command(number, values))
             if status == 1:
                 search.tell_failure(number)
-                print(f"{search.name(number)}: failed, and counts for nothing", flush=True)
             elif status:
                 sys.exit(status if status > 0 else 128 - status)
             else:
@@ -255,19 +254,21 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _report(search: Search) -> None:
-    folder, found = search.folder, find_runs(search.complete())
+    folder, found = search.folder, find_runs(search.ended("COMPLETE"))
     records = [run.record for run in found.runs]
     if not records:
         raise RuntimeError(
             "no trial has finished: above it is said why, and in the train.log of those runs below "
             f"{str(folder)!r} that began."
         )
-    page = write_report(folder / "report", records, found.runs, found.notes)
+    names = ", ".join(path.name for path in search.ended("FAIL"))
+    failed = [f"failed, and count for nothing: {names}"] if names else []
+    page = write_report(folder / "report", records, found.runs, [*found.notes, *failed])
     fronts = [
         front_table(groups, front_test(groups)).markdown()
         for groups in by_task(group_records(records))
     ]
-    print(*fronts, f"report: {page}", sep="\n\n")
+    print(*fronts, *failed, f"report: {page}", sep="\n\n")
 
 
 if __name__ == "__main__":
