@@ -1307,9 +1307,9 @@ HEADLINE = {
 MEASURED = {"sm_asap": "Sm", "action_variation": "action variation"}
 
 
-def headline(label):
-    """Rows of vanilla and of L2C2 on the same seeds: means, and how probable an improvement is."""
-    name, method, length, test = HEADLINE[label]
+def headline_groups(label):
+    """L2C2 and vanilla on the same seeds."""
+    name, method, length, _ = HEADLINE[label]
     named = label.split(", ")[1].lower()
     task = f"{named}_v5" if named in ("hopper", "walker2d") else named
     read = read_records(ROOT / "results" / f"{name}.csv")
@@ -1318,6 +1318,13 @@ def headline(label):
     beside = [r for r in read if r.method == "none" and r.seed in ours.seeds]
     (plain,) = group_records(beside)
     assert plain.seeds == ours.seeds == [*range(len(ours.seeds))] and plain.reading == ours.reading
+    return ours, plain
+
+
+def headline(label):
+    """Rows of vanilla and of L2C2: means, and how probable an improvement is."""
+    ours, plain = headline_groups(label)
+    name, _, _, test = HEADLINE[label]
 
     def compared(quantity, digits, *, changes=False):
         means = [plain.scores(test, quantity).mean(), ours.scores(test, quantity).mean()]
@@ -1340,6 +1347,19 @@ class TestReadme:
     def test_its_first_table_is_of_the_records(self, label):
         """Of all seeds of vanilla and of L2C2: roughness, and the return."""
         assert headline(label) in (ROOT / "README.md").read_text()
+
+    def test_returns_seed_by_seed_are_of_the_records(self):
+        """How often L2C2's is the lower one, which pairs of all seeds tell less of."""
+        told = {"PPO's Pendulum": "PPO, Pendulum", "SAC": "SAC, Pendulum"}
+        told |= {task: f"PPO, {task}" for task in ("LunarLander", "Hopper", "Walker2d")}
+        readme = (ROOT / "README.md").read_text()
+        for name, label in told.items():
+            ours, plain = (
+                {r.seed: r.last_mean_return for r in group.records}
+                for group in headline_groups(label)
+            )
+            lower = sum(ours[seed] < plain[seed] for seed in ours)
+            assert f"{lower} of {len(ours)} ({name})" in readme
 
     def test_its_results_are_those_of_the_records(self):
         """And those of the page of all of them, as the command at its top writes both."""
