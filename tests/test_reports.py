@@ -1152,7 +1152,7 @@ class TestReport:
 OURS, RIVALS = "L2C2, mse 1, ramp", ("vanilla", "CAPS", "CATS")
 
 
-@pytest.mark.parametrize("name", ["field", "hopper", "sac_pendulum", "walker2d"])
+@pytest.mark.parametrize("name", ["field", "hopper", "sac_lunarlander", "sac_pendulum", "walker2d"])
 def test_the_fields_pages_are_those_of_their_records(name):
     """As the command writes them that stands at the top of each."""
     page = ROOT / "results" / f"{name}.md"
