@@ -7,6 +7,7 @@ import struct
 import pytest
 import torch
 
+from torchrl_l2c2.experiment import checkpoints
 from torchrl_l2c2.experiment.checkpoints import (
     FORMAT_VERSION,
     HEADER,
@@ -22,6 +23,15 @@ from torchrl_l2c2.experiment.files import append_line
 from torchrl_l2c2.experiment.folder import begin_folder
 
 STATE = {"weights": torch.arange(100.0), "episode": 7, "names": ["a", "b"]}
+
+
+def test_what_reads_back_otherwise_leaves_the_older_one(tmp_path, monkeypatch):
+    """On a disk that loses a byte, the last good checkpoint is not removed for a bad one."""
+    older, write = save_checkpoint(tmp_path, 1, {"a": 1}, keep=1), checkpoints.write_atomically
+    monkeypatch.setattr(checkpoints, "write_atomically", lambda path, c: write(path, c[:-1]))
+    with pytest.raises(OSError, match="did not survive being written"):
+        save_checkpoint(tmp_path, 2, {"a": 2}, keep=1)
+    assert list_checkpoints(tmp_path) == [older]
 
 
 def truncated(path):

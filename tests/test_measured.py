@@ -1,0 +1,163 @@
+"""What a run measures is what it says: whose episodes, with which actions, in which units."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import ExplorationType, set_exploration_type
+
+from torchrl_l2c2 import action_variation, make_actor
+from torchrl_l2c2.experiment import (
+    AdamConfig,
+    CAPSConfig,
+    DQNConfig,
+    Experiment,
+    ExperimentConfig,
+    NoRegularizerConfig,
+    PPOConfig,
+    PPORPEConfig,
+    RolloutReplayConfig,
+    TaskConfig,
+    TD3Config,
+    UniformReplayConfig,
+    make_env,
+)
+from torchrl_l2c2.experiment.algorithms.normalization import Normalization
+from torchrl_l2c2.experiment.checkpoints import list_checkpoints
+from torchrl_l2c2.experiment.evaluate import LateTests
+
+PENDULUM = TaskConfig("pendulum", "Pendulum-v1", noise_scale=0.01, episodes=2, max_steps=40)
+
+
+def small(**settings):
+    values = {"task": PENDULUM, "algorithm": PPORPEConfig(replay_ratio=2.0, hidden=(8,))}
+    return ExperimentConfig(**{**values, "compile": False, "test_episodes": 2, **settings})
+
+
+def test_late_tests_are_of_the_mean_and_seeded_by_their_number():
+    """The same episode whatever was played before; samples would vary by more than 1."""
+    torch.manual_seed(0)
+    policy = make_actor(3, make_env(PENDULUM, 0).action_spec)
+    first, second = (LateTests(PENDULUM, 0, policy, False) for _ in range(2))
+    second.play(1)
+    found = first.play(3)
+    assert found == second.play(3)
+    assert found["test_return"] != first.play(4)["test_return"]
+    assert found["test_action_variation"] < 0.3
+
+
+def test_tests_play_episodes_of_their_own(monkeypatch):
+    """Training, tests on the way, by which the best policy is chosen, and the test at the end."""
+    seeds = []
+    monkeypatch.setattr(
+        "torchrl_l2c2.experiment.evaluate.make_env",
+        lambda task, seed: seeds.append(seed) or make_env(task, seed),
+    )
+    run = Experiment(small(evaluate_every=2, late_share=0.0))
+    run.train()
+    run.test(1)
+    assert len({run.config.seed, *seeds}) == 3
+
+
+def test_simulators_side_by_side_begin_apart():
+    """Their seeds differ."""
+    algorithm = PPOConfig(num_envs=3, frames=30, hidden=(8,))
+    task = replace(PENDULUM, noise_scale=0.0)
+    run = Experiment(small(algorithm=algorithm, replay=RolloutReplayConfig(), task=task))
+    firsts = [frames["observation"][0] for frames in run.player.play_rollout()[0]]
+    assert len(torch.stack(firsts).unique(dim=0)) == 3
+
+
+def test_the_variation_in_the_log_is_that_of_the_mean():
+    """Which gain=target follows; that of the samples is exploration, for the most part."""
+    run = Experiment(small())
+    (episode,) = run.player.play()
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        mean = run.agent.policy(episode.transitions.select("observation"))["action"]
+    assert episode.measures["action_variation"] == action_variation(mean).item()
+
+
+def test_the_observation_before_is_normalized_as_the_others():
+    """Grad-CAPS and ASAP compare the policy at both."""
+    torch.manual_seed(0)
+    norm = Normalization(2, observations=True, rewards=False, gamma=0.9, streams=1)
+    seen, ends = 5 + 3 * torch.randn(21, 2), torch.zeros(20, 1, dtype=torch.bool)
+    then = {"observation": seen[1:], "reward": torch.ones(20, 1), "done": ends}
+    now = {"observation": seen[:-1], "previous_observation": seen[:-1].clone()}
+    frames = TensorDict({**now, "next": then}, [20])
+    norm([frames])
+    norm.follow()
+    (given,) = norm([frames])
+    assert given["previous_observation"].equal(given["observation"])
+    assert not given["observation"].allclose(frames["observation"])
+
+
+def test_a_frames_reward_is_scaled_as_an_episodes():
+    """Of algorithms that learn after every frame."""
+    algorithm = PPORPEConfig(schedule="step", reward_scale=0.5, hidden=(8,))
+    run = Experiment(small(algorithm=algorithm))
+    frame = run.player.step()
+    run.learner.remember_frame(frame)
+    stored = run.learner.replay[:]["next", "reward"].item()
+    assert stored == pytest.approx(0.5 * frame.reward)
+
+
+def test_a_gradient_that_is_not_finite_is_skipped_and_counted():
+    """Also where the loss itself is finite."""
+    run = Experiment(small(on_nonfinite="skip"))
+    run.train()
+    loss, updates = run.agent.loss, run.learner.updates
+    before = [parameter.clone() for parameter in loss.parameters()]
+    trained = next(parameter for parameter in loss.parameters() if parameter.requires_grad)
+    hook = trained.register_hook(lambda gradient: gradient * math.nan)
+    run.learner.learn(3)
+    hook.remove()
+    assert all(map(torch.equal, before, loss.parameters()))
+    assert (run.learner.updates, run.learner.skipped_updates) == (updates, 3)
+
+
+def test_parameters_that_are_not_finite_are_not_saved(tmp_path):
+    """The last good checkpoint stays the last."""
+    run = Experiment(small(), tmp_path)
+    run.train(1)
+    before = list_checkpoints(tmp_path)
+    next(iter(run.agent.loss.parameters())).data.view(-1)[0] = math.inf
+    run.metrics.append(run.metrics[0])
+    with pytest.raises(FloatingPointError):
+        run.save()
+    run.close()
+    assert list_checkpoints(tmp_path) == before
+
+
+@pytest.mark.parametrize("delay", [2, 3])
+def test_the_policy_is_updated_at_every_so_many_updates(delay):
+    """In a run, and not by who calls the update."""
+    algorithm = TD3Config(hidden=(8,), random_frames=0, policy_delay=delay)
+    replay = UniformReplayConfig(batch_size=8)
+    run = Experiment(small(algorithm=algorithm, replay=replay, optimizer=AdamConfig()))
+    run.learner.remember(run.player.collector.env.rollout(20, run.agent.policy))
+    update, turns = run.learner.update, []
+    run.learner.update = lambda with_policy: turns.append(with_policy) or update(with_policy)
+    run.learner.learn(2 * delay)
+    assert turns == ([False] * (delay - 1) + [True]) * 2
+
+
+def test_epsilon_falls_with_the_frames_of_an_episode():
+    """And not by one step for each."""
+    algorithm = DQNConfig(hidden=(8,), schedule="episode", epsilon_end=0.0, epsilon_frames=1000)
+    task = replace(PENDULUM, env_id="CartPole-v1")
+    others = {"replay": UniformReplayConfig(), "optimizer": AdamConfig()}
+    none = NoRegularizerConfig()
+    run = Experiment(small(task=task, algorithm=algorithm, regularizer=none, **others))
+    run.player.play()
+    assert run.agent.exploration.eps.item() == pytest.approx(1 - run.player.frames / 1000)
+
+
+def test_the_larger_of_several_terms_counts(monkeypatch):
+    """Where one gain scales them all, and follows their gradients."""
+    run = Experiment(small(regularizer=CAPSConfig(gain="gradient", gain_target=0.3)))
+    shares = {"loss_caps_temporal": 0.1, "loss_caps_spatial": 0.4}
+    monkeypatch.setattr(run.learner, "shares", lambda batch: shares)
+    assert run.train()[-1]["gain_measured_policy"] == 0.4
