@@ -569,6 +569,8 @@ class TestCommand:
         first = folder("0ddc7233/seed_0", regularizer=tuned)
         second = folder("none/seed_0", regularizer=NoRegularizerConfig())
         assert _names([first, second]) == ["L2C2, means 10", "vanilla"]
+        third = folder("none/seed_1", regularizer=NoRegularizerConfig(), seed=1)
+        assert _names([first, third]) == ["L2C2, means 10/seed_0", "vanilla/seed_1"]
         other = folder("sigma-2/seed_0", regularizer=replace(tuned, sigma=2.0))
         assert _names([first, other]) == ["0ddc7233", "sigma-2"]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterable, Sequence
+from itertools import compress
 from pathlib import Path
 
 from torchrl_l2c2.experiment.diagnosis import (
@@ -100,9 +101,12 @@ def _names(folders: Sequence[str]) -> list[str]:
     paths = [Path(folder).resolve().parts for folder in folders]
     if len(set(paths)) < len(paths):
         raise ValueError("a run is named twice; its page would show the same thing twice.")
-    told = [_by_settings(Path(folder)) for folder in folders]
+    paths = [tuple(map(method_name, path)) for path in paths]
+    told = [each for each in map(_by_settings, map(Path, folders)) if each is not None]
     # Settings that no method's name tells are in the folders' own.
-    paths = told if len(set(told)) == len(told) else [tuple(map(method_name, p)) for p in paths]
+    if len(set(told)) == len(folders) > 1:
+        differing = [len(set(each)) > 1 for each in zip(*told, strict=True)]
+        return ["/".join(compress(each, differing)) for each in told]
     if len(paths) == 1:
         return ["/".join(paths[0][-3:])]
     longest = max(map(len, paths))
@@ -113,15 +117,15 @@ def _names(folders: Sequence[str]) -> list[str]:
     return ["/".join(end) for end in ends]
 
 
-def _by_settings(folder: Path) -> tuple[str, ...]:
-    """Task, algorithm, method and seed; of a folder without settings those that its path has."""
+def _by_settings(folder: Path) -> tuple[str, ...] | None:
+    """Task, algorithm, method and seed; ``None`` of a folder without settings."""
     try:
         config = read_config(folder)
         groups = ("task", "algorithm", "regularizer")
         task, algorithm, method = (config[group]["name"] for group in groups)
         name, _ = name_with_settings(method, differences(config))
     except (OSError, ValueError, KeyError):
-        return tuple(map(method_name, folder.resolve().parts[-4:]))
+        return None
     return task, algorithm, name, f"seed_{config['seed']}"
 
 
