@@ -1191,6 +1191,27 @@ def test_what_is_said_of_the_rivals_is_of_the_records():
             assert ours["CATS"] in start and ours["CAPS"] in start
 
 
+def test_cats_as_strong_as_l2c2_is_of_the_records():
+    """Both at the same strength, on two tasks: means, and how probable a better run is."""
+    page = (ROOT / "results" / "one_setting.md").read_text().partition("## CATS, as strong")[2]
+    groups = group_records(read_records(ROOT / "results" / "field.csv"))
+    for task, gain in (("pendulum", 0.5), ("lunarlander", 0.25)):
+        named = {group.name: group for group in groups if group.first.task == task}
+        ours, cats = named[OURS], named[f"CATS, lambda_temporal={gain}"]
+        for group in (ours, cats):
+            total, sm, variation = (
+                group.scores("last_mean", quantity).mean().item()
+                for quantity in ("return", "sm_asap", "action_variation")
+            )
+            assert (
+                f"| {task} | {group.name} | 0-9 | {total:.1f} | {sm:.3f} | {variation:.3f} |"
+                in page
+            )
+        for quantity in ("return", "sm_asap"):
+            better = improvement([ours], [cats], "last_mean", quantity).text("{:.2f}".format)
+            assert better.replace("0.", ".") in page
+
+
 @pytest.mark.parametrize("name", ["field", "walker2d", "hopper", "sac_pendulum"])
 def test_what_is_said_of_the_harness_is_of_the_records(name):
     """Vanilla's and the rivals' rows beside the published ones."""
