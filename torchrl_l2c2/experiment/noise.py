@@ -41,8 +41,8 @@ LEGEND = (
     "standard deviation either way, new at every step and in the place of the task's own; the "
     "deviation is over the states that all runs of the task here visit without noise. Means over "
     "seeds of test episodes with mean actions, 95% intervals of the bootstrap over seeds in "
-    "brackets. Sm is (2 / N) sum_i f_i |FFT_i|, a mean over the action's dimensions: the report's "
-    "in the table beside published rows."
+    "brackets. Sm is (2 / N) sum_i f_i |FFT_i|, a mean over the action's dimensions, as in the "
+    "report's table beside published rows."
 )
 
 
