@@ -7,13 +7,7 @@ import functools
 import torch
 from tensordict.nn import CompositeDistribution
 from torch import Tensor
-from torch.distributions import (
-    Categorical,
-    Distribution,
-    Independent,
-    Normal,
-    OneHotCategorical,
-)
+from torch.distributions import Categorical, Distribution, Independent, Normal, OneHotCategorical
 from torch.distributions import kl_divergence as closed_kl_divergence
 from torchrl.modules import TanhNormal
 from torchrl.modules.distributions import has_analytic_kl

@@ -7,11 +7,7 @@ from collections.abc import Callable
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
-from torchrl.modules import (
-    AdditiveGaussianModule,
-    EGreedyModule,
-    OrnsteinUhlenbeckProcessModule,
-)
+from torchrl.modules import AdditiveGaussianModule, EGreedyModule, OrnsteinUhlenbeckProcessModule
 
 from torchrl_l2c2.experiment.compilation import compiled
 

@@ -23,14 +23,7 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_l2c2.experiment.composition import (
-    CONF,
-    composing,
-    read,
-    register,
-    tell_sweep,
-    tuned,
-)
+from torchrl_l2c2.experiment.composition import CONF, composing, read, register, tell_sweep, tuned
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.errors import EXPECTED, show_cause
 from torchrl_l2c2.experiment.progress import log, say

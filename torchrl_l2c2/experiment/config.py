@@ -13,12 +13,7 @@ from pydantic import Field
 
 from torchrl_l2c2.experiment.algorithms import ALGORITHMS, AlgorithmConfig, PPORPEConfig
 from torchrl_l2c2.experiment.optimizers import OPTIMIZERS, OptimizerConfig
-from torchrl_l2c2.experiment.regularizers import (
-    REGULARIZERS,
-    TUNED,
-    L2C2Config,
-    RegularizerConfig,
-)
+from torchrl_l2c2.experiment.regularizers import REGULARIZERS, TUNED, L2C2Config, RegularizerConfig
 from torchrl_l2c2.experiment.replay import REPLAYS, ReplayConfig
 from torchrl_l2c2.experiment.settings import SettingError, read, settings
 from torchrl_l2c2.experiment.tasks import TASKS, TaskConfig
@@ -132,8 +127,7 @@ class ExperimentConfig:
         "policy_best.pt is from the best test; 0: none",
     )
     record: bool = Field(
-        default=False,
-        description="a test episode as video.mp4, after training (extra video)",
+        default=False, description="a test episode as video.mp4, after training (extra video)"
     )
     late_share: float = Field(
         default=0.1,
@@ -240,8 +234,7 @@ class ExperimentConfig:
         # Not a pattern of the field, which pydantic would show as it is written.
         if not re.fullmatch(r"cpu|cuda(:\d+)?", self.device):
             raise SettingError(
-                "device",
-                f"must be cpu, cuda or cuda:N, a number from 0 up, got {self.device!r}.",
+                "device", f"must be cpu, cuda or cuda:N, a number from 0 up, got {self.device!r}."
             )
 
     def _check_replay(self) -> None:

@@ -17,12 +17,7 @@ from torchrl.envs import EnvBase, GymWrapper, TransformedEnv
 
 from torchrl_l2c2.experiment.compilation import CompilerError
 from torchrl_l2c2.experiment.errors import SimulatorError
-from torchrl_l2c2.experiment.spaces import (
-    Env,
-    observing_image,
-    observing_vector,
-    taking_vector,
-)
+from torchrl_l2c2.experiment.spaces import Env, observing_image, observing_vector, taking_vector
 from torchrl_l2c2.transforms import ObservationNoise
 
 if TYPE_CHECKING:

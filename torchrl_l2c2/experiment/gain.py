@@ -16,12 +16,7 @@ from torchrl_l2c2.experiment.player import EPISODE_COLUMNS
 from torchrl_l2c2.experiment.regularizers import GainConfig
 from torchrl_l2c2.experiment.settings import SettingError
 from torchrl_l2c2.experiment.tasks import Budget
-from torchrl_l2c2.gains import (
-    ConstantGain,
-    GradientGain,
-    RampGain,
-    TargetGain,
-)
+from torchrl_l2c2.gains import ConstantGain, GradientGain, RampGain, TargetGain
 
 
 class GainControl:

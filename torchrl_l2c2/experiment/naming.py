@@ -13,11 +13,7 @@ from collections.abc import Iterator
 from pathlib import PurePosixPath
 from typing import Any
 
-from torchrl_l2c2.experiment.config import (
-    GROUPS,
-    ExperimentConfig,
-    is_free,
-)
+from torchrl_l2c2.experiment.config import GROUPS, ExperimentConfig, is_free
 from torchrl_l2c2.experiment.tasks import TaskConfig
 
 LONGEST = 64

@@ -118,9 +118,7 @@ def taking_vector(env: Env) -> Env:
     low, high, dtype = space.low, space.high, space.dtype
     # Rounding may lead out of the bounds.
     return TransformAction(
-        env,
-        lambda action: np.clip(action.astype(dtype), low, high),
-        _float32(space),
+        env, lambda action: np.clip(action.astype(dtype), low, high), _float32(space)
     )
 
 

@@ -37,11 +37,7 @@ class DQNConfig(PerStepConfig):
         from torchrl.objectives import DQNLoss, SoftUpdate
 
         from torchrl_l2c2.experiment.algorithms.agent import Agent
-        from torchrl_l2c2.experiment.algorithms.networks import (
-            check_actions,
-            perceptron,
-            sharing,
-        )
+        from torchrl_l2c2.experiment.algorithms.networks import check_actions, perceptron, sharing
 
         check_actions(env, self.name, continuous=False)
         spec = env.action_spec
@@ -53,10 +49,7 @@ class DQNConfig(PerStepConfig):
         loss.make_value_estimator(gamma=self.gamma)
         loss = regularizer.add_to(loss)
         greedy = EGreedyModule(
-            spec,
-            eps_init=1.0,
-            eps_end=self.epsilon_end,
-            annealing_num_steps=self.epsilon_frames,
+            spec, eps_init=1.0, eps_end=self.epsilon_end, annealing_num_steps=self.epsilon_frames
         )
         return Agent(
             loss,

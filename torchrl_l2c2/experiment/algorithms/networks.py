@@ -28,12 +28,7 @@ from torchrl_l2c2.modules import EncodedNetwork
 
 
 def check_actions(
-    env: EnvBase,
-    algorithm: str,
-    *,
-    continuous: bool,
-    squashed: bool = False,
-    drawn: bool = True,
+    env: EnvBase, algorithm: str, *, continuous: bool, squashed: bool = False, drawn: bool = True
 ) -> None:
     """Refuses actions that an algorithm cannot take.
 

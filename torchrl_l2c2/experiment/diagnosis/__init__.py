@@ -8,12 +8,7 @@ from torchrl_l2c2.experiment.diagnosis.measured import Diagnosis, TermShare, dia
 from torchrl_l2c2.experiment.diagnosis.page import write_page
 from torchrl_l2c2.experiment.diagnosis.pictures import draw_together
 from torchrl_l2c2.experiment.diagnosis.run import diagnose_run, value_function
-from torchrl_l2c2.experiment.diagnosis.words import (
-    THRESHOLDS,
-    Finding,
-    comparison,
-    findings,
-)
+from torchrl_l2c2.experiment.diagnosis.words import THRESHOLDS, Finding, comparison, findings
 
 __all__ = [
     "THRESHOLDS",

@@ -17,12 +17,7 @@ from torchrl_l2c2.experiment.diagnosis.pictures import (
     draw_spectra,
     draw_steepness,
 )
-from torchrl_l2c2.experiment.diagnosis.words import (
-    THRESHOLDS,
-    comparison,
-    findings,
-    listed,
-)
+from torchrl_l2c2.experiment.diagnosis.words import THRESHOLDS, comparison, findings, listed
 from torchrl_l2c2.experiment.files import write_atomically
 from torchrl_l2c2.experiment.reports.document import inside, picture, whole_page
 from torchrl_l2c2.experiment.reports.measures import MEASURE_NAMES
@@ -157,10 +152,7 @@ def _measures(diagnoses: Sequence[Diagnosis]) -> Table:
     rows += [
         [noise, *(f"{_number(one.noise_action)} ({one.noise_scale:g})" for one in diagnoses)],
         [of_change, *(f"{one.noise_share:.1%}" for one in diagnoses)],
-        [
-            "deviation of samples",
-            *(_number(d.spread) for d in diagnoses),
-        ],
+        ["deviation of samples", *(_number(d.spread) for d in diagnoses)],
     ]
     note = (
         "Means over the test episodes with mean actions. The last three rows are of the first of "

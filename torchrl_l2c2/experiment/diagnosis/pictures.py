@@ -257,12 +257,7 @@ def _limits(constants: Iterable[Tensor]) -> tuple[float, float]:
 
 
 def _line(place: int, number: int) -> dict[str, Any]:
-    return {
-        "color": COLORS[place],
-        "linewidth": 0.9,
-        "markersize": 3,
-        "label": f"action[{number}]",
-    }
+    return {"color": COLORS[place], "linewidth": 0.9, "markersize": 3, "label": f"action[{number}]"}
 
 
 def _legend(axis: Any, one: Diagnosis) -> None:

@@ -37,11 +37,7 @@ class GradCAPSConfig(GainConfig):
         from torchrl_l2c2.objectives import GradCAPSLoss
 
         return GradCAPSLoss(
-            loss,
-            self.lambda_temporal,
-            self.epsilon,
-            previous_key=PREVIOUS,
-            mean=self.mean,
+            loss, self.lambda_temporal, self.epsilon, previous_key=PREVIOUS, mean=self.mean
         )
 
     def set_gains(self, loss: LossModule, policy: float, value: float) -> None:

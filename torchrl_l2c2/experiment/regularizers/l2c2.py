@@ -119,11 +119,7 @@ class L2C2Config(GainConfig):
         from torchrl_l2c2.neighborhood import Neighborhood
 
         return Neighborhood(
-            self.sigma,
-            self.lambda_min,
-            self.lambda_max,
-            shared=self.shared,
-            max_step=self.max_step,
+            self.sigma, self.lambda_min, self.lambda_max, shared=self.shared, max_step=self.max_step
         )
 
     def wrap(self, loss: LossModule) -> LossModule:

@@ -15,11 +15,7 @@ from torchrl_l2c2.experiment.reports.records import (
     write_records,
 )
 from torchrl_l2c2.experiment.reports.report import write_report
-from torchrl_l2c2.experiment.reports.results import (
-    compare_with_paper,
-    sweep_summary,
-    write_results,
-)
+from torchrl_l2c2.experiment.reports.results import compare_with_paper, sweep_summary, write_results
 from torchrl_l2c2.experiment.reports.runs import (
     FinishedRun,
     Found,

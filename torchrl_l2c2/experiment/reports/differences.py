@@ -7,12 +7,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from torchrl_l2c2.experiment.config import (
-    GROUPS,
-    ExperimentConfig,
-    is_free,
-    is_neutral,
-)
+from torchrl_l2c2.experiment.config import GROUPS, ExperimentConfig, is_free, is_neutral
 from torchrl_l2c2.experiment.identity import BUDGETS, by_name
 from torchrl_l2c2.experiment.tasks import TASKS
 

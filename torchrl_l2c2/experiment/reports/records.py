@@ -204,11 +204,7 @@ def _number(cell: str) -> float:
 
 
 def _parse(path: Path, number: int, line: dict[str, str]) -> Record:
-    readers: dict[str, Callable[[str], Any]] = {
-        "int": int,
-        "float": _number,
-        "str": str,
-    }
+    readers: dict[str, Callable[[str], Any]] = {"int": int, "float": _number, "str": str}
     try:
         read_differences(line["differences"])
         if not re.fullmatch(r"\d+ (episodes|frames)", line["length"]):

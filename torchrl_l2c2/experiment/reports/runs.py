@@ -12,11 +12,7 @@ from typing import Any
 
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.identity import is_tested
-from torchrl_l2c2.experiment.reports.differences import (
-    differences,
-    fingerprint,
-    write_differences,
-)
+from torchrl_l2c2.experiment.reports.differences import differences, fingerprint, write_differences
 from torchrl_l2c2.experiment.reports.records import QUANTITIES, Record
 from torchrl_l2c2.experiment.saved import (
     REMEDY,
