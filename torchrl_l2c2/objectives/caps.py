@@ -97,14 +97,12 @@ class CAPSLoss(RegularizedLoss):
 
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
         terms = super().policy_regularizer(tensordict)
-        here, there = self.policies_at(tensordict, self._states(tensordict))
+        policies = self.policies_at(tensordict, self._states(tensordict))
         squashed = self.caps_mean == "action"
-        temporal, spatial = caps_terms(
-            policy_mean(here, squashed=squashed), policy_mean(there, squashed=squashed)
-        )
-        temporal, spatial = (self.reduce_term(term, tensordict) for term in (temporal, spatial))
-        terms.set("loss_caps_temporal", self.scaled(temporal, "caps_lambda_temporal"))
-        terms.set("loss_caps_spatial", self.scaled(spatial, "caps_lambda_spatial"))
+        means = (policy_mean(policy, squashed=squashed) for policy in policies)
+        for kind, term in zip(("temporal", "spatial"), caps_terms(*means), strict=True):
+            term = self.reduce_term(term, tensordict)
+            terms.set(f"loss_caps_{kind}", self.scaled(term, f"caps_lambda_{kind}"))
         return terms
 
     def _states(self, tensordict: TensorDictBase) -> TensorDictBase:
