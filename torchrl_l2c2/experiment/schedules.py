@@ -46,11 +46,13 @@ def by_episode(player: Player, learner: Learner, algorithm: OffPolicyConfig) -> 
 def by_rollout(player: Player, learner: Learner, algorithm: PPOConfig) -> Iterator[Episode | None]:
     """Updates with everything that one policy has played, once it is enough."""
     if algorithm.num_envs is not None:
-        return by_frames(player, learner, algorithm)
-    return by_episodes(player, learner, algorithm)
+        return by_cut_rollout(player, learner, algorithm)
+    return by_rollout_of_episodes(player, learner, algorithm)
 
 
-def by_episodes(player: Player, learner: Learner, algorithm: PPOConfig) -> Iterator[Episode]:
+def by_rollout_of_episodes(
+    player: Player, learner: Learner, algorithm: PPOConfig
+) -> Iterator[Episode]:
     """Updates after so many frames at least, of whole episodes."""
     while True:
         episodes = player.play()
@@ -62,7 +64,9 @@ def by_episodes(player: Player, learner: Learner, algorithm: PPOConfig) -> Itera
             yield episode
 
 
-def by_frames(player: Player, learner: Learner, algorithm: PPOConfig) -> Iterator[Episode | None]:
+def by_cut_rollout(
+    player: Player, learner: Learner, algorithm: PPOConfig
+) -> Iterator[Episode | None]:
     """Updates after so many frames, wherever episodes are then; hands out those that have ended."""
     normalization = learner.agent.normalization
     while True:
