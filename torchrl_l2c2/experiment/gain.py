@@ -141,10 +141,10 @@ class GainControl:
             numbers = [measured for measured in self._seen if math.isfinite(measured)]
             return {"all": fmean(numbers) if numbers else self._seen[-1]}
         if not due:
-            return dict.fromkeys(self.gains, float("nan"))
+            return dict.fromkeys(self.gains, math.nan)
         shares = self._learner.shares(self._learner.example())
         return {
-            name: max((shares[key] for key in keys if key in shares), default=float("nan"))
+            name: max((shares[key] for key in keys if key in shares), default=math.nan)
             for name, keys in self._terms().items()
         }
 

@@ -197,7 +197,7 @@ class Learner:
             self.check_parameters()
             values = values.mean(0)
         else:
-            values = torch.full((len(keys),), float("nan"))
+            values = torch.full((len(keys),), math.nan)
         means = dict(zip(keys, values.tolist(), strict=True))
         losses = {k: abs(v) for k, v in means.items() if is_loss(k)}
         total = sum(losses.values())

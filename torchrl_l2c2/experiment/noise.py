@@ -7,6 +7,7 @@ runs below folders, and writes a table and pictures.
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -100,7 +101,7 @@ def play_with_noise(
         ValueError: a level below 0, fewer than one episode, or a single state in all of them.
         FileNotFoundError: a run's policy is not there.
     """
-    if bad := [level for level in levels if not 0 <= level < float("inf")]:
+    if bad := [level for level in levels if not 0 <= level < math.inf]:
         raise ValueError(f"levels must be finite and at least 0, got {bad[0]}.")
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
@@ -151,7 +152,7 @@ class Player:
         values = (
             transitions["next", "reward"].sum().item(),
             action_variation(mean).item() if len(mean) > 1 else 0.0,
-            float("nan") if scale is None else scale.mean().item(),
+            math.nan if scale is None else scale.mean().item(),
             transitions.numel(),
         )
         measures = dict(zip(EPISODE_COLUMNS, values, strict=True))

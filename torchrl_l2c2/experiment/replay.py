@@ -134,7 +134,7 @@ def load_replay_state(replay: TensorDictReplayBuffer, state: Mapping[str, Any]) 
     state = dict(state)
     if isinstance(replay, TensorDictPrioritizedReplayBuffer):
         sampler = dict(state["_sampler"])
-        empty = replay._sampler.state_dict()
+        empty = replay.sampler.state_dict()
         for tree in ("_sum_tree", "_min_tree"):
             values = sampler[tree]
             sampler[tree] = empty[tree]

@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_l2c2._checks import check_positive_int
-from torchrl_l2c2.gains import ConstantGain, RampGain
+from torchrl_l2c2.gains import ConstantGain, RampGain, is_loss
 from torchrl_l2c2.objectives import RegularizedLoss
 from torchrl_l2c2.rsl_rl.networks import VALID, write_parameters
 from torchrl_l2c2.transforms import NeighborTransform
@@ -73,7 +73,7 @@ class Regularization:
         """
         batch_of_loss = self._transitions(actor, batch, original_batch_size)
         terms = dict(self.loss(batch_of_loss).items())
-        total = sum(term for name, term in terms.items() if name.startswith("loss_"))
+        total = sum(term for name, term in terms.items() if is_loss(name))
         if self.symmetry is not None:
             mirror = self.symmetry.compute_loss(actor, batch, original_batch_size)
             terms["symmetry"] = mirror
