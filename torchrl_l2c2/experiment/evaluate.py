@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
+from torch import Tensor
 from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 from tqdm import tqdm
@@ -42,7 +43,7 @@ from torchrl_l2c2.metrics import (
 )
 
 # The field's measures beside the paper's, each of the actions of an episode [T, A].
-ACTION_MEASURES: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
+ACTION_MEASURES: dict[str, Callable[[Tensor], Tensor]] = {
     "action_rate": action_rate,
     "action_fluctuation_ratio": action_fluctuation_ratio,
     "action_jerk": action_jerk,
@@ -198,7 +199,7 @@ def _return(episode: TensorDictBase) -> float:
     return total
 
 
-def measure(actions: torch.Tensor, spec: TensorSpec) -> dict[str, float]:
+def measure(actions: Tensor, spec: TensorSpec) -> dict[str, float]:
     """The field's measures of an episode's actions ``[T, A]``; NaN where it is too short."""
     actions = actions.float()
     long_enough = len(actions) >= LEAST_STEPS
@@ -212,17 +213,17 @@ def measure(actions: torch.Tensor, spec: TensorSpec) -> dict[str, float]:
 
 
 @torch.no_grad()
-def mean_actions(policy: TensorDictModule, episode: TensorDictBase) -> torch.Tensor:
+def mean_actions(policy: TensorDictModule, episode: TensorDictBase) -> Tensor:
     """The policy's mean actions ``[T, A]`` at the states of an episode."""
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        actions: torch.Tensor = policy(episode.select("observation"))["action"]
+        actions: Tensor = policy(episode.select("observation"))["action"]
     return actions
 
 
 def _sensitivity(policy: TensorDictModule, episode: TensorDictBase) -> float:
     """To noise that is the same at every call."""
 
-    def act(observation: torch.Tensor) -> torch.Tensor:
+    def act(observation: Tensor) -> Tensor:
         return mean_actions(policy, TensorDict({"observation": observation}, observation.shape[:1]))
 
     generator = torch.Generator().manual_seed(0)
@@ -286,26 +287,30 @@ class LateTests:
         )
 
 
-def _variation(actions: torch.Tensor) -> float:
+def _variation(actions: Tensor) -> float:
     """Zero for an episode of a single step, which has no change of action."""
     return action_variation(actions.float()).item() if actions.shape[-2] > 1 else 0.0
 
 
-def main(arguments: Iterable[str] | None = None) -> None:
-    """The command line: plays test episodes and prints their summary as JSON."""
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m torchrl_l2c2.experiment.evaluate", description="Plays test episodes."
     )
-    parser.add_argument("folder", help="a run's folder, finished or not")
-    parser.add_argument("--episodes", type=int, default=100, help="how many (default: 100)")
-    parser.add_argument("--seed", type=int, help="of all randomness (default: the test's own)")
-    parser.add_argument("--noise", type=float, help="on observations (default: the task's)")
-    parser.add_argument("--sampled", action="store_true", help="act with samples, as in training")
-    parser.add_argument("--best", action="store_true", help="policy_best.pt instead of policy.pt")
-    parser.add_argument("--output", help="a JSON file for the summary and every episode")
-    parser.add_argument(
-        "--record", metavar="VIDEO", help="a file such as test.mp4: a video of the first episode"
-    )
+    add = parser.add_argument
+    add("folder", help="a run's folder, finished or not")
+    add("--episodes", type=int, default=100, help="how many (default: 100)")
+    add("--seed", type=int, help="of all randomness (default: the test's own)")
+    add("--noise", type=float, help="on observations (default: the task's)")
+    add("--sampled", action="store_true", help="act with samples, as in training")
+    add("--best", action="store_true", help="policy_best.pt instead of policy.pt")
+    add("--output", help="a JSON file for the summary and every episode")
+    add("--record", metavar="VIDEO", help="a file such as test.mp4: a video of the first episode")
+    return parser
+
+
+def main(arguments: Iterable[str] | None = None) -> None:
+    """The command line: plays test episodes and prints their summary as JSON."""
+    parser = _parser()
     chosen = parser.parse_args(arguments)
     if chosen.record and chosen.sampled:
         parser.error("--record shows mean actions; leave it or --sampled out")
