@@ -11,6 +11,7 @@ from torchrl_l2c2.experiment.algorithms.base import Layers, PerStepConfig
 from torchrl_l2c2.experiment.settings import settings
 
 if TYPE_CHECKING:
+    from torchrl.data import TensorSpec
     from torchrl.envs import EnvBase
 
     from torchrl_l2c2.experiment.algorithms.agent import Agent
@@ -64,15 +65,7 @@ class TD3Config(PerStepConfig):
         bounds = spec.to(torch.get_default_device())
         squash = TanhModule(in_keys=["action"], out_keys=["action"], spec=bounds)
         actor = TensorDictSequential(Actor(network, out_keys=["action"]), squash)
-        half_ranges = (spec.space.high - spec.space.low) / 2
-        half_range = half_ranges.max().item()
-        if half_ranges.min() < half_range:
-            warnings.warn(
-                "td3's noise is as wide for every action, a share of the largest of half their "
-                f"ranges, got {half_ranges.tolist()}: it fills the narrow ones. Scale the task's "
-                "actions to one range (gymnasium.wrappers.RescaleAction), or use algorithm=sac.",
-                stacklevel=2,
-            )
+        half_range = _half_range(spec)
         loss = TD3Loss(
             actor,
             action_value(env, self.hidden),
@@ -94,3 +87,21 @@ class TD3Config(PerStepConfig):
             policy_terms=frozenset({"loss_actor"}),
             policy_delay=self.policy_delay,
         )
+
+
+def _half_range(spec: TensorSpec) -> float:
+    """Half the range of the actions, of the widest one: the unit of TD3's noise.
+
+    Warns:
+        UserWarning: some actions are narrower.
+    """
+    half_ranges = (spec.space.high - spec.space.low) / 2
+    half_range: float = half_ranges.max().item()
+    if half_ranges.min() < half_range:
+        warnings.warn(
+            "td3's noise is as wide for every action, a share of the largest of half their "
+            f"ranges, got {half_ranges.tolist()}: it fills the narrow ones. Scale the task's "
+            "actions to one range (gymnasium.wrappers.RescaleAction), or use algorithm=sac.",
+            stacklevel=3,
+        )
+    return half_range
