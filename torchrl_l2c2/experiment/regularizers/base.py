@@ -25,6 +25,12 @@ READ_BY = {
     "gain_limit": ("gradient", "target"),
     "gain_length": ("ramp",),
 }
+# A setting of all who compare means.
+COMPARED_MEAN: Any = Field(
+    default="loc",
+    description="means compared before or after the squashing, which deterministic policies (td3) "
+    "have after it alone [inferred: loc]",
+)
 
 
 class RegularizerConfig:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
-from torchrl_l2c2.experiment.regularizers.base import GainConfig
+from torchrl_l2c2.experiment.regularizers.base import COMPARED_MEAN, GainConfig
 from torchrl_l2c2.experiment.settings import settings
 
 if TYPE_CHECKING:
@@ -27,11 +27,7 @@ class CAPSConfig(GainConfig):
     lambda_spatial: float = Field(
         default=0.05, ge=0, description="gain of the distance between s and its noisy copy [paper]"
     )
-    mean: Literal["loc", "action"] = Field(
-        default="loc",
-        description="means compared before or after the squashing, which deterministic policies "
-        "(td3) have after it alone [inferred: loc]",
-    )
+    mean: Literal["loc", "action"] = COMPARED_MEAN
 
     def wrap(self, loss: LossModule) -> LossModule:
         from torchrl_l2c2.objectives import CAPSLoss

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 from pydantic import Field
 
-from torchrl_l2c2.experiment.regularizers.base import GainConfig
+from torchrl_l2c2.experiment.regularizers.base import COMPARED_MEAN, GainConfig
 from torchrl_l2c2.experiment.settings import settings
 
 if TYPE_CHECKING:
@@ -26,11 +26,7 @@ class GradCAPSConfig(GainConfig):
     epsilon: float = Field(
         default=0.1, gt=0, description="smaller ones punish zigzags around one place more"
     )
-    mean: Literal["loc", "action"] = Field(
-        default="loc",
-        description="means compared before or after the squashing, which deterministic policies "
-        "(td3) have after it alone [inferred: loc]",
-    )
+    mean: Literal["loc", "action"] = COMPARED_MEAN
 
     def wrap(self, loss: LossModule) -> LossModule:
         from torchrl_l2c2.experiment.frames import PREVIOUS
