@@ -148,9 +148,10 @@ def previous_action_gain(actions: Tensor) -> Tensor:
     .. math::
         \frac{\sum_t (a_t - \bar a)(a_{t-1} - \bar a)}{\sum_t (a_{t-1} - \bar a)^2}
 
-    with the sums over all dimensions and :math:`\bar a` an episode's mean. Between -1 and 1, but
-    for the ends: near 1 the action moves slowly, near 0 every action is a draw of its own, near -1
-    it flips from step to step, which is shaking at half the control rate.
+    with the sums over all dimensions and :math:`\bar a` an episode's mean: the lag-1
+    autocorrelation of the actions, but for the ends, and so between -1 and 1, but for these. Near 1
+    the action moves slowly, near 0 every action is a draw of its own, near -1 it flips from step to
+    step, which is shaking at half the control rate.
 
     Args:
         actions (Tensor): of whole episodes, shape ``[*B, T, A]`` with at least two steps.

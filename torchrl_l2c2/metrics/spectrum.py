@@ -120,10 +120,10 @@ def roughness(actions: Tensor) -> Tensor:
     .. math::
         \frac{\sum_{i \ge 1} M_i f_i}{\sum_{i \ge 1} M_i}
 
-    with :math:`M_i` and :math:`f_i` of :func:`amplitude_spectrum` at a rate of 1; the mean over the
-    action's dimensions. Between 0 and .5: white noise has .25, an action that flips from step to
-    step .5, whatever the amplitude and nearly whatever the length. It says how fast an action moves
-    and not how much. The constant part is left out.
+    with :math:`M_i` and :math:`f_i` of :func:`amplitude_spectrum` at a rate of 1: the spectral
+    centroid, a mean over the action's dimensions. Between 0 and .5: white noise has .25, an action
+    that flips from step to step .5, whatever the amplitude and nearly whatever the length. It says
+    how fast an action moves and not how much. The constant part is left out.
 
     Args:
         actions (Tensor): of whole episodes, shape ``[*B, T, A]`` with at least four steps.
