@@ -45,7 +45,8 @@ def kl_divergence(
         The divergences, shape ``[*B]``.
 
     Raises:
-        TypeError: a policy is deterministic, or can neither be sampled nor scored.
+        TypeError: a policy is deterministic, or can neither be sampled nor scored, or
+            ``num_samples`` is no integer.
         ValueError: the event shapes differ, or ``num_samples`` is below 1.
 
     Examples:

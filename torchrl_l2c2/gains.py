@@ -77,7 +77,7 @@ class RampGain(ConstantGain):
     :math:`K = 1`. A policy is found before it is smoothed.
 
     Args:
-        end (float): the last value, at least 0. Defaults to ``1.0``.
+        end (float): the last value, at least 0. Larger values regularize more. Defaults to ``1.0``.
         length (float): :math:`K`, the share of training over which it rises, in (0, 1]. Smaller
             values smooth earlier. Defaults to ``1.0``.
 
@@ -103,6 +103,7 @@ class RampGain(ConstantGain):
         A last batch may go beyond the end of training: what is somewhat above 1 counts as 1.
 
         Raises:
+            TypeError: it is no number.
             ValueError: it is below 0 or above 2: no share, but a number of frames or updates.
         """
         measured = as_number("measured", measured)
@@ -168,7 +169,11 @@ class GradientGain(_BoundedGain):
         self.share, self._measurements = float(share), 0
 
     def step(self, measured: float = math.nan) -> float:
-        """The next value after a share :math:`\\rho`; 0 and what is not finite change nothing."""
+        r"""The next value after a share :math:`\rho`; 0 and what is not finite change nothing.
+
+        Raises:
+            TypeError: it is no number.
+        """
         measured = _measured(measured)
         if 0.0 < measured < math.inf:
             wanted = self.share / measured
@@ -227,7 +232,11 @@ class TargetGain(_BoundedGain):
         self.target = float(target)
 
     def step(self, measured: float = math.nan) -> float:
-        """The next value after a measure :math:`m`; one that is not finite changes nothing."""
+        """The next value after a measure :math:`m`; one that is not finite changes nothing.
+
+        Raises:
+            TypeError: it is no number.
+        """
         measured = _measured(measured)
         if math.isfinite(measured):
             excess = min(max(measured / self.target - 1.0, -1.0), 1.0)

@@ -127,7 +127,7 @@ def action_jerk(actions: Tensor, sampling_rate: float = 1.0) -> Tensor:
         Tensor: of each episode, shape ``[*B]``.
 
     Raises:
-        TypeError: the actions are no floating-point tensor.
+        TypeError: the actions are no floating-point tensor, or the rate is no number.
         ValueError: an episode has fewer than four steps, or the rate is not greater than 0.
 
     Examples:
@@ -196,7 +196,7 @@ def saturation(
         Tensor: of each episode, shape ``[*B]``, over its steps and dimensions.
 
     Raises:
-        TypeError: the actions are no floating-point tensor.
+        TypeError: the actions are no floating-point tensor, or the margin is no number.
         ValueError: they are no episodes, or the margin is negative.
 
     Examples:

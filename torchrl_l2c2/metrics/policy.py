@@ -46,6 +46,7 @@ def local_lipschitz(
         left out; where none is left the estimate is NaN, as it is of one that is not a number.
 
     Raises:
+        TypeError: ``reduction`` is no string.
         ValueError: the shapes do not fit, or ``reduction`` is not one of the two.
 
     Examples:
@@ -101,7 +102,8 @@ def noise_sensitivity(
         Tensor: a single number, the mean over ``[*B]``.
 
     Raises:
-        TypeError: the observations are not floating point, or the policy returns no tensor.
+        TypeError: the observations are not floating point, the policy returns no tensor, or the
+            scale is no number.
         ValueError: the scale is not a finite number greater than 0, or actions lack their
             dimension.
 

@@ -32,7 +32,7 @@ def amplitude_spectrum(actions: Tensor, sampling_rate: float = 1.0) -> tuple[Ten
         amplitudes, shape ``[*B, F, A]``, in the action's unit.
 
     Raises:
-        TypeError: the actions are no floating-point tensor.
+        TypeError: the actions are no floating-point tensor, or the rate is no number.
         ValueError: an episode has fewer than four steps, or the rate is not greater than 0.
 
     Examples:
@@ -90,7 +90,7 @@ def spectral_smoothness(actions: Tensor, form: Literal["caps", "asap"] = "caps")
         Tensor: of each episode, shape ``[*B]``, in the action's unit.
 
     Raises:
-        TypeError: the actions are no floating-point tensor.
+        TypeError: the actions are no floating-point tensor, or the form is no string.
         ValueError: an episode has fewer than four steps, or another form.
 
     Examples:

@@ -66,7 +66,7 @@ class PPORPELoss(SharedEvaluation):
             A target copy is kept.
 
     Keyword Args:
-        gamma (float): discount in ``[0, 1)``. Default 0.99.
+        gamma (float): discount in ``[0, 1)``. Larger values look further ahead. Default 0.99.
         kappa (float): share of the largest deviation of the ratio that is allowed, above 0.
             Smaller values keep the policy nearer to the one that acted. Default 0.5.
         beta (float): mixture of the relative ratio, in ``(0, 1)``. At 0.5 the ratio is symmetric

@@ -46,9 +46,10 @@ class SR2LLoss(RegularizedLoss):
     Args:
         base_loss (LossModule): the loss; see :class:`RegularizedLoss` for how it is wrapped.
         epsilon (float): half the width of the box, in the observation's units, greater than 0.
-            Usual are 0.01 to 0.05 of normalized observations. Defaults to ``0.05``.
-        coeff (float): :math:`\lambda`, at least 0; usual are 0.03 to 0.3. Scheduled as
-            ``sr2l_coeff``. Defaults to ``0.1``.
+            Larger values smooth over larger distances; usual are 0.01 to 0.05 of normalized
+            observations. Defaults to ``0.05``.
+        coeff (float): :math:`\lambda`, at least 0. Larger values flatten the policy; usual are 0.03
+            to 0.3. Scheduled as ``sr2l_coeff``. Defaults to ``0.1``.
 
     Keyword Args:
         steps (int): of the ascent, at least 1. More come nearer to the maximum. Defaults to ``10``.
