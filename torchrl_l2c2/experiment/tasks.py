@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
@@ -116,16 +116,16 @@ class TaskConfig:
         return make_env(self, seed)
 
 
-def _bullet(name: str) -> str:
-    return f"pybullet_envs_gymnasium:{name}BulletEnv-v0"
+def _bullet(name: str, **settings: Any) -> TaskConfig:
+    return TaskConfig(name.lower(), f"pybullet_envs_gymnasium:{name}BulletEnv-v0", **settings)
 
 
 # Noise, steps and the returns that count as solved are the paper's; episodes are inferred.
 PAPER_TASKS: dict[str, TaskConfig] = {
     "swingup": TaskConfig(max_steps=1000, solved_at=800.0),
-    "reacher": TaskConfig("reacher", _bullet("Reacher"), 0.01, 4500, 150, 18.0),
-    "hopper": TaskConfig("hopper", _bullet("Hopper"), 0.001, 750, 1000, 2500.0),
-    "ant": TaskConfig("ant", _bullet("Ant"), 0.001, 750, 1000, 2500.0),
+    "reacher": _bullet("Reacher", noise_scale=0.01, episodes=4500, max_steps=150, solved_at=18.0),
+    "hopper": _bullet("Hopper", noise_scale=0.001, episodes=750, max_steps=1000, solved_at=2500.0),
+    "ant": _bullet("Ant", noise_scale=0.001, episodes=750, max_steps=1000, solved_at=2500.0),
 }
 # Those of the methods after it, without noise; conf/preset/rl_zoo/ says how long they train.
 FIELD_TASKS: dict[str, TaskConfig] = {
