@@ -86,7 +86,7 @@ def kl_divergence(
 
 
 def _normal_kl(p: Normal, q: Normal) -> Tensor:
-    """Of torch's value, which is looked up once in a way that does not compile."""
+    """As torch's own, whose look-up of the closed form does not compile."""
     ratio, apart = (p.scale / q.scale).square(), ((p.loc - q.loc) / q.scale).square()
     return 0.5 * (ratio + apart - 1 - ratio.log())
 
@@ -94,7 +94,7 @@ def _normal_kl(p: Normal, q: Normal) -> Tensor:
 def _categorical_kl(
     p: Categorical | OneHotCategorical, q: Categorical | OneHotCategorical
 ) -> Tensor:
-    """Of torch's value, and with a gradient where actions are impossible, as under a mask."""
+    """As torch's own, with a finite gradient where actions are impossible, as under a mask."""
     probs_p, probs_q = all_probs(p), all_probs(q)
     possible, both = probs_p > 0, (probs_p > 0) & (probs_q > 0)
     logs = p.logits, q.logits

@@ -184,12 +184,12 @@ class GradientGain(_BoundedGain):
         return self.value
 
     def state_dict(self) -> dict[str, float]:
-        """As of the others."""
+        """As :meth:`ConstantGain.state_dict`."""
         measured = {"center": self._center, "measurements": self._measurements}
         return {**super().state_dict(), **measured}
 
     def load_state_dict(self, state: dict[str, float]) -> None:
-        """As of the others."""
+        """As :meth:`ConstantGain.load_state_dict`."""
         super().load_state_dict(state)
         self._center, self._measurements = state["center"], int(state["measurements"])
 

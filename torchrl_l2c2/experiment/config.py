@@ -73,7 +73,7 @@ class ExperimentConfig:
 
     task: TaskConfig = dataclasses.field(default_factory=lambda: TASKS["swingup"])
     algorithm: AlgorithmConfig = dataclasses.field(default_factory=PPORPEConfig)
-    # Made of None below.
+    # None stands for what __post_init__ chooses by the algorithm.
     regularizer: RegularizerConfig = None  # type: ignore[assignment]
     replay: ReplayConfig = None  # type: ignore[assignment]
     optimizer: OptimizerConfig = None  # type: ignore[assignment]

@@ -54,7 +54,7 @@ ACTION_MEASURES: dict[str, Callable[[Tensor], Tensor]] = {
 }
 # Of one episode of a late policy, by their names in metrics.csv.
 TESTED = ("test_return", "test_action_variation")
-LEAST_STEPS = 4  # that each of them can be taken of
+LEAST_STEPS = 4  # of an episode, for all of these measures
 NOISE = 0.01  # standard deviation, that sensitivity is measured with: that of the paper's tasks
 
 

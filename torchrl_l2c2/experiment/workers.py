@@ -263,7 +263,7 @@ class _EpisodeWorker(EpisodeCollector):
         policy_factory: Callable[[], TensorDictModule],
         frames_per_batch: int,
         exploration_type: ExplorationType,
-        compiled_policy: bool,
+        compiled_policy: bool,  # TorchRL has a compile_policy of its own, by torch.compile.
         keep_previous: bool,
         **_: Any,
     ) -> None:
@@ -283,7 +283,7 @@ class _EpisodeWorker(EpisodeCollector):
         self._observation = None
 
     def rollout(self) -> TensorDictBase:
-        # What the parent's message said: all of the round is random or none.
+        # The parent sets it for a round that is to be random, all of it or nothing.
         self._random_frames_left = self.frames_per_batch if self.init_random_frames > 0 else 0
         episode = super().rollout()
         # The parent counts frames by this entry.

@@ -273,5 +273,5 @@ def _split(
 
 
 def _thread() -> int:
-    # Not to be compiled; a compiled call has begun and ended its pass by the time that it runs.
+    # get_ident does not compile, and need not: a pass begins and ends while it is traced.
     return 0 if is_compiling() else get_ident()

@@ -152,7 +152,7 @@ def _adopt(self: SpecializedLoss, base_loss: LossModule) -> None:
     state["_tensor_keys"] = copy.copy(base_loss.tensor_keys)
     if "_value_estimator" in self._modules:
         self._modules["_value_estimator"] = copy.copy(base_loss._value_estimator)
-    # These hooks refer to the module that they were registered on, and weakly.
+    # These hooks hold a weak reference to the module that they were registered on: the base.
     for key, hook in self._load_state_dict_pre_hooks.items():
         if hook.with_module:
             self._load_state_dict_pre_hooks[key] = type(hook)(hook.hook, self)

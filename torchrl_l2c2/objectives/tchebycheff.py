@@ -169,9 +169,9 @@ def tchebycheff_shares(
     """The derivative of :func:`smooth_tchebycheff` by each value: a softmax.
 
     Args:
-        values: as there.
-        ideal: as there.
-        mu: as there.
+        values: :math:`f`, as for :func:`smooth_tchebycheff`.
+        ideal: :math:`z`, likewise.
+        mu: likewise.
 
     Examples:
         >>> import torch

@@ -13,7 +13,7 @@ from torchrl.envs.utils import exploration_type
 
 from torchrl_l2c2.experiment.frames import PREVIOUS
 
-LARGEST = 10.0  # of what is normalized
+LARGEST = 10.0  # what is normalized is clipped to it, either way
 EPSILON = 1e-8  # added to variances
 
 

@@ -127,7 +127,7 @@ class GainConfig(RegularizerConfig):
 
     @property
     def ramped(self) -> bool:
-        """As of all."""
+        """As :attr:`RegularizerConfig.ramped`."""
         return self.gain == "ramp"
 
     @property

@@ -149,5 +149,5 @@ class L2C2Config(GainConfig):
     def set_gains(self, loss: LossModule, policy: float, value: float) -> None:
         loss.l2c2_coeff = policy
         if self.beta:
-            # Both gains are of the value terms.
+            # The value terms have the factor l2c2_coeff * l2c2_beta.
             loss.l2c2_beta = self.beta * value / policy if policy else self.beta
