@@ -129,6 +129,13 @@ class TestHandComputedNumbers:
         assert terms["l2c2_distance"].item() == pytest.approx(1.0)
         assert terms["l2c2_gain"].item() == pytest.approx((1 / 3 + 1 / 5) / 2)
 
+    def test_the_gain_that_is_told_is_the_one_that_is_applied(self):
+        """With the coefficient that multiplies all terms, as it is now."""
+        loss = linear_loss()
+        loss.l2c2_coeff = 0.5
+        terms = loss.policy_regularizer(linear_batch())
+        assert terms["l2c2_gain"].item() == pytest.approx((1 / 3 + 1 / 5) / 4)
+
     def test_gradients_flow_through_both_states(self):
         """d/dv of (v.x)^2 is 2 (v.x) x with x the difference of the states, not one of them."""
         loss = linear_loss(beta=1.0)
@@ -437,6 +444,16 @@ class TestNeighbors:
             terms.append(loss(each))
         for name in loss.added_terms:
             torch.testing.assert_close(terms[1][name], terms[0][name])
+
+    def test_neighbors_that_are_drawn_here_train_no_encoder(self):
+        """Nor do those of a transform: no gradient reaches what made the observations."""
+        loss, batch = L2C2Loss(DDPGLoss(deterministic_actor(), qvalue())), transitions(8)
+        seen = [batch["observation"], batch["next", "observation"]]
+        for each in seen:
+            each.requires_grad_()
+        for regularizer in (loss.policy_regularizer, loss.value_regularizer):
+            total = sum(t for k, t in regularizer(batch).items() if k.startswith("loss_"))
+            assert torch.autograd.grad(total, seen, allow_unused=True) == (None, None)
 
     def test_neighbors_are_drawn_as_often_as_asked(self):
         """More samples leave the mean as it is and make it less noisy."""
