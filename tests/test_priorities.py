@@ -40,36 +40,37 @@ def test_rows_weights_and_state_are_the_samplers_own(alpha):
         priority = torch.rand(16, generator=torch.Generator().manual_seed(number)) * (1 + number)
         set_priorities(ours.sampler, rows, priority)
         theirs.sampler.update_priority(expected, priority)
+        assert ours.sampler._max_priority == theirs.sampler._max_priority
     state, other = replay_state(ours)["_sampler"], replay_state(theirs)["_sampler"]
     assert torch.equal(state["_sum_tree"], other["_sum_tree"])
     assert torch.equal(state["_min_tree"], other["_min_tree"])
-    assert ours.sampler._max_priority == theirs.sampler._max_priority
     # What the buffer gives by itself then, and the priority of what is new.
     assert torch.equal(ours.sample()["row"], theirs.sample()["row"])
     assert ours.sampler.default_priority == theirs.sampler.default_priority
 
 
 class Misled:
-    """A tree whose search ends in the middle of rows that have no priority."""
+    """A tree whose search ends at this row, of which rows 20 to 29 have no priority."""
 
-    def __init__(self, tree):
-        self.query, self._tree = tree.query, tree
+    def __init__(self, tree, row):
+        self.query, self._tree, self._row = tree.query, tree, row
         tree[torch.arange(20, 30)] = 0.0
 
     def __getitem__(self, rows):
         return self._tree[rows]
 
     def scan_lower_bound(self, mass):
-        return self._tree.scan_lower_bound(mass) * 0 + 25
+        return self._tree.scan_lower_bound(mass) * 0 + self._row
 
 
-def test_a_row_that_cannot_be_drawn_gives_way_to_the_one_before():
-    """As in TorchRL, where rounding leads to one that has no priority."""
+@pytest.mark.parametrize(("found", "drawn"), [(25, 19), (40, 39)])
+def test_a_row_that_cannot_be_drawn_gives_way_to_the_one_before(found, drawn):
+    """As in TorchRL, where rounding leads to one without priority, or beyond those stored."""
     buffer = filled(40)
-    buffer.sampler._sum_tree = Misled(buffer.sampler._sum_tree)
+    buffer.sampler._sum_tree = Misled(buffer.sampler._sum_tree, found)
     rows, weight = draw_by_priority(buffer.sampler, 40, 16)
     expected, info = buffer.sampler.sample(buffer.storage, 16)
-    assert torch.equal(rows, expected) and (rows == 19).all()
+    assert torch.equal(rows, expected) and (rows == drawn).all()
     assert torch.equal(weight, info["priority_weight"])
 
 
