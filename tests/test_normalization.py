@@ -75,6 +75,13 @@ def test_what_is_far_out_is_clipped():
     assert norm.normalized(frames[0])["next", "reward"].max() == 10.0
 
 
+def test_what_never_changes_is_divided_by_a_ten_thousandth():
+    """As in Stable-Baselines3, and not by 0."""
+    moments = Moments(1)
+    moments.var.zero_()
+    assert moments.scale.item() == pytest.approx(1e-4)
+
+
 @pytest.mark.parametrize("kind", ["observations", "rewards"])
 def test_either_is_left_as_it_is_where_it_is_not_normalized(kind):
     norm, frames = make(**{kind: False}), [rollout(30), rollout(30, seed=1)]

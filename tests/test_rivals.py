@@ -177,9 +177,11 @@ class TestGradCAPS:
         assert found.item() == pytest.approx(0.3 * (0.0 + 400.0) / 2, rel=1e-4)
 
     def test_what_the_action_moved_over_both_steps_is_what_counts(self):
-        """(1 - 0) / (tanh 1 + .5) for actions 0, 0, 1."""
-        term = grad_caps_term(torch.zeros(1, 1), torch.zeros(1, 1), torch.ones(1, 1), 0.5)
-        assert term.item() == pytest.approx((1.0 / (math.tanh(1.0) + 0.5)) ** 2)
+        """(1 - 0) / (tanh 1 + .5) for actions 0, 0, 1, and for 1, 0, 0: either way."""
+        still, moved = torch.zeros(1, 1), torch.ones(1, 1)
+        for before, later in ((still, moved), (moved, still)):
+            term = grad_caps_term(before, torch.zeros(1, 1), later, 0.5)
+            assert term.item() == pytest.approx((1.0 / (math.tanh(1.0) + 0.5)) ** 2)
 
     @pytest.mark.parametrize("kind", [GradCAPSLoss, ASAPLoss])
     def test_frames_that_are_not_of_the_state(self, kind):
@@ -321,6 +323,16 @@ class TestASAP:
             if name.startswith("actor_network"):
                 parameter.data.mul_(2.0)
         assert loss.policy_regularizer(batch)["loss_asap_spatial"].item() > 0.0
+
+    @pytest.mark.parametrize("make", [linear_normal, linear_base])
+    def test_the_predictor_has_what_a_copied_loss_has_learned(self, make):
+        """The networks of a copy do not follow the parameters that the copy keeps beside them."""
+        base, batch = copy.deepcopy(make()), self.batch()
+        for parameter in base.actor_network_params.values(True, True):
+            parameter.data.mul_(2.0)
+        loss = ASAPLoss(base, previous_key="before")
+        batch["before"] = batch["observation"]
+        assert loss.policy_regularizer(batch)["loss_asap_spatial"].item() == 0.0
 
     def test_the_predictor_belongs_to_the_loss(self):
         """Optimizers, checkpoints and copies have it."""
