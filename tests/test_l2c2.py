@@ -136,6 +136,15 @@ class TestHandComputedNumbers:
         terms = loss.policy_regularizer(linear_batch())
         assert terms["l2c2_gain"].item() == pytest.approx((1 / 3 + 1 / 5) / 4)
 
+    def test_a_gain_may_be_assigned_to_before_the_backward_pass(self):
+        """What was computed with the old one keeps it."""
+        loss = linear_loss()
+        term = loss.policy_regularizer(linear_batch())["loss_l2c2_actor"]
+        parameters = [p for p in loss.actor_network_params.values(True, True) if p.requires_grad]
+        expected = torch.autograd.grad(term, parameters, retain_graph=True)
+        loss.l2c2_coeff = 0.5
+        assert all(map(torch.equal, torch.autograd.grad(term, parameters), expected))
+
     def test_gradients_flow_through_both_states(self):
         """d/dv of (v.x)^2 is 2 (v.x) x with x the difference of the states, not one of them."""
         loss = linear_loss(beta=1.0)

@@ -27,6 +27,8 @@ from torchrl_l2c2.experiment import (
 from torchrl_l2c2.experiment.algorithms.normalization import Normalization
 from torchrl_l2c2.experiment.checkpoints import list_checkpoints
 from torchrl_l2c2.experiment.evaluate import LateTests
+from torchrl_l2c2.experiment.optimizers import anneal
+from torchrl_l2c2.experiment.tasks import Budget
 
 PENDULUM = TaskConfig("pendulum", "Pendulum-v1", noise_scale=0.01, episodes=2, max_steps=40)
 
@@ -163,3 +165,17 @@ def test_the_larger_of_several_terms_counts(monkeypatch):
     shares = {"loss_caps_temporal": 0.1, "loss_caps_spatial": 0.4}
     monkeypatch.setattr(run.learner, "shares", lambda batch: shares)
     assert run.train()[-1]["gain_measured_policy"] == 0.4
+
+
+def test_a_late_share_is_one_episode_at_least():
+    """Of a training of five, a hundredth is the last; of none there is none."""
+    assert [Budget(5).is_late(spent, 0.01) for spent in (4, 5)] == [False, True]
+    assert not Budget(5).is_late(5, 0.0)
+
+
+def test_a_training_that_goes_beyond_its_end_has_no_negative_learning_rate():
+    """As a last rollout does."""
+    config = AdamConfig(linear=True)
+    optimizer = config.make([torch.nn.Parameter(torch.ones(1))])
+    anneal(config, optimizer, 1.2)
+    assert optimizer.param_groups[0]["lr"] == 0.0
