@@ -65,8 +65,11 @@ def test_the_terms_and_gradients_are_those_without_autocast(make, compiling, bat
         loss.delta.fill_(0.5)  # The adaptive threshold is a state that every forward pass moves.
     monkeypatch.setattr(evaluation, "is_compiling", lambda: compiling)
     found, its_gradients, its_own = evaluate(loss, batch, autocast=True)
-    torch.testing.assert_close(found, added)
-    torch.testing.assert_close(its_gradients, gradients)
+    # Relative to themselves: of states so near the terms are far below 1e-5.
+    torch.testing.assert_close(found, added, rtol=0.05, atol=0.0)
+    for gradient, expected in zip(its_gradients, gradients, strict=True):
+        atol = 0.05 * expected.abs().max().item() + 1e-12  # A bias of values has none.
+        torch.testing.assert_close(gradient, expected, rtol=0.0, atol=atol)
     assert (its_own != own).any()
 
 
