@@ -204,8 +204,9 @@ class TestTheClass:
 
     def test_two_threads_have_a_forward_pass_each(self):
         """What one has evaluated is not taken for the other's."""
-        loss, batches = L2C2Loss(ddpg(), NEAR), [transitions(32), transitions(32)]
-        batches = [NeighborTransform(NEAR)(batch) for batch in batches]
+        # A functional loss writes into its networks, which two threads cannot do at once.
+        loss = L2C2Loss(PPOLoss(gaussian_actor(), critic(), functional=False), NEAR)
+        batches = [NeighborTransform(NEAR)(on_policy(32)) for _ in range(2)]
         expected, wrong = [loss(batch)["loss_l2c2_actor"].item() for batch in batches], []
 
         def ask(i):
@@ -219,6 +220,22 @@ class TestTheClass:
         for thread in threads:
             thread.join()
         assert expected[0] != expected[1] and not wrong
+
+    def test_a_loss_may_call_itself(self):
+        """As for parts of a batch: the mean over both halves is that over all."""
+
+        class Halved(DDPGLoss):
+            def forward(self, tensordict):
+                if len(tensordict) <= 4:
+                    return super().forward(tensordict)
+                return torch.stack([self(part) for part in tensordict.split(4)]).mean(0)
+
+        base, batch = ddpg(), NeighborTransform(NEAR)(transitions(8))
+        loss = L2C2Loss(Halved(base.actor_network, base.value_network))
+        loss.load_state_dict(L2C2Loss(base).state_dict())
+        expected, found = L2C2Loss(base)(batch), loss(batch)
+        for key in ("loss_actor", "loss_l2c2_actor"):
+            torch.testing.assert_close(found[key], expected[key])
 
     def test_the_gain_may_be_a_tensor_when_it_is_made_too(self):
         """As where it is assigned to."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import pickle
+from functools import partial
 
 import pytest
 import torch
@@ -30,6 +31,7 @@ from torchrl.modules import (
     IndependentNormal,
     NormalParamExtractor,
     ProbabilisticActor,
+    TanhDelta,
 )
 from torchrl.objectives import BCLoss, DDPGLoss, DQNLoss, PPOLoss
 
@@ -99,6 +101,89 @@ def linear_normal(scale: float = 0.5) -> PPOLoss:
         return_log_prob=True,
     )
     return PPOLoss(actor, None)
+
+
+class Contact(nn.Module):
+    """Acts by what is touched: 1 in the first dimension, and what is observed in the second."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(1))
+
+    def forward(self, observation, contact):
+        return self.weight * torch.cat((contact.to(observation.dtype), observation), -1)
+
+
+class TestLabels:
+    """What the policy reads beside its observation is that of the state that it acts in."""
+
+    def terms(self, kind, **settings):
+        actor = Actor(Contact(), in_keys=["observation", "contact"])
+        loss = kind(DDPGLoss(actor, qvalue()), **settings)
+        still = {"observation": torch.zeros(4, 1)}
+        touched = torch.tensor([[False], [True], [True], [False]])
+        later = {**still, "contact": torch.tensor([[True], [False], [True], [False]])}
+        batch = TensorDict({**still, "contact": touched, "before": torch.zeros(4, 1)}, [4])
+        batch["next"] = TensorDict(later, [4])
+        return {key: term.item() for key, term in loss.policy_regularizer(batch).items()}
+
+    def test_a_next_state_has_its_own(self):
+        """Of four states two begin or end to touch: each is a change of 1."""
+        assert self.terms(CATSLoss, lambda_temporal=1.0)["loss_cats"] == pytest.approx(2 / 4)
+
+    def test_a_noisy_one_has_those_of_the_state(self):
+        settings = {"lambda_temporal": 1.0, "lambda_spatial": 1.0, "sigma": 1e-4}
+        terms = self.terms(CAPSLoss, **settings)
+        assert terms["loss_caps_temporal"] == pytest.approx(0.5 * 2 / 4)
+        assert terms["loss_caps_spatial"] < 1e-6
+
+    def test_one_before_is_taken_to_have_those_of_the_state(self):
+        """The two changes are 0 and 1: ((1 - 0) / (tanh 1 + .5)) ^ 2."""
+        settings = {"lambda_temporal": 1.0, "epsilon": 0.5, "previous_key": "before"}
+        expected = 2 / 4 / (math.tanh(1.0) + 0.5) ** 2
+        assert self.terms(GradCAPSLoss, **settings)["loss_grad_caps"] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("kind", [CAPSLoss, CATSLoss, SR2LLoss, LCPLoss, L2C2Loss])
+def test_dimensions_of_a_plain_normal_are_those_of_one_action(kind):
+    """As of TorchRL's IndependentNormal, and not policies of their own, which would be averaged."""
+    net = nn.Sequential(nn.Linear(3, 4), NormalParamExtractor())
+    batch, terms = transitions(8), []
+    for distribution in (IndependentNormal, torch.distributions.Normal):
+        actor = ProbabilisticActor(
+            TensorDictModule(net, ["observation"], ["loc", "scale"]),
+            in_keys=["loc", "scale"],
+            distribution_class=distribution,
+        )
+        torch.manual_seed(0)
+        terms.append(kind(BCLoss(actor)).policy_regularizer(batch))
+    for key, expected in terms[0].items():
+        torch.testing.assert_close(terms[1][key], expected)
+
+
+class Widest(TanhDelta):
+    """A distribution of one's own."""
+
+
+class TestDeterministicPolicies:
+    """Written as a distribution, in whatever way."""
+
+    @pytest.fixture(params=[TanhDelta, Widest, partial(TanhDelta, low=-1.0, high=1.0)])
+    def base(self, request):
+        actor = ProbabilisticActor(
+            TensorDictModule(nn.Linear(3, 2), ["observation"], ["param"]),
+            in_keys=["param"],
+            distribution_class=request.param,
+        )
+        return DDPGLoss(actor, qvalue())
+
+    def test_actions_are_compared(self, base):
+        terms = L2C2Loss(base).policy_regularizer(transitions(4))
+        assert terms["l2c2_action_distance"] > 0
+
+    def test_what_needs_a_density_is_refused_when_it_is_made(self, base):
+        with pytest.raises(TypeError, match="stochastic"):
+            LCPLoss(base)
 
 
 @pytest.mark.parametrize("kind", [CAPSLoss, CATSLoss, GradCAPSLoss, ASAPLoss, SR2LLoss, LCPLoss])

@@ -12,7 +12,7 @@ from torchrl.objectives import LossModule
 from torchrl_l2c2._checks import check_choice, check_real
 from torchrl_l2c2.distances import squared_error
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
-from torchrl_l2c2.objectives.transitions import finite_successor
+from torchrl_l2c2.objectives.transitions import finite_successor, is_floating_point
 from torchrl_l2c2.policy_distances import policy_mean
 
 
@@ -33,8 +33,9 @@ class CAPSLoss(RegularizedLoss):
     plain normal; of a squashed or truncated one, ``mean`` says which side of that is compared. Of
     discrete policies the probabilities are compared, the mean of an action written as one-hot
     vector; the heads of composite ones add up.
-    Coordinates of the next observation that are not finite, as at the ends of some episodes, count
-    as not having moved.
+    The next state is that of the batch, with its masks and labels, several steps away behind
+    ``MultiStepTransform``; the noisy one has those of the state. Coordinates of the next
+    observation that are not finite, as at the ends of some episodes, count as not having moved.
 
     .. note:: The noise is drawn with torch's global generator. The gains are buffers that can be
         assigned to, as in ``loss.caps_lambda_spatial = 0.1``, also between calls of a compiled
@@ -108,10 +109,12 @@ class CAPSLoss(RegularizedLoss):
     def _states(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The next state and a noisy one, ``[2, *B]``."""
         states = TensorDict(batch_size=[2, *tensordict.batch_size])
-        transitions = self.transitions(tensordict, self.policy_networks())
+        transitions = self.transitions(tensordict, self.policy_networks(), labels=True)
         for key, (state, successor) in transitions.items():
             later = finite_successor(state, successor)
-            noisy = state + self.caps_sigma * torch.randn_like(state)
+            noisy = state
+            if is_floating_point(state):
+                noisy = state + self.caps_sigma * torch.randn_like(state)
             states.set(key, torch.stack((later, noisy)))
         return states
 

@@ -30,7 +30,8 @@ class CATSLoss(RegularizedLoss):
     alone, through both states.
 
     [inferred] Which side of a squashing is compared and the value of :math:`\lambda` could not be
-    read. Coordinates of the next observation that are not finite count as not having moved.
+    read. The next state is that of the batch, with its masks and labels, several steps away behind
+    ``MultiStepTransform``. Its coordinates that are not finite count as not having moved.
 
     Args:
         base_loss (LossModule): the loss; see :class:`RegularizedLoss` for how it is wrapped.
@@ -75,7 +76,7 @@ class CATSLoss(RegularizedLoss):
 
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
         terms = super().policy_regularizer(tensordict)
-        transitions = self.transitions(tensordict, self.policy_networks())
+        transitions = self.transitions(tensordict, self.policy_networks(), labels=True)
         later = {key: finite_successor(*pair)[None] for key, pair in transitions.items()}
         states = TensorDict(later, batch_size=[1, *tensordict.batch_size])
         squashed = self.cats_mean == "action"

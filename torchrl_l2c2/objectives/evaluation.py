@@ -11,7 +11,7 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torch.compiler import is_compiling
-from torch.distributions import Distribution
+from torch.distributions import Distribution, Independent
 from torchrl.envs.utils import set_exploration_type
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import _vmap_func
@@ -60,13 +60,18 @@ class EvaluatedNetworks:
         """What this thread's forward pass shares; ``None`` outside of one."""
         return self._forward_passes.get(_thread())
 
-    def begin_forward_pass(self) -> None:
-        """From here on evaluations are shared, till :meth:`end_forward_pass`."""
+    def begin_forward_pass(self) -> ForwardPass | None:
+        """From here on evaluations are shared; the pass that this one lies in, to end it with."""
+        outer = self.forward_pass
         self._forward_passes[_thread()] = ForwardPass()
+        return outer
 
-    def end_forward_pass(self) -> None:
-        """From here on they are not, and what was shared is forgotten."""
-        del self._forward_passes[_thread()]
+    def end_forward_pass(self, outer: ForwardPass | None) -> None:
+        """What was shared is forgotten; the outer pass goes on, if a loss called itself."""
+        if outer is None:
+            del self._forward_passes[_thread()]
+        else:
+            self._forward_passes[_thread()] = outer
 
     def wire(self, loss: LossModule, networks: Iterable[str]) -> None:
         """Finds out how these networks are evaluated; refuses those that cannot be."""
@@ -162,6 +167,9 @@ class EvaluatedNetworks:
         if not wiring.stochastic:
             return outputs.get(wiring.output)
         policy: Distribution = getattr(loss, POLICY_NETWORK).build_dist_from_params(outputs)
+        separate = len(policy.batch_shape) > outputs.batch_dims and not policy.event_shape
+        if separate and not policy.has_enumerate_support:
+            return Independent(policy, 1)  # Its actions' dimensions, as of torch's plain Normal.
         return policy
 
     def _fits_one_pass(self, network: str, tensordict: TensorDictBase) -> bool:

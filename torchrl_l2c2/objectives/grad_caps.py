@@ -11,7 +11,7 @@ from torchrl.objectives import LossModule
 
 from torchrl_l2c2._checks import check_choice, check_real, read_key
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
-from torchrl_l2c2.objectives.transitions import finite_successor
+from torchrl_l2c2.objectives.transitions import finite_successor, is_floating_point
 from torchrl_l2c2.policy_distances import policy_mean
 
 
@@ -34,9 +34,11 @@ class GradCAPSLoss(RegularizedLoss):
         CatFrames(N=2, dim=-1, in_keys=["observation"], out_keys=["frames"])
 
     appended to the environment, behind what normalizes the observation: the first half of
-    ``frames`` is that observation, in the first step of an episode the state itself. Or it is an
-    entry of its own, such as the ``"previous_observation"`` that the collectors of this package's
-    experiment keep, named by ``previous_key``.
+    ``frames`` is that observation, in the first step of an episode the state itself (with
+    ``padding="constant"`` zeros, which are taken for it). Or it is an entry of its own, such as the
+    ``"previous_observation"`` that the collectors of this package's experiment keep, named by
+    ``previous_key``. Masks and labels are each state's own; those of the state before, which are
+    not known, are taken to be the state's.
 
     Args:
         base_loss (LossModule): the loss; see :class:`RegularizedLoss` for how it is wrapped. Its
@@ -121,19 +123,25 @@ class GradCAPSLoss(RegularizedLoss):
 
     def states_around(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The state before and the next one, ``[2, *B]``."""
-        transitions = self.transitions(tensordict, self.policy_networks())
-        if len(transitions) != 1:
+        transitions = self.transitions(tensordict, self.policy_networks(), labels=True)
+        observations = [key for key, (s, _) in transitions.items() if is_floating_point(s)]
+        if len(observations) != 1:
             raise ValueError(
-                f"a policy of one observation is needed, got {list(transitions)}: join them with "
+                f"a policy of one observation is needed, got {observations}: join them with "
                 "CatTensors."
             )
-        ((key, (state, successor)),) = transitions.items()
+        (key,) = observations
+        state = transitions[key][0]
         before = self._before(tensordict, key, state).detach().to(state.dtype)
         if not (self._grad_caps_checked or torch.compiler.is_compiling()):
             self._check_successive(tensordict, key, state)
             self._grad_caps_checked = True  # Once, as a GPU would have to be waited for.
-        states = torch.stack((before, finite_successor(state, successor)))
-        return TensorDict({key: states}, batch_size=[2, *tensordict.batch_size])
+        # Labels of the state before are not known: it has those of the state.
+        states = {
+            k: torch.stack((before if k == key else s, finite_successor(s, successor)))
+            for k, (s, successor) in transitions.items()
+        }
+        return TensorDict(states, batch_size=[2, *tensordict.batch_size])
 
     def _before(self, tensordict: TensorDictBase, key: NestedKey, state: Tensor) -> Tensor:
         if self.grad_caps_previous_key is not None:

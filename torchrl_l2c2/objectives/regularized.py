@@ -35,9 +35,9 @@ class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
     both classes that is made once for each pair. It is a full member of the loss's class: updaters,
     ``set_keys``, ``select_out_keys``, scheduled coefficients, ``deepcopy`` and checkpoints work as
     before, and its ``state_dict`` has the keys of the plain loss's (but for networks of a
-    regularizer's own: :class:`ASAPLoss`). It holds the networks,
-    parameters and buffers of ``loss`` themselves, not copies, and ``loss`` stays the plain loss.
-    From then on, move, cast or compile the regularized one.
+    regularizer's own: :class:`ASAPLoss`). It holds the networks, parameters and buffers of ``loss``
+    themselves, not copies, and ``loss`` stays the plain loss. From then on, move, cast or compile
+    the regularized one.
 
     ``forward`` returns the loss's own terms, unchanged (compiled: to rounding), and the
     regularizer's. Loops that call ``actor_loss`` and ``value_loss`` themselves add
@@ -118,14 +118,14 @@ class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
         Returns:
             TensorDict: the loss's own output with the regularizer's terms and diagnostics added.
         """
-        self._evaluation.begin_forward_pass()
+        outer = self._evaluation.begin_forward_pass()
         try:
             # The loss's own draws come first: at one seed its terms are those of the plain loss.
             terms = super().forward(tensordict)
             terms.update(self.policy_regularizer(tensordict))
             terms.update(self.value_regularizer(tensordict))
         finally:
-            self._evaluation.end_forward_pass()
+            self._evaluation.end_forward_pass(outer)
         networks = (f"{name}_params" for name in self._evaluation.wiring)
         self._clear_weakrefs(tensordict, terms, *networks)
         return terms
@@ -207,23 +207,23 @@ class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
     # For who writes a regularizer: computations, made in the two methods.
 
     def transitions(
-        self, tensordict: TensorDictBase, networks: Iterable[str]
+        self, tensordict: TensorDictBase, networks: Iterable[str], *, labels: bool = False
     ) -> dict[NestedKey, tuple[Tensor, Tensor]]:
         """The states that networks read, with their successors: keys to pairs of ``[*B, *F]``.
 
-        Neither has a gradient. Inputs that are not floating point (masks, labels) or have no
-        successor (goals) are not among them.
+        Neither has a gradient. Inputs without a successor (goals) are left out.
 
         Args:
             tensordict: the batch, ``[*B]``.
             networks: names of declared ones.
+            labels: also inputs that are not floating point, such as masks.
 
         Raises:
             TypeError: a network reads no floating-point state.
             KeyError: no state that a network reads has a successor in the batch.
         """
-        wiring = self._evaluation.wiring
-        return find_transitions(tensordict, {name: wiring[name].states for name in networks})
+        read = {name: self._evaluation.wiring[name].states for name in networks}
+        return find_transitions(tensordict, read, labels=labels)
 
     def policy_states(self, tensordict: TensorDictBase) -> dict[NestedKey, Tensor]:
         """The floating-point states that the policy reads, ``[*B, *F]`` by their keys.

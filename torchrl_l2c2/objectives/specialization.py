@@ -70,7 +70,7 @@ class SpecializedLoss(LossMixin):
         if not isinstance(base_loss, LossModule):
             raise TypeError(
                 f"{cls.__name__} wraps a torchrl.objectives.LossModule, got a "
-                f"{type(base_loss).__name__}."
+                f"{type(base_loss).__name__}: a loss is compiled when it is wrapped already."
             )
         specialized = cls if cls._parts else cls.__class_getitem__(type(base_loss))
         if type(base_loss) not in specialized.__mro__:

@@ -86,16 +86,19 @@ def check_reads_next(loss: LossModule) -> None:
 
 
 def find_transitions(
-    tensordict: TensorDictBase, states: Mapping[str, Iterable[NestedKey]]
+    tensordict: TensorDictBase,
+    states: Mapping[str, Iterable[NestedKey]],
+    *,
+    labels: bool = False,
 ) -> dict[NestedKey, tuple[Tensor, Tensor]]:
     """The states that networks read, with their successors; both without a gradient.
 
-    Inputs that are not floating point (masks, labels) or have no successor (goals) are not
-    among them.
+    Inputs without a successor (goals) are not among them.
 
     Args:
         tensordict (TensorDictBase): the batch, ``[*B]``.
         states (Mapping): the keys of the states that each network reads, by its name.
+        labels (bool): also inputs that are not floating point, such as masks and labels.
 
     Returns:
         dict: by their keys, states and successors, each ``[*B, *F]``.
@@ -117,9 +120,13 @@ def find_transitions(
                 f"{network} needs the next observation to be regularized, and the batch has no "
                 f"{list(map(next_key, floating))}: keep what the collector wrote there."
             )
-        for key, (state, successor) in present.items():
-            _check_successor(key, state, successor)
         pairs.update(present)
+        for key in read if labels else ():
+            state, successor = tensordict.get(key, None), following.get(next_key(key), None)
+            if isinstance(state, Tensor) and isinstance(successor, Tensor):
+                pairs.setdefault(key, (state, successor))
+    for key, (state, successor) in pairs.items():
+        _check_successor(key, state, successor)
     return {key: pairs[key] for key in keys if key in pairs}
 
 
@@ -191,7 +198,7 @@ def next_key(key: NestedKey) -> NestedKey:
 
 
 def _check_successor(key: NestedKey, state: Tensor, successor: Tensor) -> None:
-    if not successor.is_floating_point():
+    if state.is_floating_point() and not successor.is_floating_point():
         raise TypeError(
             f"{next_key(key)} must be floating point, as {key!r} is, got {successor.dtype}: cast "
             "both alike in the environment, the collector or the replay buffer."

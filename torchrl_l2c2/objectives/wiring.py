@@ -124,12 +124,12 @@ def _has_buffers(loss: LossModule, network: str) -> bool:
 
 
 def _is_stochastic(actor: nn.Module) -> bool:
-    classes = {
-        module.distribution_class
+    classes = [
+        getattr(module.distribution_class, "func", module.distribution_class)  # of a partial
         for module in actor.modules()
         if isinstance(module, ProbabilisticTensorDictModule)
-    }
-    if classes <= {Delta, TanhDelta}:
+    ]
+    if all(isinstance(one, type) and issubclass(one, Delta | TanhDelta) for one in classes):
         return False
     if getattr(actor, "return_composite", False) or not hasattr(actor, "get_dist_params"):
         raise TypeError(
