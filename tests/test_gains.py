@@ -8,13 +8,22 @@ import math
 import re
 import statistics
 import warnings
+from copy import deepcopy
 
 import pytest
 import torch
 from losses import CASES
 from small import ALGORITHMS
 
-from torchrl_l2c2 import L2C2Loss, Neighborhood, NeighborTransform
+from torchrl_l2c2 import (
+    CAPSLoss,
+    L2C2Loss,
+    Neighborhood,
+    NeighborTransform,
+    PPORPELoss,
+    make_actor,
+    make_critic,
+)
 from torchrl_l2c2.experiment import (
     AdamConfig,
     CAPSConfig,
@@ -81,6 +90,20 @@ class TestByHand:
             norms[key] = torch.cat([g.flatten() for g in gradients]).norm().item()
         share = gradient_shares(loss, batch)["loss_l2c2_actor"]
         assert share == pytest.approx(norms["loss_l2c2_actor"] / norms["loss_actor"], rel=1e-4)
+
+    def test_measuring_changes_nothing(self):
+        """Neither the loss, which keeps a threshold, nor the batch, nor the global generator."""
+        torch.manual_seed(0)
+        loss = CAPSLoss(PPORPELoss(make_actor(3, 1), make_critic(3)))
+        batch = next(case for case in CASES if case.name == "PPO").batch(8)
+        batch = batch.select("observation", "next").set("action", torch.zeros(8, 1))
+        batch.set("action_log_prob", torch.full((8,), -3.0))
+        seen, kept, state = batch.clone(), deepcopy(loss.state_dict()), torch.get_rng_state()
+        assert gradient_shares(loss, batch)["loss_caps_spatial"] > 0.0
+        assert torch.get_rng_state().equal(state)
+        assert all(value.equal(kept[name]) for name, value in loss.state_dict().items())
+        assert set(batch.keys(True, True)) == set(seen.keys(True, True))
+        assert (batch == seen).all()
 
     def test_a_gradients_share_is_met_at_once_with_rate_1(self):
         """Also by later measurements: .02 at the gain 3 is .1 at 15."""
@@ -318,6 +341,15 @@ class TestInARun:
         assert len(told) == (kind != "target")
         if kind == "ramp":
             assert run.agent.loss.l2c2_coeff == run.metrics[-1]["gain_measured"] > 0.0
+
+    def test_what_a_ramp_ends_with_is_looked_at_and_left(self):
+        """The loss has the gain of now again, before the next update."""
+        run = Experiment(small(L2C2Config(gain="ramp")))
+        run.train(1)
+        before = run.agent.loss.l2c2_coeff.item()
+        with run.learner.at_full_gain():
+            assert run.agent.loss.l2c2_coeff.item() == 1.0 > before
+        assert run.agent.loss.l2c2_coeff.item() == before
 
     def test_a_ramp_is_told_by_the_gain_that_it_ends_with(self, measured_soon):
         """Its first updates have none."""

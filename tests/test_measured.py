@@ -13,6 +13,7 @@ from torchrl_l2c2.experiment import (
     AdamConfig,
     CAPSConfig,
     DQNConfig,
+    EpisodeCollector,
     Experiment,
     ExperimentConfig,
     NoRegularizerConfig,
@@ -26,6 +27,7 @@ from torchrl_l2c2.experiment import (
 )
 from torchrl_l2c2.experiment.algorithms.normalization import Normalization
 from torchrl_l2c2.experiment.checkpoints import list_checkpoints
+from torchrl_l2c2.experiment.environments import NOISE_SEED
 from torchrl_l2c2.experiment.evaluate import LateTests
 from torchrl_l2c2.experiment.optimizers import anneal
 from torchrl_l2c2.experiment.tasks import Budget
@@ -179,3 +181,32 @@ def test_a_training_that_goes_beyond_its_end_has_no_negative_learning_rate():
     optimizer = config.make([torch.nn.Parameter(torch.ones(1))])
     anneal(config, optimizer, 1.2)
     assert optimizer.param_groups[0]["lr"] == 0.0
+
+
+def test_rewards_are_scaled_by_what_the_discount_leaves():
+    """So that values are of the rewards' size, unless a factor is given."""
+    assert PPORPEConfig(gamma=0.9).reward_factor == pytest.approx(0.1)
+    assert PPORPEConfig(gamma=0.9, reward_scale=2.0).reward_factor == 2.0
+
+
+def test_a_seed_of_the_collectors_gives_its_noise_another():
+    """As where the environment is made: simulator and noise draw from streams of their own."""
+    env = make_env(PENDULUM, 0)
+    collector = EpisodeCollector(env, make_actor(3, env.action_spec), frames_per_batch=40)
+    collector.set_seed(5)
+    assert env.transform.generator.initial_seed() == 5 + NOISE_SEED
+    collector.shutdown()
+
+
+def test_random_frames_that_are_left_are_continued():
+    """A run that goes on from the second frame of three has one more."""
+    env = make_env(replace(PENDULUM, max_steps=2), 0)
+    options = {"frames_per_batch": 2, "random_frames": 3}
+    collector = EpisodeCollector(env, make_actor(3, env.action_spec), **options)
+    collector.rollout()
+    state = collector.generator_state()
+    assert state["random_frames_left"] == 1
+    collector.rollout()
+    collector.set_generator_state(state)
+    assert collector.generator_state()["random_frames_left"] == 1
+    collector.shutdown()

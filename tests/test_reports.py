@@ -809,6 +809,15 @@ class TestStatistics:
         interval = bootstrap_interval(mean, scores, generator=generator, confidence=0.8)
         assert interval == (0.25, 0.75)
 
+    def test_the_bootstrap_draws_as_many_runs_as_a_task_has(self):
+        """Also where another task has more of them."""
+
+        def runs(scores):
+            return (~np.isnan(scores)).sum((-2, -1)).astype(float)
+
+        scores = np.array([[1.0, 5.0], [2.0, np.nan], [3.0, np.nan]])
+        assert bootstrap_interval(runs, scores, generator=np.random.default_rng(0)) == (4.0, 4.0)
+
     def test_the_bootstrap_of_many_pairs_fits_into_memory(self):
         """All resamples of 200 runs beside 200 at once would be 40 million pairs."""
         scores, generator = np.arange(200.0)[:, None], np.random.default_rng(0)

@@ -33,7 +33,7 @@ from torchrl_l2c2.experiment.evaluate import evaluate_policy
 from torchrl_l2c2.experiment.noise import play_with_noise
 from torchrl_l2c2.experiment.rollouts import RolloutCollector
 from torchrl_l2c2.experiment.signals import Interrupted
-from torchrl_l2c2.metrics import saturation
+from torchrl_l2c2.metrics import action_rate, saturation
 
 NOISY = TaskConfig("pendulum", "Pendulum-v1", noise_scale=0.1, max_steps=9)
 LANDER = TaskConfig("lunarlander", "LunarLanderContinuous-v3")
@@ -256,6 +256,8 @@ def test_a_test_with_samples_gives_the_task_clipped_actions():
     taken = torch.from_numpy(np.stack(env._env.unwrapped.taken))
     assert taken.max() == np.float32(0.2) and taken.min() == np.float32(-0.1)
     assert result.measures["sampled_saturation"] == [saturation(taken, -0.1, 0.2).item()]
+    # Beyond a bound is at it, for the saturation; not for the change.
+    assert result.measures["sampled_action_rate"] == pytest.approx([action_rate(taken).item()])
 
 
 def test_what_a_cut_leaves_is_bootstrapped(monkeypatch):

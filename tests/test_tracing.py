@@ -33,6 +33,14 @@ def walked(make, compile):
     return torch.stack(parameters).detach(), optimizer
 
 
+@pytest.mark.parametrize("kind", [Adam, AdaTerm])
+def test_a_learning_rate_is_the_same_number_as_a_tensor(kind):
+    """A run that goes on without a compiler has it again."""
+    optimizer = kind([torch.nn.Parameter(torch.zeros(2))], lr=3e-4)
+    traceable_step(optimizer)
+    assert optimizer.param_groups[0]["lr"].item() == 3e-4
+
+
 @pytest.mark.skipif(not compiler_available(), reason="no C++ compiler")
 @pytest.mark.parametrize(
     ("kind", "settings"),
