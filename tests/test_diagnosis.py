@@ -44,6 +44,7 @@ from torchrl_l2c2.experiment.diagnosis import (
 from torchrl_l2c2.experiment.diagnosis.film import film
 from torchrl_l2c2.experiment.diagnosis.page import page
 from torchrl_l2c2.experiment.diagnosis.run import _batch
+from torchrl_l2c2.experiment.errors import SimulatorError
 from torchrl_l2c2.experiment.files import make_folder_of, write_json
 from torchrl_l2c2.experiment.learner import Learner
 from torchrl_l2c2.metrics import action_variation, previous_action_gain
@@ -463,11 +464,19 @@ class TestRun:
         for batch in (read, learned[0]):
             torch.testing.assert_close(batch["next", "reward"], expected)
 
-    def test_pictures_are_left_out_where_they_cannot_be_drawn(self, run, monkeypatch):
-        """As without pygame; all else is there."""
+    @pytest.mark.parametrize(
+        "error",
+        [
+            gymnasium.error.DependencyNotInstalled("pygame is not installed"),
+            ValueError("Still-v0 draws no pictures"),
+            SimulatorError("Still-v0 could not begin: no graphics library"),
+        ],
+    )
+    def test_pictures_are_left_out_where_they_cannot_be_drawn(self, run, monkeypatch, error):
+        """All else is there."""
 
         def missing(*args, **kwargs):
-            raise gymnasium.error.DependencyNotInstalled("pygame is not installed")
+            raise error
 
         monkeypatch.setattr("torchrl_l2c2.experiment.diagnosis.run.play_pictures", missing)
         assert diagnose_run(run, episodes=1).pictures == []

@@ -404,6 +404,19 @@ def test_other_versions_are_refused_unless_they_are_allowed(trained):
     assert len(again.metrics) == 6
 
 
+def test_what_another_experiment_went_on_with_is_not_written_over(tmp_path):
+    """In one process, as of a notebook: the second of two objects would write episodes again."""
+    first = Experiment(small(), tmp_path)
+    first.train(2)
+    second = Experiment(small(), tmp_path)
+    first.train()
+    first.finish(first.test())
+    before = contents(tmp_path)
+    with pytest.raises(OtherRunError, match=r"metrics\.csv has .* another Experiment went on"):
+        second.train()
+    assert contents(tmp_path) == before
+
+
 def test_fewer_episodes_than_there_are_are_refused(trained):
     """Nothing is changed, and the run can be continued as it was or for longer."""
     before = contents(trained)

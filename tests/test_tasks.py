@@ -280,6 +280,28 @@ def test_what_a_task_raises_in_a_test_is_told_as_in_training(monkeypatch, where,
         trained.test(1)
 
 
+class Drawn(Still):
+    """Takes a way of drawing, as usual, and what it says of it."""
+
+    def __init__(self, render_mode=None, modes=("rgb_array",), **spaces):
+        super().__init__(**spaces)
+        self.render_mode, self.metadata = render_mode, {"render_modes": list(modes)}
+
+
+gymnasium.register("Drawn-v0", Drawn)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("modes", [["rgb_array"], ["human"], []])
+def test_a_task_that_cannot_draw_says_so(monkeypatch, modes):
+    """It has no render(), or none that gives pictures."""
+    for name, value in {"space": VECTOR, "modes": modes}.items():
+        monkeypatch.setitem(gymnasium.registry["Drawn-v0"].kwargs, name, value)
+    with pytest.raises(ValueError, match="Drawn-v0 draws no pictures: it has no render_mode"):
+        make_env(task("Drawn-v0"), 0, render=True)
+    make_env(task("Drawn-v0"), 0).close()
+
+
 def test_a_task_without_pictures_is_not_trained_for_a_video(monkeypatch, tmp_path):
     """It would be found out at the end."""
     still(monkeypatch)

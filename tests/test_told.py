@@ -53,12 +53,21 @@ def warned(make_it):
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_a_parameter_that_is_not_finite_stops_every_algorithm(tmp_path, name):
-    """With its name, the update and the last checkpoint, whatever the loss has made of it."""
+def test_a_parameter_that_is_not_finite_stops_every_algorithm(tmp_path, monkeypatch, name):
+    """With its name, the update and the last checkpoint, whatever the loss has made of it.
+
+    Before a late test is played, which would blame the environment.
+    """
+
+    def blamed(number):
+        pytest.fail("the environment was tested with it")
+
     settings = {"random_frames": 35} if name in ("sac", "td3") else {}
     few = {"algorithm": replace(ALGORITHMS[name], **settings)}  # updates, that is
-    run = make(name, tmp_path, **few)
+    run = make(name, tmp_path, late_share=0.5, **few)
     run.train(1)
+    if name != "ppo":  # which is tested before the update of the rollout
+        monkeypatch.setattr(run._late_tests, "play", blamed)
     parameter_name, parameter = list(run.agent.loss.named_parameters())[-1]
     step = run.agent.optimizer.step
 

@@ -217,7 +217,8 @@ def run(
     if finished is None:
         finished = _train(config, folder, values, standing)
     else:
-        tell_past(finished.config, config.to_dict())
+        with _warnings_logged(folder):
+            tell_past(finished.config, config.to_dict())
     if records:
         record_video(folder, video)
     if finished is not None:

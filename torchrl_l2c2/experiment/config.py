@@ -96,6 +96,7 @@ class ExperimentConfig:
     num_workers: int = Field(
         default=1,
         ge=1,
+        le=1024,
         description="processes that play episodes, one each in a round with one policy, the last "
         "round whole: 4 play 352 episodes where 350 are asked for; more than 1 needs "
         "algorithm.schedule other than step",

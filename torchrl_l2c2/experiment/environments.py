@@ -46,7 +46,8 @@ def simulating(what: str) -> Iterator[None]:
     except CompilerError:
         raise
     except (Exception, SystemExit) as error:
-        raise SimulatorError(f"{what}: {type(error).__name__}: {error}") from error
+        told = " ".join(str(error).split())  # in a line, as it stands in one of a sweep's end
+        raise SimulatorError(f"{what}: {type(error).__name__}: {told}") from error
 
 
 def make_env(task: TaskConfig, seed: int, *, render: bool = False) -> EnvBase:
@@ -77,9 +78,14 @@ def make_env(task: TaskConfig, seed: int, *, render: bool = False) -> EnvBase:
         simulator = observing_vector(simulator, flatten=task.flatten)
     if render:
         simulator = RenderCollection(simulator)
-    with _explained(task), quiet_output():
-        env = GymWrapper(simulator)
-        env.reset()
+    try:
+        with _explained(task), quiet_output():
+            env = GymWrapper(simulator)
+            env.reset()
+    except SimulatorError as error:
+        if render and isinstance(error.__cause__, NotImplementedError):  # Gymnasium's own render()
+            raise _draws_nothing(task) from error.__cause__
+        raise
     env.set_seed(seed)
     if not task.noise_scale:
         return env
@@ -144,14 +150,18 @@ def _make(task: TaskConfig, render: bool) -> Env:
             return gymnasium.make(task.env_id, max_episode_steps=limit)
         try:
             env = gymnasium.make(task.env_id, max_episode_steps=limit, render_mode="rgb_array")
-            mode, cause = env.render_mode, None
+            cause = None
         except TypeError as error:  # It knows of no render_mode at all.
-            mode, cause = None, error
-    if mode != "rgb_array":
-        raise ValueError(
-            f"{task.env_id} draws no pictures: it has no render_mode 'rgb_array'."
-        ) from cause
+            cause = error
+    if cause is not None:
+        raise _draws_nothing(task) from cause
+    if env.render_mode != "rgb_array" or "rgb_array" not in env.metadata.get("render_modes", ()):
+        raise _draws_nothing(task)
     return env
+
+
+def _draws_nothing(task: TaskConfig) -> ValueError:
+    return ValueError(f"{task.env_id} draws no pictures: it has no render_mode 'rgb_array'.")
 
 
 @contextlib.contextmanager

@@ -5,8 +5,10 @@ from __future__ import annotations
 import signal
 import sys
 import traceback
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 
 class OtherRunError(ValueError):
@@ -33,11 +35,19 @@ def show_cause(error: Exception) -> None:
 def told_in_a_line() -> Iterator[None]:
     """Ends a command with one line where what went wrong says so by itself, or Ctrl-C ends it.
 
+    Warnings are lines, too.
+
     Raises:
         SystemExit: with that line.
     """
+
+    def tell(message: Warning | str, *_: Any, **__: Any) -> None:
+        print(f"warning: {message}", file=sys.stderr)
+
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.showwarning = tell
+            yield
     except EXPECTED as error:
         show_cause(error)
         sys.exit(f"error: {error}")

@@ -32,7 +32,8 @@ def manual(width: int = 100) -> str:
     for group, choices in GROUPS.items():
         lines += ["", f"{group}="]
         for name, chosen, first in _by_kind(choices):
-            lines.append(f"  {name}: {_about(name, chosen, first)}")
+            about = f"  {name}: {_about(name, chosen, first)}"
+            lines.append(textwrap.fill(about, width, subsequent_indent=" " * 6))
             lines += _entries(chosen, f"{group}.", width) if chosen is first else []
         lines += [f"  {ANY_TASK}"] if group == "task" else []
     return "\n".join(lines) + "\n"

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from torchrl_l2c2.experiment.errors import OtherRunError
 from torchrl_l2c2.experiment.files import append_line, write_atomically
 from torchrl_l2c2.experiment.loggers import close_logger, make_logger
 
@@ -25,6 +26,7 @@ class MetricsLog:
     def __init__(self, folder: Path | None, *, logger: str = "csv") -> None:
         self.path = None if folder is None else folder / "metrics.csv"
         self.columns: list[str] | None = None
+        self._size = 0  # of the file, as it was left here
         self._name = logger
         self._logger = None if folder is None else make_logger(logger, folder)
 
@@ -48,14 +50,28 @@ class MetricsLog:
         if list(row) != self.columns:
             raise ValueError(f"the metrics changed from {self.columns} to {list(row)}.")
         append_line(self.path, _line(row.values()))
+        self._size = self.path.stat().st_size
         if self._logger is not None:
             for name, value in row.items():
                 self._logger.log_scalar(name, value, step=int(row["frames"]))
 
+    def check_unchanged(self) -> None:
+        """Refuses to go on where another object of this process went on meanwhile.
+
+        Raises:
+            OtherRunError: the file is not as long as it was left.
+        """
+        size = self.path.stat().st_size if self.path is not None and self.path.exists() else 0
+        if size != self._size:
+            raise OtherRunError(
+                f"{self.path} has {size} bytes, and had {self._size} when this run last wrote to "
+                "it: another Experiment went on in its folder. Make a new one, which continues "
+                "from there."
+            )
+
     def state_dict(self) -> dict[str, Any]:
         """How far the file goes."""
-        size = 0 if self.path is None or self.columns is None else self.path.stat().st_size
-        return {"columns": self.columns, "size": size}
+        return {"columns": self.columns, "size": self._size}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Cuts off what was written after the state was taken, so that no line comes twice.
@@ -77,6 +93,7 @@ class MetricsLog:
                 "folder."
             )
         os.truncate(self.path, state["size"])
+        self._size = state["size"]
 
 
 def _line(cells: Iterable[object]) -> str:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @settings
 class AdaTermConfig:
-    """The paper's optimizer, :class:`~torchrl_l2c2.AdaTerm`, at one learning rate."""
+    """The paper's optimizer, AdaTerm, at one learning rate."""
 
     linear: ClassVar[bool] = False
 

@@ -105,7 +105,8 @@ class Progress:
             f"{rows[-1]['frames_per_second']:.0f} frames/s"
         )
         self._bar.set_postfix_str(state)
-        tenth = self._done * 10 // self._total > before * 10 // self._total
+        # A last rollout may go on far beyond the end.
+        tenth = min(self._done * 10 // self._total, 10) > before * 10 // self._total
         if tenth or time.monotonic() - self._last_line > LINE_SECONDS:
             self._last_line = time.monotonic()
             line = f"{self._name}{self._unit} {self._done:g} of {self._total}: {state}"

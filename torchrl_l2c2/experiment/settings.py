@@ -137,6 +137,8 @@ def _first_problem(error: ValidationError, cls: type) -> SettingError:
     if first["type"] == "unexpected_keyword_argument":
         known = ", ".join(sorted(f.name for f in dataclasses.fields(cls)))
         return SettingError(where[0], f"is not a setting; here there are {known}.", cls.__name__)
+    if first["type"] == "missing":  # of a tuple
+        return SettingError(name, f"must have more entries, got {list(given)}.", cls.__name__)
     allowed = first["msg"].replace("Input should be", "must be", 1)
     allowed = allowed.replace("a valid tuple", "a list")
     return SettingError(name, f"{allowed}, got {given!r}.", cls.__name__)

@@ -140,7 +140,7 @@ class Experiment:
                 loss or in a parameter; names the key and the step, and the last good checkpoint.
             SimulatorError: the environment failed; names the frame and the last good checkpoint.
             OSError: the disk is full, for example; names the file and the last good checkpoint.
-            OtherRunError: fewer episodes than there are.
+            OtherRunError: fewer episodes than there are, or another Experiment went on here.
             Interrupted: a signal ended the training.
 
         Warns:
@@ -165,6 +165,7 @@ class Experiment:
         ended = self._ended(budget)
         if self.folder is not None:
             settings = replace(self.config, task=task).to_dict()
+            self._log.check_unchanged()
             begin_folder(self.folder, settings, begun=True, ended=ended)
         with self._process, bar, stop_on_signals() as signals, checkpoint_named(self.folder):
             # What goes on for longer begins at another rate than it had ended with.
@@ -200,16 +201,15 @@ class Experiment:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the rest of the run depends on, between two episodes or rollouts."""
-        learner = self.learner
         return {
             "config": json.dumps(self.config.to_dict()),
             "versions": json.dumps(versions()),
             **{name: part.state_dict() for name, part in self._parts().items()},
-            "replay": replay_state(learner.replay),
+            "replay": replay_state(self.learner.replay),
             "collector": self.player.collector.generator_state(),
             "global_rng": self._process.state_dict(),
-            "counters": [self.player.frames, learner.updates, learner.skipped_updates],
-            "unreported": learner.unreported,
+            "counters": [self.player.frames, self.learner.updates, self.learner.skipped_updates],
+            "unreported": self.learner.unreported,
             "metrics": json.dumps(self.metrics),
         }
 
@@ -246,13 +246,12 @@ class Experiment:
         Returns:
             Evaluation: give it to :meth:`finish` to have it written.
         """
-        config = self.config
         return evaluate_task(
             self.agent.policy,
-            config.task,
-            config.seed + TEST_SEED,
-            config.test_episodes if episodes is None else episodes,
-            threads=config.threads,
+            self.config.task,
+            self.config.seed + TEST_SEED,
+            self.config.test_episodes if episodes is None else episodes,
+            threads=self.config.threads,
             sampled=sampled,
             compile_policy=self._compile,
             progress=progress,
@@ -331,6 +330,7 @@ class Experiment:
         return least and self._spent(budget) >= budget.total
 
     def _record(self, episode: Episode, full: Budget, bar: Progress) -> None:
+        report = self.learner.report(episode.last_frame)  # Before tests, which blame the task.
         number = len(self.metrics) + 1
         late = full.is_late(full.spent(number, episode.last_frame), self.config.late_share)
         row = {
@@ -340,7 +340,7 @@ class Experiment:
             "skipped_updates": self.learner.skipped_updates,
             **episode.measures,
             **(self._late_tests.play(number) if late else self._late_tests.none()),
-            **self.learner.report(episode.last_frame),
+            **report,
         }
         row |= self._gain.after(row, full, ends_round=episode.ends_round)
         row["frames_per_second"] = bar.frames_per_second(self.player.frames)

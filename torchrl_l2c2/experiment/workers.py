@@ -5,10 +5,12 @@ from __future__ import annotations
 import atexit
 import os
 import signal
+import tempfile
 import weakref
 from collections.abc import Callable, Iterator
 from functools import partial
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -149,6 +151,8 @@ class MultiEpisodeCollector(_Rounds, MultiSyncCollector):
         self._at_exit = partial(_shut_down, weakref.ref(self))
         atexit.register(self._at_exit)
         self._seed = seed
+        # A worker that fails leaves its error here: TorchRL says only that one has failed.
+        self._failures = tempfile.TemporaryDirectory()
         super().__init__(
             [create_env] * num_workers,
             policy,
@@ -157,7 +161,10 @@ class MultiEpisodeCollector(_Rounds, MultiSyncCollector):
             init_random_frames=random_frames,
             exploration_type=exploration_type,
             collector_class=partial(
-                _EpisodeWorker, compiled_policy=compile_policy, keep_previous=keep_previous
+                _EpisodeWorker,
+                compiled_policy=compile_policy,
+                keep_previous=keep_previous,
+                failures=self._failures.name,
             ),
             init_fn=_leave_signals_to_parent,
             update_at_each_batch=True,
@@ -181,11 +188,11 @@ class MultiEpisodeCollector(_Rounds, MultiSyncCollector):
         try:
             self.set_seed(self._round_seed())
             episodes = next(self._rounds).unbind(0)
-        except (OSError, EOFError, ValueError) as error:
+        except (OSError, EOFError, ValueError, RuntimeError) as error:
             # Pipes and process handles of one that died fail in their own ways.
-            raise RuntimeError(
-                f"a worker process died ({type(error).__name__}: {error})."
-            ) from error
+            left = [path.read_text() for path in Path(self._failures.name).iterdir()]
+            told = left[0] if left else f"{type(error).__name__}: {error}"
+            raise RuntimeError(f"a worker process died ({told}).") from error
         self._rounds_played += 1
         return [episode.exclude("collector") for episode in episodes]
 
@@ -265,9 +272,11 @@ class _EpisodeWorker(EpisodeCollector):
         exploration_type: ExplorationType,
         compiled_policy: bool,  # TorchRL has a compile_policy of its own, by torch.compile.
         keep_previous: bool,
+        failures: str | None = None,
         **_: Any,
     ) -> None:
         torch.set_num_threads(1)
+        self._failures = failures
         super().__init__(
             create_env(),
             policy_factory(),
@@ -285,7 +294,13 @@ class _EpisodeWorker(EpisodeCollector):
     def rollout(self) -> TensorDictBase:
         # The parent sets it for a round that is to be random, all of it or nothing.
         self._random_frames_left = self.frames_per_batch if self.init_random_frames > 0 else 0
-        episode = super().rollout()
+        try:
+            episode = super().rollout()
+        except Exception as error:
+            if self._failures is not None:
+                left = Path(self._failures, str(os.getpid()))
+                left.write_text(f"{type(error).__name__}: {error}")
+            raise
         # The parent counts frames by this entry.
         return episode.set(("collector", "traj_ids"), torch.zeros(len(episode), dtype=torch.int64))
 

@@ -23,6 +23,7 @@ from torchrl_l2c2.experiment.collection import play_episodes
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.diagnosis.measured import Diagnosis, TermShare, Value, diagnose
 from torchrl_l2c2.experiment.environments import TEST_SEED, untransformed
+from torchrl_l2c2.experiment.errors import SimulatorError
 from torchrl_l2c2.experiment.export import entry_names
 from torchrl_l2c2.experiment.frames import PREVIOUS
 from torchrl_l2c2.experiment.process import ProcessState
@@ -193,7 +194,7 @@ def _pictures(folder: Path, seed: int, noise_scale: float | None, best: bool) ->
         ((_, pictures, _),) = play_pictures(
             folder, 1, seed=seed, noise_scale=noise_scale, best=best
         )
-    # The task draws none, or not without a package that is not there.
-    except (ValueError, DependencyNotInstalled):
+    # The task draws none, or not without what is not there.
+    except (ValueError, DependencyNotInstalled, SimulatorError):
         return []
     return pictures

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @settings
 class ASAPConfig(GainConfig):
-    """A rival, :class:`~torchrl_l2c2.ASAPLoss`; frames keep the observation before theirs."""
+    """A rival, ASAPLoss; frames keep the observation before theirs."""
 
     reads_previous: ClassVar[bool] = True
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @settings
 class CAPSConfig(GainConfig):
-    """The baseline, :class:`~torchrl_l2c2.CAPSLoss`."""
+    """The baseline, CAPSLoss."""
 
     name: str = "caps"
     sigma: float = Field(

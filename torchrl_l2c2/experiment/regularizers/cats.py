@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @settings
 class CATSConfig(GainConfig):
-    """A rival, :class:`~torchrl_l2c2.CATSLoss`, with its linear ramp over the training."""
+    """A rival, CATSLoss, with its linear ramp over the training."""
 
     name: str = "cats"
     gain: Literal["constant", "ramp", "gradient", "target"] = Field(

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @settings
 class GradCAPSConfig(GainConfig):
-    """A rival, :class:`~torchrl_l2c2.GradCAPSLoss`; frames keep the observation before theirs."""
+    """A rival, GradCAPSLoss; frames keep the observation before theirs."""
 
     reads_previous: ClassVar[bool] = True
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @settings
 class L2C2Config(GainConfig):
-    """The paper's method, :class:`~torchrl_l2c2.L2C2Loss`."""
+    """The paper's method, L2C2Loss."""
 
     name: str = "l2c2"
     sigma: float = Field(

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @settings
 class LCPConfig(GainConfig):
-    """A rival, :class:`~torchrl_l2c2.LCPLoss`."""
+    """A rival, LCPLoss."""
 
     name: str = "lcp"
     coeff: float = Field(default=0.002, ge=0, description="gain of the squared gradient")

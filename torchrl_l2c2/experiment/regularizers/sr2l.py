@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @settings
 class SR2LConfig(GainConfig):
-    """A rival, :class:`~torchrl_l2c2.SR2LLoss`; its update costs several others."""
+    """A rival, SR2LLoss; its update costs several others."""
 
     name: str = "sr2l"
     epsilon: float = Field(

@@ -61,7 +61,8 @@ def compare_with_paper(run: FinishedRun) -> str:
         if own is not None:
             with read_back(run.folder):
                 total, variation = ((own[f"{q}_mean"], own[f"{q}_std"]) for q in QUANTITIES)
-                what = f"{own['episodes']} test episodes, seed {run.seed}"
+                episodes = "episode" if own["episodes"] == 1 else "episodes"
+                what = f"{own['episodes']} test {episodes}, seed {run.seed}"
                 lines.append(_compared(name, total, variation, what))
     paper = run.record.paper
     if paper:
