@@ -105,8 +105,9 @@ def test_a_wrong_setting_gives_its_line(settings_of, line, message):
         ),
         (
             "task=5",
-            "task, algorithm, regularizer, replay, optimizer, logger are chosen by name (Conf",
+            "task, algorithm, regularizer, replay, optimizer, logger are each chosen by name",
         ),
+        ("~regularizer", "task, algorithm, regularizer, replay, optimizer, logger are each chosen"),
         ("seed=${oder}", "Interpolation key 'oder' not found full_key: seed"),
         ("seed=[1", "no viable alternative at input '[1'"),
     ],
@@ -119,6 +120,7 @@ def test_what_cannot_be_composed_ends_in_a_line(settings_of, monkeypatch, line, 
     said = str(ended.value)
     assert "HYDRA_FULL_ERROR" not in os.environ
     assert said.startswith(f"error: {told}") and "\n" not in said and "search path" not in said
+    assert ("in quotes" in said) is (line == "seed=[1")  # of values that Hydra cannot read
 
 
 def test_a_folder_that_hydra_cannot_make_ends_in_a_line(tmp_path):

@@ -15,7 +15,7 @@ from typing import Any
 
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
+from hydra.errors import HydraException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf.errors import OmegaConfBaseException
 
@@ -195,12 +195,16 @@ def refusal(error: Exception) -> str:
     """What Hydra, or OmegaConf, refuses, in a line; of a name that there is not what was meant."""
     if found := re.match("Could not override '([^']+)'", str(error)):
         return unknown_setting(found[1])
-    if "group override must be" in str(error):
-        return f"{', '.join(GROUPS)} are chosen by name ({error})."
+    if "group override must be" in str(error) or "${regularizer}_${algorithm}" in str(error):
+        return f"{', '.join(GROUPS)} are each chosen by name; regularizer=none has none ({error})."
     said = " ".join(str(error).partition("\nConfig search path:")[0].split())
     if found := re.search(r"Could not find '(\w+)/([^']+)'", said):
         return f"{said}{_choice_meant(*found.groups())}"
-    return f"{said}. No shell expands this ~: write $HOME." if "=~" in said else said
+    if "=~" in said:
+        return f"{said}. No shell expands this ~: write $HOME."
+    if isinstance(error, OverrideParseException):
+        return f"{said}. A value with other signs stands in quotes within quotes: 'name=\"a b\"'."
+    return said
 
 
 def _choice_meant(group: str, name: str) -> str:
