@@ -37,12 +37,13 @@ from torchrl_l2c2.experiment.checkpoints import (
     load_checkpoint,
     save_checkpoint,
 )
-from torchrl_l2c2.experiment.command import _end_logged, _warnings_logged, run
+from torchrl_l2c2.experiment.command import _end_logged, run
 from torchrl_l2c2.experiment.config import GROUPS
 from torchrl_l2c2.experiment.continuation import check_same_settings
-from torchrl_l2c2.experiment.errors import OtherRunError
+from torchrl_l2c2.experiment.errors import OtherRunError, warnings_told
 from torchrl_l2c2.experiment.files import write_json
 from torchrl_l2c2.experiment.naming import run_name
+from torchrl_l2c2.experiment.progress import say
 from torchrl_l2c2.experiment.reports import results
 from torchrl_l2c2.experiment.reports.differences import fingerprint
 from torchrl_l2c2.experiment.reports.runs import find_runs, finished_run, read_runs
@@ -555,7 +556,7 @@ def test_a_full_disk_names_the_file_and_the_last_good_checkpoint(tmp_path, monke
 
 def test_a_warning_is_a_line_in_the_log_too(tmp_path, capsys):
     """And not Python's, with a line of its source."""
-    with _warnings_logged(tmp_path):
+    with warnings_told(partial(say, tmp_path)):
         warnings.warn("hardly regularized", stacklevel=1)
     assert capsys.readouterr().err == "warning: hardly regularized\n"
     assert (tmp_path / "train.log").read_text().endswith(" warning: hardly regularized\n")

@@ -13,6 +13,7 @@ import traceback
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,7 +26,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_l2c2.experiment.composition import CONF, composing, read, register, tell_sweep, tuned
 from torchrl_l2c2.experiment.config import ExperimentConfig
-from torchrl_l2c2.experiment.errors import EXPECTED, show_cause
+from torchrl_l2c2.experiment.errors import EXPECTED, show_cause, warnings_told
 from torchrl_l2c2.experiment.progress import log, say
 from torchrl_l2c2.experiment.settings import SettingError
 from torchrl_l2c2.experiment.signals import (
@@ -217,7 +218,7 @@ def run(
     if finished is None:
         finished = _train(config, folder, values, standing)
     else:
-        with _warnings_logged(folder):
+        with warnings_told(partial(say, folder)):
             tell_past(finished.config, config.to_dict())
     if records:
         record_video(folder, video)
@@ -248,7 +249,7 @@ def _train(
     keep_freed_memory()
     going_on = {name: values[name] for name in ("resume", "allow_other_versions")}
     with (
-        _warnings_logged(folder),
+        warnings_told(partial(say, folder)),
         closing(Experiment(config, folder, **going_on)) as experiment,
         _end_logged(folder),
     ):
@@ -273,18 +274,6 @@ def _show(finished: FinishedRun) -> None:
     if not picture.exists():
         draw_learning_curves([finished], picture)
     print(f"picture: {picture}", flush=True)
-
-
-@contextmanager
-def _warnings_logged(folder: Path) -> Iterator[None]:
-    """Warnings are lines like others, above the bar and in ``train.log``."""
-
-    def tell(message: Warning | str, *_: Any, **__: Any) -> None:
-        say(folder, f"warning: {message}")
-
-    with warnings.catch_warnings():
-        warnings.showwarning = tell
-        yield
 
 
 @contextmanager

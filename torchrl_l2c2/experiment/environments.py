@@ -150,13 +150,11 @@ def _make(task: TaskConfig, render: bool) -> Env:
             return gymnasium.make(task.env_id, max_episode_steps=limit)
         try:
             env = gymnasium.make(task.env_id, max_episode_steps=limit, render_mode="rgb_array")
-            cause = None
+            draws, cause = env.render_mode in env.metadata.get("render_modes", ()), None
         except TypeError as error:  # It knows of no render_mode at all.
-            cause = error
-    if cause is not None:
+            draws, cause = False, error
+    if not draws:
         raise _draws_nothing(task) from cause
-    if env.render_mode != "rgb_array" or "rgb_array" not in env.metadata.get("render_modes", ()):
-        raise _draws_nothing(task)
     return env
 
 

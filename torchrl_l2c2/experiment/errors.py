@@ -6,8 +6,9 @@ import signal
 import sys
 import traceback
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 
@@ -32,6 +33,22 @@ def show_cause(error: Exception) -> None:
 
 
 @contextmanager
+def warnings_told(tell: Callable[[str], Any]) -> Iterator[None]:
+    """Warnings are lines like others, without where in the program they come from.
+
+    Args:
+        tell (callable): what a line is given to.
+    """
+
+    def show(message: Warning | str, *_: Any, **__: Any) -> None:
+        tell(f"warning: {message}")
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield
+
+
+@contextmanager
 def told_in_a_line() -> Iterator[None]:
     """Ends a command with one line where what went wrong says so by itself, or Ctrl-C ends it.
 
@@ -40,13 +57,8 @@ def told_in_a_line() -> Iterator[None]:
     Raises:
         SystemExit: with that line.
     """
-
-    def tell(message: Warning | str, *_: Any, **__: Any) -> None:
-        print(f"warning: {message}", file=sys.stderr)
-
     try:
-        with warnings.catch_warnings():
-            warnings.showwarning = tell
+        with warnings_told(partial(print, file=sys.stderr)):
             yield
     except EXPECTED as error:
         show_cause(error)

@@ -47,6 +47,7 @@ class MetricsLog:
         if self.columns is None:
             self.columns = list(row)
             write_atomically(self.path, _line(self.columns).encode())
+            self._size = self.path.stat().st_size
         if list(row) != self.columns:
             raise ValueError(f"the metrics changed from {self.columns} to {list(row)}.")
         append_line(self.path, _line(row.values()))
