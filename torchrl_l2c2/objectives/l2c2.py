@@ -193,8 +193,8 @@ class L2C2Loss(RegularizedLoss):
         self._l2c2_policies, self._l2c2_values = policies, values
         self.register_coefficient("l2c2_coeff", coeff)
         self.register_coefficient("l2c2_beta", beta, used=bool(values))
-        how = (policy_distance, hellinger_samples) != ("hellinger", None)
-        _check_terms(type(base_loss).__name__, policies, values, beta, how)
+        own = (policy_distance, hellinger_samples) != ("hellinger", None)
+        _check_terms(type(base_loss).__name__, policies, values, beta, own)
         self.declare_networks([*policies, *values])
         read = {name: self._evaluation.wiring[name].states for name in [*policies, *values]}
         self.l2c2_moved_keys = None if moved_keys is None else read_moved_keys(moved_keys, read)
@@ -326,14 +326,14 @@ def _value_term(network: str) -> str:
     return "loss_l2c2_" + network.removesuffix("_network")
 
 
-def _check_terms(loss: str, policies: list[str], values: list[str], beta: float, how: bool) -> None:
+def _check_terms(loss: str, policies: list[str], values: list[str], beta: float, own: bool) -> None:
     if not (policies or values):
         what = "trained value function" if beta else "value function to regularize, with beta=0,"
         raise TypeError(
             f"L2C2Loss finds nothing to regularize: {loss} has no actor_network, and no {what} "
             f"among {', '.join(VALUE_NETWORKS)}."
         )
-    if not policies and how:
+    if not policies and own:
         usual = "policy_distance='hellinger' and hellinger_samples=None"
         raise TypeError(f"{loss} has no policy to compare: leave {usual}.")
     if not policies:

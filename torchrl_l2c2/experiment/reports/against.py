@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from torchrl_l2c2.experiment.reports.comparison import improvement, probability
+from torchrl_l2c2.experiment.reports.comparison import READING, improvement, probability
 from torchrl_l2c2.experiment.reports.field import FIELD_MEASURES, field_groups
 from torchrl_l2c2.experiment.reports.groups import Group
 from torchrl_l2c2.experiment.reports.records import Record
@@ -13,8 +13,7 @@ from torchrl_l2c2.experiment.reports.tables import Table, number, number_range, 
 LEGEND = (
     "Means over seeds of the last policy's test episodes, with its mean actions. P: the "
     "probability that a run of {name} is better than a run of the other method (all pairs of "
-    "runs, ties count half), with its 95% interval of the stratified bootstrap; an interval that "
-    "contains .50 does not separate the two."
+    "runs, ties count half), with its 95% interval of the stratified bootstrap."
 )
 
 
@@ -45,7 +44,8 @@ def against_table(records: Sequence[Record], name: str) -> Table:
     for quantity, better in zip(FIELD_MEASURES, ("returns more", *["smoother"] * 2), strict=True):
         columns += [FIELD_MEASURES[quantity], "the other's", f"P({better})"]
     title = f"{name} against each other method"
-    return Table(title, columns, [_row(*pair) for pair in pairs], [LEGEND.format(name=name)])
+    legend = f"{LEGEND.format(name=name)} {READING}"
+    return Table(title, columns, [_row(*pair) for pair in pairs], [legend])
 
 
 def _row(ours: Group, theirs: Group) -> list[str]:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchrl_l2c2.experiment.reports.comparison import improvement, probability
+from torchrl_l2c2.experiment.reports.comparison import READING, improvement, probability
 from torchrl_l2c2.experiment.reports.field import BETTER, field_groups
 from torchrl_l2c2.experiment.reports.groups import Group, baseline_of, over_tasks
 from torchrl_l2c2.experiment.reports.records import Record
@@ -20,7 +20,7 @@ LEGEND = (
     "over seeds, relative to the size of vanilla's, averaged over tasks. Sm: the ratio of the "
     "means over seeds, geometric mean over tasks; 1 is no smoother. P: the probability that a "
     "run is better than a run of vanilla (all pairs of runs, ties count half), averaged over "
-    "tasks."
+    f"tasks. {READING}"
 )
 
 

@@ -22,6 +22,10 @@ from torchrl_l2c2.experiment.reports.statistics import (
 )
 from torchrl_l2c2.experiment.reports.tables import Table, number, number_range
 
+READING = (
+    "An interval that contains .50 does not separate the two; one without a width says that all "
+    "pairs agree, not that chance is ruled out."
+)
 # What is better: a larger return, a smaller action variation.
 SIGNS = {"return": 1.0, "action_variation": -1.0}
 
@@ -121,7 +125,7 @@ def statistics_table(test: str, groups: Sequence[Group]) -> Table:
     notes = [
         "95% intervals of the stratified bootstrap in brackets (Agarwal et al. 2021). P: the "
         "probability that a run is better than a run of vanilla with the same other settings "
-        "(ties count half)."
+        f"(ties count half). {READING}"
     ]
     return Table(f"Statistics: {TESTS[test]}", columns, rows, notes)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from torchrl_l2c2.experiment.reports.comparison import improvement, probability
+from torchrl_l2c2.experiment.reports.comparison import READING, improvement, probability
 from torchrl_l2c2.experiment.reports.groups import Group, group_records
 from torchrl_l2c2.experiment.reports.paper import FASTER, FASTER_RETURNS, PAPER, TAU, is_of_paper
 from torchrl_l2c2.experiment.reports.paper_table import FIRST, SECOND
@@ -16,7 +16,7 @@ LEGEND = (
     "Means over seeds, standard deviations in brackets, of the late policies with sampled "
     "actions, and of the last policy; for tau .5 the paper has the returns alone. P: the "
     "probability that a run of L2C2 returns more than a run without the value term (beta=0) at "
-    "the same tau (ties count half), with its 95% interval of the stratified bootstrap."
+    "the same tau (ties count half), with its 95% interval of the stratified bootstrap. " + READING
 )
 
 

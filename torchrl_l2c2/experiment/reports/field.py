@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from torchrl_l2c2.experiment.reports.comparison import (
+    READING,
     Estimate,
     estimate_cell,
     improvement,
@@ -65,7 +66,8 @@ LEGEND = (
     "of the bootstrap over seeds in brackets. Sm as in the published table: `(2 / N) sum_i f_i "
     "|FFT_i|` at one action per unit of time, averaged over the action's dimensions; unlike the "
     "action variation it grows with the length N of an episode. P: the probability that a run is "
-    "better than a run of vanilla with the same other settings (ties count half). Published: "
+    "better than a run of vanilla with the same other settings (ties count half). "
+    f"{READING} Published: "
     "CATS (arXiv 2610.07910), ten seeds by ten episodes; its L2C2 is that of ASAP's code, which "
     "does not follow the paper's equations."
 )

@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any
 
-from torchrl_l2c2.experiment.reports.comparison import improvement, probability
+from torchrl_l2c2.experiment.reports.comparison import READING, improvement, probability
 from torchrl_l2c2.experiment.reports.field import BETTER, field_groups
 from torchrl_l2c2.experiment.reports.groups import Group, over_tasks
 from torchrl_l2c2.experiment.reports.records import Record
@@ -16,7 +16,7 @@ MOST = 12  # Methods of a table: more are what a search tried, and are told by t
 LEGEND = (
     "The probability that a run of the row is better than a run of the column (all pairs of runs "
     "on a task, ties count half), averaged over tasks; 95% intervals of the stratified bootstrap "
-    "in brackets. An interval that contains .50 does not separate the two."
+    f"in brackets. {READING}"
 )
 
 

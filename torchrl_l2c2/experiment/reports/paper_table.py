@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from torchrl_l2c2.experiment.reports.comparison import (
+    READING,
     improvement,
     improvements_over_tasks,
     probability,
@@ -21,9 +22,9 @@ LEGEND = (
     "last tenth or late_share); † marks means further from the paper's than the paper's "
     "deviation. P is of the same: the probability that a run is better than a run of vanilla "
     "with the same other settings (ties count half), with its 95% interval of the stratified "
-    "bootstrap; over several tasks it is the mean of theirs. The policy scale is that of the "
-    "late policies: the Hellinger distance is relative to it, so that a wider policy may change "
-    "more."
+    f"bootstrap; over several tasks it is the mean of theirs. {READING} The "
+    "policy scale is that of the late policies: the Hellinger distance is relative to it, so that "
+    "a wider policy may change more."
 )
 DEPLOYED_LEGEND = (
     "The same runs with mean actions, as a trained policy is used: the late policies in a test "
