@@ -1339,7 +1339,7 @@ HEADLINE = {
     "PPO-RPE, Reacher, as in the paper": ("runs", "L2C2", "4500 episodes", "last_mean"),
     "PPO-RPE, Swingup, as in the paper": ("runs", "L2C2", "350 episodes", "last_mean"),
     "PPO-RPE, Swingup, with a target": (
-        *("runs", "L2C2, means, target 0.045", "300 episodes", "late_sampled"),
+        *("runs", "L2C2, means, target 0.045", "350 episodes", "last_mean"),
     ),
 }
 MEASURED = {"sm_asap": "Sm", "action_variation": "action variation"}
