@@ -308,6 +308,27 @@ class TestSeveralWorkers:
             collector.rollout()
 
 
+class LosesAJoint(gymnasium.Wrapper):
+    """An environment whose simulator fails in its first step."""
+
+    def step(self, action):
+        raise KeyError("joint_7")
+
+
+def make_failing_env():
+    """As a worker makes it; a function of a module, which pickle finds."""
+    return GymWrapper(LosesAJoint(gymnasium.make("Pendulum-v1")))
+
+
+def test_what_failed_in_a_worker_is_told():
+    """TorchRL has ended the processes by then, and says only that one has failed."""
+    actor = make_actor(3, make_failing_env().action_spec)
+    collector = MultiEpisodeCollector(make_failing_env, actor, num_workers=1, max_steps=5)
+    with pytest.raises(RuntimeError, match=r"a worker process died \(KeyError: 'joint_7'\)"):
+        collector.rollout()
+    collector.shutdown()
+
+
 @pytest.mark.slow
 def test_a_script_that_leaves_its_workers_running_ends(tmp_path):
     """They are ended with it, also where nobody closed the experiment."""

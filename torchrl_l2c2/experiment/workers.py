@@ -181,7 +181,6 @@ class MultiEpisodeCollector(_Rounds, MultiSyncCollector):
         # Left to their __del__ they would start a thread where Python ends, and wait for it.
         for scheme in (getattr(self, "_weight_sync_schemes", None) or {}).values():
             scheme.shutdown()
-        self._failures.cleanup()
 
     def rollout(self) -> list[TensorDictBase]:
         """One episode of every process, as :meth:`EpisodeCollector.rollout` gives them."""
