@@ -5,7 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 from small import ALGORITHMS, env_id_of, replay_of
+from tensordict import TensorDict
+from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.utils._python_dispatch import TorchDispatchMode
 
+from torchrl_l2c2 import Neighborhood
 from torchrl_l2c2.experiment import (
     AdamConfig,
     Experiment,
@@ -13,6 +17,9 @@ from torchrl_l2c2.experiment import (
     TaskConfig,
 )
 from torchrl_l2c2.experiment.settings import SettingError
+from torchrl_l2c2.optim.adaterm import adaterm
+from torchrl_l2c2.transforms.neighbors import draw_neighbors
+from torchrl_l2c2.updaters import t_soft_update
 
 CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 
@@ -68,6 +75,45 @@ def test_a_device_that_is_not_there_is_refused():
         Experiment(config("sac", device="cuda:99"))
     with pytest.raises(SettingError, match=r"device .*got 'gpu'"):
         config("sac", device="gpu")
+
+
+class CopiesToDevices(TorchDispatchMode):
+    """Keeps what makes a tensor on a device of one on the CPU: the CPU waits for each."""
+
+    def __init__(self):
+        super().__init__()
+        self.found = []
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        result = function(*args, **(kwargs or {}))
+        given = [arg for arg in args if isinstance(arg, torch.Tensor)]
+        if isinstance(result, torch.Tensor) and result.is_cuda:
+            self.found += [function for each in given if not each.is_cuda and each.ndim]
+        return result
+
+
+def soft_update(make):
+    t_soft_update([make(3), make(4, 2)], [make(3), make(4, 2)], make(2), make(2), tau=0.1, nu=1.0)
+
+
+def optimize(make):
+    pairs = [[make(3), make(4, 2)] for _ in range(4)]
+    adaterm(*pairs, [make(), make()], [make(), make()], lr=1e-3, beta=0.9, eps=1e-5, nu_min=1.0)
+
+
+def draw(make):
+    states = {"observation": make(5, 3), "next": {"observation": make(5, 3)}}
+    draw_neighbors(TensorDict(states, [5]), Neighborhood(), ["observation"])
+
+
+@pytest.mark.parametrize("step", [soft_update, optimize, draw])
+def test_nothing_of_an_update_is_copied_to_the_device(step):
+    """Such a copy holds both up, and no CUDA graph can be captured around it."""
+    with FakeTensorMode(allow_non_fake_inputs=True), CopiesToDevices() as copies:
+        torch.ones(3).to("cuda")
+        assert len(copies.found) == 1
+        step(lambda *shape: torch.empty(shape, device="cuda"))
+    assert len(copies.found) == 1, copies.found
 
 
 @CUDA

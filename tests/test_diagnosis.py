@@ -190,8 +190,8 @@ class TestWords:
             in said(made_up(shares={**own, "l2c2_actor": faint}), "faint").text
         )
         assert "faint" not in kinds(made_up(shares={**own, "l2c2_actor": strong}))
-        by_size = said(made_up(shares={**own, "caps": TermShare(True, 1e-3)}), "faint")
-        assert "caps 0.1% of the loss" in by_size.text and by_size.fault
+        by_size = said(made_up(shares={**own, "caps": TermShare(True, 5e-4)}), "faint")
+        assert "caps 0.05% of the loss" in by_size.text and by_size.fault
         both = said(made_up(shares={"a": faint, "b": strong}), "faint")
         assert both.text.startswith("Some") and not both.fault
 

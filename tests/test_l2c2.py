@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import warnings
+from functools import partial
 
 import pytest
 import torch
@@ -454,15 +455,56 @@ class TestNeighbors:
         for name in loss.added_terms:
             torch.testing.assert_close(terms[1][name], terms[0][name])
 
-    def test_neighbors_that_are_drawn_here_train_no_encoder(self):
-        """Nor do those of a transform: no gradient reaches what made the observations."""
+    @pytest.mark.parametrize("written", [False, True])
+    def test_neighbors_train_no_encoder(self, written):
+        """Drawn here or by a transform: no gradient reaches what made the observations."""
         loss, batch = L2C2Loss(DDPGLoss(deterministic_actor(), qvalue())), transitions(8)
         seen = [batch["observation"], batch["next", "observation"]]
         for each in seen:
             each.requires_grad_()
+        if written:
+            NeighborTransform(Neighborhood())(batch)
+            assert batch["neighbor", "observation"].requires_grad
         for regularizer in (loss.policy_regularizer, loss.value_regularizer):
             total = sum(t for k, t in regularizer(batch).items() if k.startswith("loss_"))
             assert torch.autograd.grad(total, seen, allow_unused=True) == (None, None)
+
+    def test_around_a_loss_whose_evaluations_it_shares_it_trains_no_encoder_either(self):
+        """PPO-RPE itself does; its evaluations are then not the regularizer's."""
+        torch.manual_seed(0)
+        loss, batch = L2C2Loss(PPORPELoss(gaussian_actor(), critic())), on_policy(8)
+        batch["observation"].requires_grad_()
+        terms = loss(batch)
+        for key in terms.keys():
+            if key.startswith("loss_"):
+                (found,) = torch.autograd.grad(
+                    terms[key], [batch["observation"]], retain_graph=True, allow_unused=True
+                )
+                assert (found is None) == ("l2c2" in key)
+
+    @pytest.mark.parametrize(("offset", "scale"), [(-100.0, 1.0), (0.0, 3.0)])
+    @pytest.mark.parametrize("fraction", [1.0, 0.5])
+    def test_neighbors_of_observations_that_changed_since_are_told(self, offset, scale, fraction):
+        """A normalization after NeighborTransform; once, and not of what is as it was."""
+        torch.manual_seed(0)
+        batch = transitions(64)
+        batch["observation"] += 100.0  # Where rounding is as large as it gets here.
+        batch["next", "observation"] = batch["observation"] + 0.01 * torch.randn(64, OBSERVATION)
+        NeighborTransform(NEAR)(batch)
+        base = DDPGLoss(deterministic_actor(), qvalue(), delay_value=False)
+        make = partial(L2C2Loss, base, NEAR, fraction=fraction)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            make()(batch)
+        normalized = batch.clone()
+        for key in ("observation", ("next", "observation")):
+            normalized[key] = scale * (normalized[key] + offset)
+        loss = make()
+        with pytest.warns(UserWarning, match="of 'observation' .* a transform has changed it"):
+            loss(normalized)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            loss(normalized)
 
     def test_neighbors_are_drawn_as_often_as_asked(self):
         """More samples leave the mean as it is and make it less noisy."""

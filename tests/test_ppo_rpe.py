@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
+from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.modules import IndependentNormal, NormalParamExtractor, ProbabilisticActor
 
 from torchrl_l2c2 import (
@@ -246,9 +247,10 @@ def test_extreme_ratios_stay_finite():
     assert all(p.grad.isfinite().all() for p in loss.parameters())
 
 
-def test_gradients_reach_only_the_network_of_each_term_and_never_the_targets():
+@pytest.mark.parametrize("baseline", ["stored", "target"])
+def test_gradients_reach_only_the_network_of_each_term_and_never_the_targets(baseline):
     """The actor's loss trains the actor, the critic's the critic."""
-    loss = make_loss()
+    loss = make_loss(baseline=baseline)
     for term, trained in (("loss_actor", "actor"), ("loss_critic", "critic")):
         loss.zero_grad()
         loss(make_batch(loss, [1.4, 0.6], [0.3, -0.7]))[term].backward()
@@ -311,12 +313,56 @@ def test_dispatch_takes_keyword_arguments():
     torch.testing.assert_close(outputs[0], loss(batch)["loss_actor"])
 
 
-def test_a_batch_without_the_likelihood_of_its_actions_is_told():
+@pytest.mark.parametrize(
+    ("key", "told"),
+    [("action_log_prob", "keep it, or take baseline='target'."), ("action", "keep it.")],
+)
+def test_a_batch_without_what_was_done_is_told(key, told):
     """Which entry it lacks."""
     loss = make_loss()
-    batch = make_batch(loss, [1.2], [0.3]).exclude("action_log_prob")
-    with pytest.raises(KeyError, match=r"no 'action_log_prob': keep it, or take baseline='target'"):
+    batch = make_batch(loss, [1.2], [0.3]).exclude(key)
+    with pytest.raises(KeyError, match=rf"no '{key}': {told}"):
         loss(batch)
+
+
+@pytest.mark.parametrize("baseline", ["stored", "target"])
+def test_a_rollout_that_keeps_gradients_is_learned_from_all_the_same(baseline):
+    """As TorchRL's ``rollout`` does: those of the ratio's two sides would cancel."""
+    torch.manual_seed(0)
+    loss = PPORPELoss(make_actor(3, 2), make_critic(3), baseline=baseline)
+    TSoftUpdate(loss)
+    _, batch = paper_loss_and_batch()
+    with set_exploration_type(ExplorationType.RANDOM):
+        batch = loss.actor_network(batch.exclude("action", "action_log_prob"))
+    assert batch["action"].requires_grad and batch["action_log_prob"].requires_grad
+    loss.eval()  # The threshold stays.
+    weights = list(loss.actor_network_params.values(True, True))
+    found, expected = (
+        torch.autograd.grad(loss(each)["loss_actor"], weights, retain_graph=True)
+        for each in (batch, batch.detach())
+    )
+    assert all(gradient.abs().sum() > 0 for gradient in expected)
+    torch.testing.assert_close(found, expected)
+
+
+def test_weights_of_shape_b_1_are_those_of_shape_b():
+    """They would be spread over every pair of transitions."""
+    loss, batch = paper_loss_and_batch()
+    expected = loss.eval()(batch.clone())
+    batch["priority_weight"] = batch["priority_weight"].unsqueeze(-1)
+    found = loss(batch)
+    for key in ("loss_actor", "loss_critic"):
+        torch.testing.assert_close(found[key], expected[key])
+
+
+def test_the_threshold_adapts_in_training_alone():
+    """A validation loss leaves no trace."""
+    loss, batch = paper_loss_and_batch()
+    before = loss.delta.clone()
+    loss.eval()(batch.clone())
+    assert torch.equal(loss.delta, before)
+    loss.train()(batch.clone())
+    assert loss.delta > before
 
 
 def test_renamed_keys_are_read():

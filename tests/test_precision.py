@@ -13,7 +13,7 @@ from tests.losses import (
     on_policy,
     qvalue,
 )
-from torchrl_l2c2 import ASAPLoss, CATSLoss, L2C2Loss, LCPLoss, PPORPELoss
+from torchrl_l2c2 import ASAPLoss, CATSLoss, L2C2Loss, LCPLoss, PPORPELoss, SR2LLoss
 from torchrl_l2c2.objectives import evaluation
 
 
@@ -79,6 +79,15 @@ def test_what_is_a_copy_of_the_policy_predicts_it_under_autocast_too(batch):
     added, *_ = evaluate(ASAPLoss(ppo(), previous_key="previous_observation"), batch, autocast=True)
     for kind in ("spatial", "temporal"):
         assert added[f"loss_asap_{kind}"].item() == 0.0
+
+
+@pytest.mark.parametrize("kind", [LCPLoss, SR2LLoss])
+def test_gradients_that_a_term_is_made_of_are_in_full_precision(kind, batch):
+    """The penalty is one of gradients, or the state is found by them."""
+    loss = kind(ppo())
+    added, *_ = evaluate(loss, batch, autocast=False)
+    found, *_ = evaluate(loss, batch, autocast=True)
+    torch.testing.assert_close(found, added, rtol=1e-5, atol=0.0)
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])

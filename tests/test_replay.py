@@ -43,6 +43,9 @@ CASES = {
     "prioritized": PAPER,
     "without neighbors": replace(PAPER, regularizer=NoRegularizerConfig()),
     "several neighbors": replace(PAPER, regularizer=L2C2Config(num_samples=3)),
+    "largest of several": replace(
+        PAPER, regularizer=L2C2Config(num_samples=3, over_neighbors="max", fraction=0.5)
+    ),
     "uniform": replace(PAPER, replay=UniformReplayConfig(capacity=50, batch_size=8)),
     "rollout": replace(
         PAPER,
@@ -149,7 +152,15 @@ def test_where_a_transition_lies_says_nothing_of_its_neighbor(name):
 
 @pytest.mark.skipif(not compiler_available(), reason="no C++ compiler")
 # The others with Adam take as long.
-@pytest.mark.parametrize("name", ["prioritized", pytest.param("sac", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "prioritized",
+        # Of its graph inductor made no program.
+        pytest.param("largest of several", marks=pytest.mark.slow),
+        pytest.param("sac", marks=pytest.mark.slow),
+    ],
+)
 def test_compiled_it_learns_the_same_and_follows_what_may_change(name):
     """Gain, learning rate, a policy left out, and an older state, loaded over its tensors."""
     seen = []

@@ -25,6 +25,7 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.data import Bounded
 from torchrl.envs import CatFrames, GymEnv, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import (
     Actor,
     AdditiveGaussianModule,
@@ -33,7 +34,7 @@ from torchrl.modules import (
     ProbabilisticActor,
     TanhDelta,
 )
-from torchrl.objectives import BCLoss, DDPGLoss, DQNLoss, PPOLoss
+from torchrl.objectives import BCLoss, DDPGLoss, DQNLoss, PPOLoss, SACLoss
 
 from torchrl_l2c2 import ASAPLoss, CAPSLoss, CATSLoss, GradCAPSLoss, L2C2Loss, LCPLoss, SR2LLoss
 from torchrl_l2c2.experiment import (
@@ -563,6 +564,26 @@ class TestLCP:
         expected = (error @ WEIGHT / 0.5**2).square().sum(-1).mean()
         found = LCPLoss(linear_normal(), 0.002).policy_regularizer(batch)["loss_lcp"]
         torch.testing.assert_close(found, 0.002 * expected)
+
+    def test_actions_that_hang_on_the_policy_are_what_was_done(self):
+        """A rollout that keeps gradients trains the policy as one that does not."""
+        torch.manual_seed(0)
+        actor = gaussian_actor()
+        loss, batch = LCPLoss(SACLoss(actor, qvalue(), target_entropy=-2.0)), transitions(8)
+        with set_exploration_type(ExplorationType.RANDOM):
+            batch.update(actor(batch.select("observation")).select("action"))
+        assert batch["action"].requires_grad
+        weights = [p for p in loss.actor_network_params.values(True, True) if p.requires_grad]
+        found, expected = (
+            torch.autograd.grad(
+                loss.policy_regularizer(each)["loss_lcp"],
+                weights,
+                allow_unused=True,
+                retain_graph=True,
+            )
+            for each in (batch, batch.detach())
+        )
+        torch.testing.assert_close(found, expected)
 
     @pytest.mark.parametrize("regularizer", [LCPLoss, lambda base: SR2LLoss(base, steps=1)])
     def test_successors_do_not_matter(self, regularizer):

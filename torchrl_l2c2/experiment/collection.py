@@ -52,7 +52,7 @@ class EpisodeCollector(Collector):
             What is written into its parameters is followed; a parameter or a setting that is
             replaced after the first frame is overlooked. Default ``False``.
         random_frames (int): first frames whose actions are drawn from the action's bounds
-            instead. Default 0.
+            instead; their log-likelihood stays that of the policy's own. Default 0.
         exploration_type (ExplorationType): default ``RANDOM``.
         keep_previous (bool): whether frames have the observation before theirs as well, as
             ``"previous_observation"``; in an episode's first it is their own. Default ``False``.

@@ -206,7 +206,8 @@ def _compile(
     try:
         with torch.no_grad(), tracing(TracingContext(mode)), inductor_config.patch(options):
             program: Any = compile_fx(module, inputs)
-    except RuntimeError as error:
+    # Of any kind: inductor's own mistakes are such as any program makes.
+    except Exception as error:
         raise CompilerError(_failure(str(error).splitlines())) from error
     return program
 

@@ -142,10 +142,12 @@ class EvaluatedNetworks:
     ) -> TensorDictBase:
         """Evaluates a network as the loss does, and keeps the result for the forward pass.
 
-        Compiled, small batches are evaluated together with the other states, where these are known
-        by now: that differs by rounding, and so it is left to where compiling does anyway.
+        Not of inputs that hang on an encoder, which a regularizer does not train. Compiled, small
+        batches are evaluated together with the other states, where these are known by now: that
+        differs by rounding, and so it is left to where compiling does anyway.
         """
-        if self.forward_pass is None:
+        wiring = self.wiring.get(network)
+        if self.forward_pass is None or wiring is None or _requires_grad(tensordict, wiring.inputs):
             return evaluate(network, tensordict)
         states = None
         alone = not is_compiling() or autocast_at(tensordict)
@@ -173,11 +175,8 @@ class EvaluatedNetworks:
         return policy
 
     def _fits_one_pass(self, network: str, tensordict: TensorDictBase) -> bool:
-        wiring = self.wiring.get(network)
-        if wiring is None or wiring.trunk or wiring.has_buffers or not wiring.rowwise:
-            return False
-        inputs = tensordict.select(*wiring.inputs, strict=False).values(True, True)
-        if any(value.requires_grad for value in inputs):
+        wiring = self.wiring[network]
+        if wiring.trunk or wiring.has_buffers or not wiring.rowwise:
             return False
         return tensordict.ndim == 1 and tensordict.numel() <= ONE_PASS_STATES
 
@@ -255,6 +254,11 @@ class EvaluatedNetworks:
                 randomness=loss.vmap_randomness,
                 pseudo_vmap=getattr(loss, "deactivate_vmap", False),
             )(rows, params)
+
+
+def _requires_grad(tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> bool:
+    inputs = tensordict.select(*keys, strict=False).values(True, True)
+    return any(value.requires_grad for value in inputs)
 
 
 def is_ensemble(loss: LossModule, network: str) -> bool:

@@ -23,6 +23,7 @@ from torchrl_l2c2.objectives.neighbors import (
     l2c2_penalty,
     read_moved_keys,
     read_neighbors,
+    warn_of_far,
     warn_of_other_neighbors,
     warn_of_unmoved,
 )
@@ -69,16 +70,15 @@ class L2C2Loss(RegularizedLoss):
     Neighbors are read from the batch where :class:`~torchrl_l2c2.NeighborTransform` has written
     them (give it the same neighborhood, ``num_samples`` and observations; a difference is told
     once, as a warning), and otherwise drawn from the observations and next observations with
-    torch's global generator. Drawn here, those floating-point inputs of the
-    regularized networks are moved that have a successor in the batch, or ``moved_keys``, and the
-    distance is the largest of theirs.
+    torch's global generator. Drawn here, those floating-point inputs of the regularized networks
+    are moved that have a successor in the batch, or ``moved_keys``; the distance is their largest.
 
     ``forward`` adds these entries to the loss's own:
 
     * ``loss_l2c2_actor``, the policy term, and one value term for each value function, named after
       its network: ``loss_l2c2_critic``, ``loss_l2c2_qvalue``, ``loss_l2c2_value``, ...
-    * ``l2c2_distance``, the mean :math:`d`, and ``l2c2_gain``, the mean gain applied,
-      :math:`\lambda_\pi / d`;
+    * ``l2c2_distance``, the mean :math:`d`, and ``l2c2_gain``, the mean gain
+      :math:`\lambda_\pi / d`, both 0 of a transition that ``max_step`` leaves out;
     * the mean :math:`d_\pi`, named after the distance: ``l2c2_hellinger``,
       ``l2c2_mean_distance``, ``l2c2_mse``, ``l2c2_kl``, ``l2c2_policy_distance`` for a function of
       one's own, ``l2c2_action_distance`` for deterministic policies;
@@ -101,16 +101,14 @@ class L2C2Loss(RegularizedLoss):
             gradients. Scheduled as ``l2c2_coeff``. Defaults to ``1.0``.
         num_samples (int): neighbors per state, drawn here or by the transform, at least 1. More
             give a less noisy estimate at so many times the network evaluations. Defaults to ``1``.
-        over_neighbors (str): ``"mean"``, the paper's, or ``"max"``: the neighbor with the largest
-            penalty alone, an adversary that is as strong as there are neighbors to choose from.
-            Larger at the same gain. Defaults to ``"mean"``.
+        over_neighbors (str): ``"mean"``, the paper's, or ``"max"``: the largest penalty alone, an
+            adversary of ``num_samples`` choices, larger at the same gain. Defaults to ``"mean"``.
         fraction (float): share of the batch, in (0, 1], whose states have neighbors, drawn anew
             each time with torch's global generator. Smaller ones cost less, pay in large batches,
             and are noisier; the terms' expectation stays: a drawn transition counts
             ``1 / fraction`` times and the others 0, also with ``reduction="none"``. Defaults to 1.
         moved_keys (str or sequence of NestedKey, optional): which observations neighbors drawn here
-            differ in, such as those that carry noise; the networks read them. Defaults to
-            ``None``, all that can.
+            differ in, such as those that carry noise. Defaults to ``None``, all that can.
         policy_distance (str or callable): :math:`d_\pi`. ``"hellinger"``, the paper's, is in [0, 1]
             and relative to how wide the policies are; ``"mean"``
             (:func:`~torchrl_l2c2.policy_distances.mean_distance`) is neither; nor is ``"mse"``
@@ -292,8 +290,10 @@ class L2C2Loss(RegularizedLoss):
         states, distance, drawn = read_neighbors(neighbor, self.l2c2_neighbor_key)
         if drawn is not None and not (self._l2c2_compared or torch.compiler.is_compiling()):
             # Of the first transition; a batch may be a single one, with no dimension.
-            first = drawn.unsqueeze(-1).flatten(1)[:, :1]
-            self._compare(first.flatten().tolist(), len(distance))
+            numbers = drawn.unsqueeze(-1).flatten(1)[:, :1].flatten().tolist()
+            self._compare(numbers, len(distance))
+            batch = tensordict if rows is None else at_rows(tensordict, rows)
+            warn_of_far(states, batch, max([self.l2c2_neighborhood.sigma, *numbers[:1]]))
             if self.l2c2_moved_keys is None:
                 warn_of_unmoved(states, tensordict, self._evaluation.wiring.values())
         check_moved(states, self.l2c2_moved_keys)

@@ -11,6 +11,7 @@ from torchrl.objectives import LossModule
 
 from torchrl_l2c2._checks import check_takes_gradients
 from torchrl_l2c2.distances import log_prob_of
+from torchrl_l2c2.objectives.precision import in_full_precision
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
 from torchrl_l2c2.objectives.wiring import POLICY_NETWORK
 
@@ -72,13 +73,14 @@ class LCPLoss(RegularizedLoss):
             others = TensorDict(states, batch_size=[1, *tensordict.batch_size])
             policy = self.policy_at(tensordict, others)
             assert isinstance(policy, Distribution)
-            actions = tensordict.unsqueeze(0)
+            actions = tensordict.detach().unsqueeze(0)
             if not isinstance(policy, CompositeDistribution):
                 # Of a loss that does not name it, what the policy writes.
                 written = self._evaluation.wiring[POLICY_NETWORK].output
                 actions = actions.get(getattr(self.tensor_keys, "action", written))
             log_prob = log_prob_of(policy, actions)
-            term = lcp_term(log_prob, list(states.values()), tensordict.batch_dims + 1)
+            with in_full_precision(tensordict):
+                term = lcp_term(log_prob, list(states.values()), tensordict.batch_dims + 1)
         term = self.reduce_term(term.squeeze(0), tensordict)
         return terms.set("loss_lcp", self.scaled(term, "lcp_coeff"))
 

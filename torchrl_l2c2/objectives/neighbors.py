@@ -95,7 +95,7 @@ def read_neighbors(
             "another neighbor_key."
         )
     entries = {
-        key: value.movedim(neighbor.batch_dims, 0)
+        key: value.detach().movedim(neighbor.batch_dims, 0)
         for key, value in neighbor.items(include_nested=True, leaves_only=True)
     }
     if "distance" not in entries:
@@ -186,6 +186,32 @@ def warn_of_unmoved(
         )
 
 
+def warn_of_far(neighbors: TensorDictBase, tensordict: TensorDictBase, sigma: float) -> None:
+    """Says where neighbors lie outside the box of their transition, as before a normalization.
+
+    Args:
+        neighbors (TensorDictBase): the states, ``[K, *B]``.
+        tensordict (TensorDictBase): the batch, ``[*B]``.
+        sigma (float): that of the neighborhood that they are drawn in.
+
+    Warns:
+        UserWarning: at least one does.
+    """
+    for key, near in neighbors.items(include_nested=True, leaves_only=True):
+        here, there = tensordict.get(key, None), tensordict.get(next_key(key), None)
+        if here is None or there is None:
+            continue
+        # A little more, for the numbers are rounded.
+        rounding = 10.0 * torch.finfo(near.dtype).eps * torch.maximum(here.abs(), there.abs())
+        if ((near - here).abs() > 1.01 * sigma * (there - here).abs() + rounding).any():
+            warnings.warn(
+                f"neighbors of {key!r} in the batch lie further from it than the next state does: "
+                "a transform has changed it since they were drawn. Append NeighborTransform after "
+                "all that change observations, or leave it out, and L2C2Loss draws neighbors.",
+                stacklevel=4,
+            )
+
+
 def l2c2_penalty(
     difference: Tensor,  # shape: [K, *B, ...]
     gain: Tensor,  # shape: [K, *B]
@@ -217,7 +243,8 @@ def l2c2_penalty(
     check_of_each(difference.shape, gain.shape)
     gain = gain[(...,) + (None,) * (difference.ndim - gain.ndim)]
     penalty = gain * difference
-    return penalty.mean(0) if over_neighbors == "mean" else penalty.amax(0)
+    # Not amax: of some of PPO-RPE's graphs inductor makes no program with it.
+    return penalty.mean(0) if over_neighbors == "mean" else penalty.max(0).values
 
 
 def warn_of_other_neighbors(

@@ -27,7 +27,7 @@ from torchrl_l2c2.objectives.relative_pearson import (
     update_deviation,
 )
 from torchrl_l2c2.objectives.shared_evaluation import SharedEvaluation
-from torchrl_l2c2.objectives.transitions import next_key
+from torchrl_l2c2.objectives.transitions import next_key, read_taken
 
 # exp(20) is far beyond any ratio that the loss treats differently (the relative ratio is within
 # 1e-8 of its end there) and far below what overflows when it is squared in float32.
@@ -93,8 +93,9 @@ class PPORPELoss(SharedEvaluation):
         ValueError: a setting outside its range, or a threshold so wide that :math:`C` could
             change its sign.
 
-    .. note:: ``delta`` is a persistent buffer: it travels with the ``state_dict``. Likelihood
-        ratios are limited to ``exp(20)`` either way, so that no float32 overflows.
+    .. note:: ``delta`` is a persistent buffer: it travels with the ``state_dict``, and stays as it
+        is in ``eval()`` mode. Likelihood ratios are limited to ``exp(20)`` either way, so that no
+        float32 overflows.
 
     Examples:
         >>> import torch
@@ -275,7 +276,9 @@ class PPORPELoss(SharedEvaluation):
             loss_critic = loss_critic * relative_ratio
 
         weight = self._maybe_get_priority_weight(tensordict)
-        weight = 1.0 if weight is None else importance_weight(weight, self.importance, mask)
+        if weight is not None:  # One of shape [*B, 1] would be spread over pairs of transitions.
+            weight = importance_weight(weight.reshape(advantage.shape), self.importance, mask)
+        weight = 1.0 if weight is None else weight
         return TensorDict(
             {
                 "loss_actor": self._reduce_loss(weight * loss_actor, tensordict),
@@ -319,16 +322,16 @@ class PPORPELoss(SharedEvaluation):
             )
 
     def _log_ratio(self, tensordict: TensorDictBase) -> Tensor:
-        action = tensordict.get(self.tensor_keys.action)
+        action = read_taken(tensordict, self.tensor_keys.action)
         parameters = self.evaluate_at_batch("actor_network", tensordict)
         log_prob = self.actor_network.build_dist_from_params(parameters).log_prob(action)
         if self.baseline == "stored":
-            if (stored := tensordict.get(key := self.tensor_keys.sample_log_prob, None)) is None:
-                raise KeyError(f"the batch has no {key!r}: keep it, or take baseline='target'.")
-            return log_prob - stored
+            key = self.tensor_keys.sample_log_prob
+            return log_prob - read_taken(tensordict, key, ", or take baseline='target'")
         states = tensordict.select(*self.actor_network.in_keys)
         with torch.no_grad(), self.target_actor_network_params.to_module(self.actor_network):
-            return log_prob - self.actor_network.get_dist(states).log_prob(action)
+            baseline = self.actor_network.get_dist(states).log_prob(action)
+        return log_prob - baseline  # Out here: the policy's own gradient is kept.
 
     @torch.no_grad()
     def _update_threshold(
@@ -342,5 +345,6 @@ class PPORPELoss(SharedEvaluation):
             reading=self.threshold,
             mask=mask,
         )
-        self.delta.copy_(delta)
+        if self.training:
+            self.delta.copy_(delta)
         return deviation, self.kappa * self.delta

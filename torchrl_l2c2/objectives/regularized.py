@@ -40,8 +40,8 @@ class RegularizedLoss(DeclaredTerms, SpecializedLoss, SharedEvaluation):
     the regularized one.
 
     ``forward`` returns the loss's own terms, unchanged (compiled: to rounding), and the
-    regularizer's. Loops that call ``actor_loss`` and ``value_loss`` themselves add
-    :meth:`policy_regularizer` and :meth:`value_regularizer`.
+    regularizer's. They share evaluations, so sum them before ``backward``. Loops that call
+    ``actor_loss`` and ``value_loss`` add :meth:`policy_regularizer` and :meth:`value_regularizer`.
 
     A regularizer is a subclass that defines ``__init__`` and one or both of these methods. When its
     ``__init__`` runs, the object already is the loss: no other constructor is to be called.

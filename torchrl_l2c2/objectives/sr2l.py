@@ -14,6 +14,7 @@ from torchrl.objectives import LossModule
 from torchrl_l2c2._checks import check_positive_int, check_real, check_takes_gradients
 from torchrl_l2c2.divergences import kl_divergence
 from torchrl_l2c2.objectives.evaluation import Policy
+from torchrl_l2c2.objectives.precision import in_full_precision
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
 from torchrl_l2c2.policy_distances import (
     PolicyDistance,
@@ -159,9 +160,9 @@ def ascend(
         with torch.enable_grad():
             moved = {key: state.detach().requires_grad_() for key, state in moved.items()}
             # Zero where the policy does not use a part of the state.
-            gradients = torch.autograd.grad(
-                distance(moved).sum(), list(moved.values()), materialize_grads=True
-            )
+            total = distance(moved).sum()
+            with in_full_precision(TensorDict(states)):
+                gradients = torch.autograd.grad(total, list(moved.values()), materialize_grads=True)
         for (key, state), gradient in zip(states.items(), gradients, strict=True):
             found = moved[key].detach() + 2.5 * epsilon / steps * gradient.sign()
             moved[key] = found.clamp(state - epsilon, state + epsilon)

@@ -213,3 +213,22 @@ def _check_successor(key: NestedKey, state: Tensor, successor: Tensor) -> None:
 def is_floating_point(value: object) -> bool:
     """Whether an entry of a batch is a tensor of floating-point numbers."""
     return isinstance(value, Tensor) and value.is_floating_point()
+
+
+def read_taken(tensordict: TensorDictBase, key: NestedKey, otherwise: str = "") -> Tensor:
+    """What was done, or how likely it was, as it is in a batch: without a gradient.
+
+    A rollout may have kept that of the policy which made it. In a likelihood ratio it would cancel
+    the gradient of the policy that is trained.
+
+    Args:
+        tensordict: the batch.
+        key: of the entry.
+        otherwise: what else can be done where there is none.
+
+    Raises:
+        KeyError: there is none.
+    """
+    if (entry := tensordict.get(key, None)) is None:
+        raise KeyError(f"the batch has no {key!r}: keep it{otherwise}.")
+    return entry.detach()

@@ -235,10 +235,9 @@ def adaterm(
     """
     deviations = torch._foreach_sub(grads, exp_avgs)
     squares = torch._foreach_mul(deviations, deviations)
-    # Sums one by one: _foreach_norm(..., 1) is slower, by far when compiled for the CPU.
-    sums = [quotient.sum() for quotient in torch._foreach_div(squares, exp_avg_vars)]
-    nu = torch.stack(nus)
-    mean_distance = torch.stack(sums) / nu.new_tensor([p.numel() for p in params])
+    # One by one: _foreach_norm(..., 1) is slower, by far when compiled for the CPU.
+    means = [quotient.mean() for quotient in torch._foreach_div(squares, exp_avg_vars)]
+    nu, mean_distance = torch.stack(nus), torch.stack(means)
     tau = (1.0 - beta) * nu / (nu + mean_distance)
 
     # s + max(eps^2, (s - D v) / nu) - v

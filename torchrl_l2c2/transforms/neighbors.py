@@ -84,7 +84,9 @@ def _place(
             near, ndim = neighbors.get(key), tensordict.batch_dims
             left_out = far.reshape(*far.shape, *(1,) * (near.ndim - far.ndim))
             neighbors.set(key, torch.where(left_out, state.unsqueeze(ndim), near))
-    numbers = distance.new_tensor(neighborhood.numbers).expand(*tensordict.batch_size, -1)
+    # Filled in and not copied: a copy from the CPU would wait for the device, every time.
+    numbers = torch.stack([distance.new_full((), number) for number in neighborhood.numbers])
+    numbers = numbers.expand(*tensordict.batch_size, -1)
     return neighbors.set("neighborhood", numbers).set("distance", distance)
 
 
