@@ -1206,6 +1206,18 @@ def test_what_is_said_of_the_rivals_is_of_the_records():
         assert smoother[OURS][WEAK_CAPS] in said and more[WEAK_CAPS][OURS] in said
 
 
+def test_what_is_said_of_both_lengths_of_sac_is_of_the_records():
+    """Seed by seed, and in the mean."""
+    page = (ROOT / "results" / "sac_pendulum.md").read_text()
+    for frames, name in (("30,000", "sac_pendulum"), ("100,000", "sac_pendulum_100000")):
+        records = read_records(ROOT / "results" / f"{name}.csv")
+        runs = {r.seed: r for r in records if r.method == "none" and r.seed < 5}
+        pairs = np.array([(runs[s].last_mean_return, runs[s].last_mean_sm_asap) for s in range(5)])
+        cells = [f"{total:.0f} / {sm:.3f}" for total, sm in pairs]
+        mean = "{:.1f} / {:.3f}".format(*pairs.mean(0))
+        assert f"| {' | '.join([frames, *cells, mean])} |" in page
+
+
 def test_cats_as_strong_as_l2c2_is_of_the_records():
     """Both at the same strength, on two tasks: means, and how probable a better run is."""
     page = (ROOT / "results" / "one_setting.md").read_text().partition("## CATS, as strong")[2]
@@ -1227,7 +1239,9 @@ def test_cats_as_strong_as_l2c2_is_of_the_records():
             assert better.replace("0.", ".") in page
 
 
-@pytest.mark.parametrize("name", ["field", "walker2d", "hopper", "sac_pendulum"])
+@pytest.mark.parametrize(
+    "name", ["field", "walker2d", "hopper", "sac_pendulum", "sac_pendulum_100000"]
+)
 def test_what_is_said_of_the_harness_is_of_the_records(name):
     """Vanilla's and the rivals' rows beside the published ones."""
     table = field_table(read_records(ROOT / "results" / f"{name}.csv"))
@@ -1239,6 +1253,7 @@ def test_what_is_said_of_the_harness_is_of_the_records(name):
     for row in shown:
         method, _, gain = row["method"].partition(",")
         method += f",{gain}" if gain and gains[row["task"], method] > 1 else ""
+        method += ", 100000 frames" if name.endswith("100000") else ""
         cells = [row[column] for column in columns]
         assert f"| {' | '.join([*cells[:2], method, *cells[3:]])} |" in page
 
