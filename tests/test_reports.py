@@ -1206,6 +1206,26 @@ def test_what_is_said_of_the_rivals_is_of_the_records():
         assert smoother[OURS][WEAK_CAPS] in said and more[WEAK_CAPS][OURS] in said
 
 
+def test_what_each_part_of_the_setting_does_is_of_the_records():
+    """Beside vanilla, the paper's and PPO's one setting on the same seeds."""
+    parts, field = (read_records(ROOT / "results" / f"{name}.csv") for name in ("parts", "field"))
+    beside = [
+        r for r in field if r.method in ("none", "l2c2_paper") or r.commit.startswith("e01476b")
+    ]
+    seeds = {record.seed for record in parts}
+    table = field_table([*parts, *(record for record in beside if record.seed in seeds)])
+    rows = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
+    shown = [row for row in rows if row["seeds"]]
+    page = (ROOT / "results" / "parts.md").read_text().partition("## How large")[0]
+    lines = [line.split(" | ") for line in page.splitlines() if line.startswith("| ")][2:]
+    found = {(task.removeprefix("| "), " | ".join(cells)) for task, _, *cells in lines}
+    columns = ("seeds", "return", "Sm", "action variation", *BETTER.values())
+    expected = {
+        (row["task"], f"{' | '.join(row[column] for column in columns)} |") for row in shown
+    }
+    assert len(shown) == len(lines) == 18 and found == expected
+
+
 def test_what_is_said_of_both_lengths_of_sac_is_of_the_records():
     """Seed by seed, and in the mean."""
     page = (ROOT / "results" / "sac_pendulum.md").read_text()
