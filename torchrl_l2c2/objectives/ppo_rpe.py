@@ -278,11 +278,11 @@ class PPORPELoss(SharedEvaluation):
         weight = self._maybe_get_priority_weight(tensordict)
         if weight is not None:  # One of shape [*B, 1] would be spread over pairs of transitions.
             weight = importance_weight(weight.reshape(advantage.shape), self.importance, mask)
-        weight = 1.0 if weight is None else weight
+            loss_actor, loss_critic = weight * loss_actor, weight * loss_critic
         return TensorDict(
             {
-                "loss_actor": self._reduce_loss(weight * loss_actor, tensordict),
-                "loss_critic": self._reduce_loss(weight * loss_critic, tensordict),
+                "loss_actor": self._reduce_loss(loss_actor, tensordict),
+                "loss_critic": self._reduce_loss(loss_critic, tensordict),
                 "ratio_deviation": deviation,
                 "ratio_threshold": threshold,
             }
