@@ -426,8 +426,8 @@ class TestRun:
     def test_the_gain_is_that_of_the_runs_end(self, tmp_path):
         """Where it set itself, the shares of the gradients are with it."""
         shares = {}
-        for target in (0.01, 1.0):
-            regularizer = L2C2Config(gain="gradient", gain_target=target)
+        for target in (1e3, 1e-9):
+            regularizer = L2C2Config(gain="target", gain_target=target, gain_rate=1.0)
             task = TaskConfig("pendulum", "Pendulum-v1", episodes=3, max_steps=40)
             config = ExperimentConfig(task, ALGORITHMS["ppo_rpe"], regularizer, compile=False)
             experiment = Experiment(config, tmp_path / str(target))
@@ -436,7 +436,7 @@ class TestRun:
             experiment.close()
             found = diagnose_run(tmp_path / str(target), episodes=1, with_pictures=False)
             shares[target] = found.shares["l2c2_actor"].gradient
-        assert shares[1.0] > 10 * shares[0.01]
+        assert shares[1e-9] > 10 * shares[1e3]
 
     def test_gradients_are_of_what_training_learns_from(self, monkeypatch):
         """Rewards of 1, 50 and -200 are cut off at 10 before they are scaled by .01."""

@@ -14,7 +14,7 @@ from torchrl.objectives import SACLoss
 
 import torchrl_l2c2
 from torchrl_l2c2 import affinities
-from torchrl_l2c2.experiment.regularizers import TUNED
+from torchrl_l2c2.presets import KINDS, PRESETS, presets_table
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs"
@@ -70,29 +70,19 @@ def test_the_readmes_code_does_what_it_says() -> None:
     assert "<!-- no-test -->" not in page.read_text()
     defined = run_blocks(page)
     assert isinstance(defined["loss"], SACLoss)
-    assert {"loss_l2c2_actor", "l2c2_mean_distance"} <= set(defined["terms"].keys())
-    assert "loss_l2c2_qvalue" not in defined["terms"].keys()
+    assert {"penalty_l2c2_actor", "l2c2_mean_distance"} <= set(defined["terms"].keys())
+    assert defined["ppo"].regularizer_gain.item() == 0.25
 
 
-@pytest.mark.parametrize("algorithm", TUNED)
-def test_what_to_begin_from_is_what_runs_begin_from(algorithm: str) -> None:
-    """In the README's snippets and in the guide's table."""
-
-    def written(*names: str) -> str:
-        found = {name: TUNED[algorithm][name] for name in names if name in TUNED[algorithm]}
-        quoted = {n: f'"{v}"' if isinstance(v, str) else f"{v:g}" for n, v in found.items()}
-        quoted |= {"shared": "True"} if found.get("shared") else {}
-        return ", ".join(f"{name}={value}" for name, value in quoted.items())
-
-    near, rest = written("lambda_min", "lambda_max", "shared"), written("beta", "policy_distance")
-    told = f"{near}, {rest}".strip(", ").split(", ")
-    assert len(told) == len(TUNED[algorithm].keys() - {"gain"})
-    begin = f"L2C2Loss(loss, Neighborhood({near}), {rest})".replace(", )", ")")
-    (row,) = re.findall(rf"\| {algorithm.upper()}(?: \||,).*", (FOLDER / "choosing.md").read_text())
-    assert f"`{begin}`" in row and ("[ramp]" in row) == (TUNED[algorithm].get("gain") == "ramp")
-    if rest:  # TD3 has no snippet.
-        snippets = (ROOT / "README.md").read_text().replace(".0", "")
-        assert f"Neighborhood({near})" in snippets and rest in snippets
+def test_the_guide_shows_the_table_of_presets() -> None:
+    """As the package has it; pages that are named as evidence exist."""
+    page = (FOLDER / "choosing.md").read_text()
+    shown = re.search(r"<!-- presets -->\n(.*)<!-- presets end -->", page, re.S)
+    assert shown is not None and shown[1] == presets_table()
+    for kinds in PRESETS.values():
+        assert kinds.keys() == KINDS.keys()
+        for preset in kinds.values():
+            assert preset.evidence is None or (ROOT / preset.evidence).exists()
 
 
 def test_a_marked_block_is_left_out_and_the_others_share_a_namespace(tmp_path: Path) -> None:

@@ -31,13 +31,18 @@ from torchrl_l2c2.experiment.composition import (
     check_folders,
     check_preset,
     check_simulator,
-    tuned,
+    preset_used,
 )
 from torchrl_l2c2.experiment.config import GROUPS
 from torchrl_l2c2.experiment.manual import manual, page
-from torchrl_l2c2.experiment.regularizers import BEGIN_TUNED, REGULARIZERS, TUNED, TUNED_ON
+from torchrl_l2c2.experiment.regularizers import (
+    BEGIN_WITH_PRESET,
+    REGULARIZERS,
+    preset_settings,
+)
 from torchrl_l2c2.experiment.settings import SettingError, describe
 from torchrl_l2c2.experiment.tasks import FIELD_TASKS, PAPER_TASKS
+from torchrl_l2c2.presets import KINDS, preset
 
 ROOT = Path(__file__).parent.parent
 
@@ -127,6 +132,7 @@ def test_every_comparison_is_made_of_valid_runs(name, regularizer):
         "field_gains": ("Pendulum-v1", "ppo", 64),
         "field_table": ("Pendulum-v1", "ppo", 64),
         "cartpole": ("CartPole-v1", "dqn", 64),
+        "new_tasks": ("Reacher-v5", "ppo", 64),
     }[name]
     if algorithm == "ppo_rpe":
         assert config.algorithm.tau == (0.5 if name == "table3_tau" else 0.1)
@@ -280,30 +286,38 @@ def test_hydras_folders_are_none_of_a_sweep(name):
         check_folders(hydra.hydra, "outputs")
 
 
-@pytest.mark.parametrize("algorithm", TUNED)
-@pytest.mark.parametrize("name", BEGIN_TUNED)
-def test_l2c2_begins_from_what_was_found_for_the_algorithm(name, algorithm):
-    """What is given goes before; a run says what it has; l2c2_paper is the paper's."""
+@pytest.mark.parametrize("algorithm", KINDS)
+@pytest.mark.parametrize("name", BEGIN_WITH_PRESET)
+def test_a_regularizer_begins_with_the_preset_of_the_algorithm(name, algorithm):
+    """Of the one table; given settings replace its own, and a run says which it has."""
     chosen = [f"algorithm={algorithm}", f"regularizer={name}"]
+    if name == "lcp" and algorithm == "dqn":
+        return
     config = ExperimentConfig.from_dict(composed(*chosen))
-    own = {**TUNED[algorithm], **BEGIN_TUNED[name]}
-    found = dataclasses.replace(REGULARIZERS[name], **own)
-    assert config.regularizer == found != REGULARIZERS[name]
-    told = tuned(config)
-    assert f"lambda_min={found.lambda_min}, " in told
-    assert f"for {algorithm} on {TUNED_ON[algorithm]}" in told
-    other = ExperimentConfig.from_dict(composed(*chosen, "regularizer.beta=0.5"))
-    assert other.regularizer == dataclasses.replace(found, beta=0.5)
-    paper = ExperimentConfig.from_dict(composed(chosen[0], "regularizer=l2c2_paper"))
+    method, own = BEGIN_WITH_PRESET[name]
+    table = preset(method, algorithm)
+    for setting, value in {**table.settings, **own}.items():
+        assert getattr(config.regularizer, setting) == value
+    ramped = own.get("gain", "constant" if table.ramp is None else "ramp") == "ramp"
+    assert config.regularizer.ramped == ramped
+    told = preset_used(config)
+    assert all(f"{setting}={value}" in told for setting, value in table.settings.items())
+    assert (table.evidence or "its authors' settings") in told
+    stronger = ExperimentConfig.from_dict(composed(*chosen, "regularizer.strength=0.5"))
+    assert stronger.regularizer == dataclasses.replace(config.regularizer, strength=0.5)
+
+
+def test_l2c2_paper_begins_with_the_papers_settings():
+    """With any algorithm."""
+    paper = ExperimentConfig.from_dict(composed("algorithm=sac", "regularizer=l2c2_paper"))
     assert dataclasses.replace(paper.regularizer, name="l2c2") == L2C2Config()
-    assert tuned(paper) is tuned(ExperimentConfig()) is None
+    assert preset_used(paper) is None and preset_settings("l2c2_paper", "sac") == {}
 
 
-@pytest.mark.parametrize("chosen", [("algorithm=dqn",), ("task=pendulum",)], ids=str)
-def test_l2c2_says_where_nothing_was_found_for_it(chosen):
-    """With another algorithm, or the paper's on another task."""
-    told = tuned(ExperimentConfig.from_dict(composed(*chosen, "regularizer=l2c2")))
-    assert "others were found for ppo, sac, td3 alone" in told
+def test_an_algorithm_without_a_preset_is_reported():
+    """Q-learning has none."""
+    told = preset_used(ExperimentConfig.from_dict(composed("algorithm=dqn", "regularizer=l2c2")))
+    assert "there is no preset for dqn" in told
 
 
 @pytest.mark.parametrize("task", PAPER_TASKS)

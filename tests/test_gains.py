@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 import re
 import statistics
@@ -26,15 +25,12 @@ from torchrl_l2c2 import (
 )
 from torchrl_l2c2.experiment import (
     AdamConfig,
-    CAPSConfig,
-    DQNConfig,
     Experiment,
     ExperimentConfig,
     L2C2Config,
     PPOConfig,
     PPORPEConfig,
     RolloutReplayConfig,
-    SACConfig,
     TaskConfig,
     TD3Config,
     UniformReplayConfig,
@@ -42,7 +38,6 @@ from torchrl_l2c2.experiment import (
 from torchrl_l2c2.experiment.settings import SettingError
 from torchrl_l2c2.gains import (
     ConstantGain,
-    GradientGain,
     RampGain,
     TargetGain,
     gradient_shares,
@@ -55,7 +50,7 @@ class TestByHand:
         gain = ConstantGain(2.0)
         assert [gain.step(), gain.step(7.0)] == [2.0, 2.0]
 
-    @pytest.mark.parametrize("make", [RampGain, GradientGain, TargetGain])
+    @pytest.mark.parametrize("make", [RampGain, TargetGain])
     def test_what_was_measured_may_be_a_tensor(self, make):
         """Of one number; gain and state are plain numbers, as a file has them."""
         gain, like = (make(2.0) for _ in range(2))
@@ -70,10 +65,6 @@ class TestByHand:
         ramp = RampGain(3.0, length=0.5)
         assert ramp.value == 0.0
         assert [ramp.step(k) for k in (0.0, 0.25, 0.5, 1.0, 1.1)] == [0.0, 1.5, 3.0, 3.0, 3.0]
-
-    def test_the_first_measurement_of_a_gradient_sets_the_gain(self):
-        """A share of 5e-6 at the gain 1 is .1 at 20 thousand, whatever the rate."""
-        assert GradientGain(0.1, rate=0.1).step(5e-6) == pytest.approx(2e4)
 
     def test_cloning_that_takes_the_actors_place_is_none_of_its_gradient(self):
         """CQL's two terms of the policy are descended one after the other, and never summed."""
@@ -105,29 +96,6 @@ class TestByHand:
         assert set(batch.keys(True, True)) == set(seen.keys(True, True))
         assert (batch == seen).all()
 
-    def test_a_gradients_share_is_met_at_once_with_rate_1(self):
-        """Also by later measurements: .02 at the gain 3 is .1 at 15."""
-        gain = GradientGain(0.1, rate=1.0)
-        gain.step(0.1 / 3.0)
-        assert gain.step(0.02) == pytest.approx(15.0)
-
-    def test_gradients_are_averaged_on_the_logarithm(self):
-        """Shares per gain of .1 * 4^-n: their geometric mean, then a moving one of the rate 1/4."""
-        gain, units = GradientGain(0.1, rate=0.25), [0.05, 0.2, 0.4, 0.1, 0.8, 0.05]
-        wanted, value = [math.log(0.1 / unit) for unit in units], 1.0
-        for k, unit in enumerate(units):
-            value = gain.step(value * unit)
-            if k < 4:
-                expected = sum(wanted[: k + 1]) / (k + 1)
-            else:
-                expected = 0.75 * expected + 0.25 * wanted[k]
-            assert math.log(value) == pytest.approx(expected)
-
-    @pytest.mark.parametrize("share", [0.0, math.inf, math.nan])
-    def test_a_share_that_says_nothing_changes_nothing(self, share):
-        """Where one of the gradients vanishes."""
-        assert GradientGain(0.1, value=3.0).step(share) == 3.0
-
     def test_dual_ascent(self):
         """exp(rate * relative excess); no step is larger than the rate; nan changes nothing."""
         gain = TargetGain(2.0, rate=0.5)
@@ -142,15 +110,6 @@ class TestByHand:
         assert [gain.step(1e9) for _ in range(9)][-1] == 16.0
         assert [gain.step(1e-9) for _ in range(9)][-1] == 0.25
 
-    def test_a_gradients_gain_stays_within_bounds_around_the_first_that_was_measured(self):
-        """8 times 500 and an eighth of it, where the first share was .002 at the gain 1."""
-        gain = GradientGain(1.0, 1.0, limit=8.0)
-        gain.step(0.002)
-        again = GradientGain(1.0, 1.0, limit=8.0)
-        again.load_state_dict(gain.state_dict())
-        assert again.step(1e-9) == pytest.approx(4000.0)
-        assert again.step(1e9) == pytest.approx(62.5)
-
     def test_dual_ascent_finds_the_gain_that_meets_the_target(self):
         """Of a measure 1 / (1 + gain), which is 1/4 at the gain 3."""
         gain = TargetGain(0.25, rate=0.1)
@@ -158,9 +117,7 @@ class TestByHand:
             gain.step(1.0 / (1.0 + gain.value))
         assert gain.value == pytest.approx(3.0, rel=1e-3)
 
-    @pytest.mark.parametrize(
-        "make", [lambda: RampGain(), lambda: GradientGain(0.1), lambda: TargetGain(0.1)]
-    )
+    @pytest.mark.parametrize("make", [lambda: RampGain(), lambda: TargetGain(0.1)])
     def test_a_restored_gain_goes_on_as_the_other(self, make):
         """From its state_dict."""
         gain, again = make(), make()
@@ -169,19 +126,11 @@ class TestByHand:
         assert again.value == gain.value != make().value
         assert again.step(0.9) == gain.step(0.9)
 
-    def test_a_state_of_another_kind_changes_nothing(self):
-        """The value is not half of the other's."""
-        gain = GradientGain(0.1)
-        with pytest.raises(ValueError, match=r"GradientGain has .*another kind"):
-            gain.load_state_dict(TargetGain(0.1, value=3.0).state_dict())
-        assert gain.value == 1.0
-
-    @pytest.mark.parametrize("make", [lambda: GradientGain(0.1), lambda: TargetGain(0.1)])
     @pytest.mark.parametrize("measured", ["a", None, True])
-    def test_what_is_measured_is_a_number(self, make, measured):
+    def test_what_is_measured_is_a_number(self, measured):
         """Which may be NaN, and then says nothing."""
         with pytest.raises(TypeError, match="measured must be a real number, got"):
-            make().step(measured)
+            TargetGain(0.1).step(measured)
 
     @pytest.mark.parametrize(
         ("make", "message"),
@@ -189,10 +138,9 @@ class TestByHand:
             (lambda: ConstantGain(-1.0), "value must be finite and at least 0, got -1"),
             (lambda: RampGain().step(512), r"measured must be in \[0, 2\].* It is a share of tr"),
             (lambda: RampGain(length=0.0), r"length must be in \(0, 1\], got 0"),
-            (lambda: GradientGain(0.0), "share must be finite and greater than 0, got 0"),
             (lambda: TargetGain(-0.1), "target must be finite and greater than 0"),
             (lambda: TargetGain(0.1, rate=2.0), r"rate must be in \(0, 1\], got 2"),
-            (lambda: GradientGain(0.1, limit=1.0), "limit must be finite and greater than 1"),
+            (lambda: TargetGain(0.1, limit=1.0), "limit must be finite and greater than 1"),
         ],
     )
     def test_wrong_settings_are_refused(self, make, message):
@@ -205,7 +153,6 @@ TASK = TaskConfig("pendulum", "Pendulum-v1", episodes=6, max_steps=40)
 FEW_UPDATES = dataclasses.replace(ALGORITHMS["ppo_rpe"], replay_ratio=1.0)
 KINDS = {
     "ramp": {"gain": "ramp"},
-    "gradient": {"gain": "gradient", "gain_target": 0.3},
     "target": {"gain": "target", "gain_target": 0.05, "gain_of": "l2c2_hellinger"},
 }
 
@@ -259,7 +206,7 @@ class TestInARun:
         rows = run.train(3) and run.train()
         assert [row["gain"] for row in rows] == pytest.approx([k / 6 for k in range(6)])
         assert rows[0]["loss_l2c2_actor"] == 0.0 < rows[-1]["loss_l2c2_actor"]
-        assert run.agent.loss.l2c2_coeff == 1.0
+        assert run.agent.loss.regularizer_gain == 1.0
 
     def test_a_longer_training_has_a_longer_ramp_and_its_own_rates(self):
         """Of twelve episodes instead of six; one that had ended begins at a rate above 0."""
@@ -280,18 +227,8 @@ class TestInARun:
         assert [row["gain"] for row in rows] == pytest.approx([math.exp(k / 2) for k in range(6)])
         assert [row["gain_measured"] for row in rows] == [row["action_variation"] for row in rows]
         assert rows[0]["gain_target"] == 1e-9
-        assert run.agent.loss.l2c2_coeff.item() == pytest.approx(math.exp(3.0))
+        assert run.agent.loss.regularizer_gain.item() == pytest.approx(math.exp(3.0))
         assert run.agent.loss.l2c2_beta.item() == pytest.approx(0.1)
-
-    def test_each_network_gets_its_share_of_the_gradient(self):
-        """With rate 1, the next measurement on the same batch gives it for policy and values."""
-        regularizer = L2C2Config(gain="gradient", gain_target=0.3, gain_rate=1.0, gain_limit=1e6)
-        run = Experiment(small(regularizer))
-        rows = run.train()
-        shares = gradient_shares(run.agent.loss, run.learner.update.example())
-        assert shares["loss_l2c2_actor"] == pytest.approx(0.3, rel=1e-4)
-        assert shares["loss_l2c2_critic"] == pytest.approx(0.3, rel=1e-4)
-        assert rows[-1]["gain_policy"] != pytest.approx(rows[-1]["gain_value"])
 
     def test_shares_are_measured_where_no_gradients_are_kept(self):
         """As between updates; terms that are not single numbers are refused."""
@@ -304,16 +241,6 @@ class TestInARun:
         run.agent.loss.reduction = "none"
         with pytest.raises(ValueError, match="make the loss with reduction='mean'"):
             gradient_shares(run.agent.loss, batch)
-
-    def test_several_terms_of_a_network_share_their_gain(self):
-        """CAPS has two of the policy: the larger counts, and neither changes beside the other."""
-        run = Experiment(small(CAPSConfig(gain="gradient", gain_target=0.3, gain_rate=1.0)))
-        rows = run.train()
-        loss = run.agent.loss
-        assert "gain_value" not in rows[0]
-        ratio = loss.caps_lambda_spatial / loss.caps_lambda_temporal
-        assert ratio.item() == pytest.approx(5.0)
-        assert loss.caps_lambda_temporal.item() != pytest.approx(0.01)
 
     @pytest.mark.parametrize(
         "kind",
@@ -340,16 +267,16 @@ class TestInARun:
         told = [w for w in caught if "regularizer's terms are less" in str(w.message)]
         assert len(told) == (kind != "target")
         if kind == "ramp":
-            assert run.agent.loss.l2c2_coeff == run.metrics[-1]["gain_measured"] > 0.0
+            assert run.agent.loss.regularizer_gain == run.metrics[-1]["gain_measured"] > 0.0
 
     def test_what_a_ramp_ends_with_is_looked_at_and_left(self):
         """The loss has the gain of now again, before the next update."""
         run = Experiment(small(L2C2Config(gain="ramp")))
         run.train(1)
-        before = run.agent.loss.l2c2_coeff.item()
+        before = run.agent.loss.regularizer_gain.item()
         with run.learner.at_full_gain():
-            assert run.agent.loss.l2c2_coeff.item() == 1.0 > before
-        assert run.agent.loss.l2c2_coeff.item() == before
+            assert run.agent.loss.regularizer_gain.item() == 1.0 > before
+        assert run.agent.loss.regularizer_gain.item() == before
 
     def test_a_ramp_is_told_by_the_gain_that_it_ends_with(self, measured_soon):
         """Its first updates have none."""
@@ -366,27 +293,6 @@ class TestInARun:
         rows = run.train()
         gains = [row["loss_l2c2_actor"] / row["l2c2_hellinger"] for row in rows]
         assert gains[0] == 0.0 and gains == sorted(gains) and gains[-1] > 0
-
-    def test_a_loss_without_a_policy_has_the_gain_of_its_values(self):
-        """Q-learning."""
-        task = dataclasses.replace(TASK, env_id="CartPole-v1")
-        regularizer = L2C2Config(gain="gradient", gain_target=0.3, gain_rate=1.0)
-        with pytest.warns(UserWarning, match="leaves out the policy term"):
-            run = Experiment(
-                small(regularizer, task=task, algorithm=DQNConfig(hidden=(8,), random_frames=10))
-            )
-        row = run.train()[-1]
-        assert "gain_policy" not in row and row["gain_value"] != 1.0
-        assert run.agent.loss.l2c2_coeff == 1.0
-
-    def test_before_the_first_update_nothing_is_measured(self):
-        """Random frames leave the gain at 1."""
-        config = small(
-            L2C2Config(**KINDS["gradient"]), algorithm=SACConfig(hidden=(8,), random_frames=90)
-        )
-        rows = Experiment(config).train(3)
-        assert [row["gain_policy"] for row in rows] == [1.0, 1.0, 1.0]
-        assert [math.isnan(row["gain_measured_policy"]) for row in rows] == [True, True, False]
 
 
 ROLLOUTS = {
@@ -405,7 +311,7 @@ KINDS_OF_ROLLOUTS = ["episodes", pytest.param("simulators", marks=pytest.mark.sl
 
 def small_ppo(kind="episodes", **settings):
     """A rollout is forgotten before the gain is set, and several episodes end in it."""
-    regularizer = L2C2Config(**{**KINDS["gradient"], "policy_distance": "mean", **settings})
+    regularizer = L2C2Config(**{"policy_distance": "mean", **settings})
     return small(
         regularizer,
         algorithm=PPOConfig(hidden=(8,), epochs=1, **ROLLOUTS[kind]),
@@ -415,34 +321,6 @@ def small_ppo(kind="episodes", **settings):
 
 
 class TestRollouts:
-    @pytest.mark.parametrize("kind", KINDS_OF_ROLLOUTS)
-    def test_the_share_is_measured_on_the_rollout_that_was_learned_from(self, kind, monkeypatch):
-        """With rate 1 the next measurement there gives the target."""
-        run, kept = Experiment(small_ppo(kind, gain_rate=1.0)), []
-        extend = run.learner.replay.extend
-        monkeypatch.setattr(run.learner.replay, "extend", lambda t: kept.append(t) or extend(t))
-        run.train(2)
-        rollout, batch = torch.cat(kept), run.learner.example()
-        rows = torch.linspace(0, len(rollout) - 1, 32).long()
-        assert len(run.learner.replay) == 0 < run.learner.updates
-        assert batch["observation"].equal(rollout["observation"][rows])
-        assert batch["advantage"].equal(rollout["advantage"][rows])
-        shares = gradient_shares(run.agent.loss, batch)
-        assert shares["loss_l2c2_actor"] == pytest.approx(0.3, rel=1e-4)
-        assert shares["loss_l2c2_critic"] == pytest.approx(0.3, rel=1e-4)
-
-    @pytest.mark.parametrize("kind", KINDS_OF_ROLLOUTS)
-    def test_it_is_measured_with_the_gain_that_was_applied(self, kind):
-        """Once for a rollout; with rate 1 every gain follows from the one before and its share."""
-        run = Experiment(small_ppo(kind, gain_rate=1.0))
-        rows = [row for row in run.train(10) if row["updates"]]
-        measured = [row for row in rows if not math.isnan(row["gain_measured_policy"])]
-        assert 2 <= len(measured) < len(rows)
-        for row, after in itertools.pairwise(measured):
-            expected = row["gain_policy"] * 0.3 / row["gain_measured_policy"]
-            assert after["gain_policy"] == pytest.approx(expected)
-            assert row["updates"] < after["updates"]
-
     @pytest.mark.parametrize("kind", KINDS_OF_ROLLOUTS)
     def test_a_target_is_of_the_rollout_that_was_learned_from(self, kind):
         """Of all its episodes: a single one is noisy, and the first that ends a short one."""
@@ -463,30 +341,11 @@ class TestRollouts:
             seen = []
         assert several
 
-    @pytest.mark.parametrize("gain", ["gradient", "target"])
     @pytest.mark.parametrize("kind", KINDS_OF_ROLLOUTS)
-    def test_a_continued_run_is_the_uninterrupted_one(self, tmp_path, kind, gain):
+    def test_a_continued_run_is_the_uninterrupted_one(self, tmp_path, kind):
         """To the last bit, wherever in the rollouts it was interrupted."""
-        assert_continues(small_ppo(kind, gain=gain), tmp_path, 5, 10)
-
-    def test_the_values_have_a_share_of_their_own(self):
-        """A fifth of the policy's, by the log and in the gradients."""
-        run = Experiment(small_ppo(gain_rate=1.0, gain_target_value=0.06))
-        rows = run.train(2)
-        shares = gradient_shares(run.agent.loss, run.learner.example())
-        assert shares["loss_l2c2_actor"] == pytest.approx(0.3, rel=1e-4)
-        assert shares["loss_l2c2_critic"] == pytest.approx(0.06, rel=1e-4)
-        assert rows[-1]["gain_target"] == 0.3 and rows[-1]["gain_target_value"] == 0.06
-
-    def test_the_values_may_have_none(self):
-        """From the first update on; the policy has its share."""
-        run = Experiment(small_ppo(gain_rate=1.0, gain_target_value=0.0))
-        rows = run.train(4)
-        assert rows[1]["loss_l2c2_critic"] == rows[3]["loss_l2c2_critic"] == 0.0
-        assert rows[3]["gain_value"] == 0.0 < rows[3]["loss_l2c2_actor"]
-        shares = gradient_shares(run.agent.loss, run.learner.example())
-        assert shares["loss_l2c2_actor"] == pytest.approx(0.3, rel=1e-4)
-        assert shares["loss_l2c2_critic"] == 0.0
+        config = small_ppo(kind, gain="target", gain_target=0.1)
+        assert_continues(config, tmp_path, 5, 10)
 
 
 class TestRefusals:
@@ -528,28 +387,21 @@ class TestRefusals:
         ("settings", "message"),
         [
             ({"gain": "target"}, "gain_target must be given with gain=target, got null"),
-            ({"gain": "gradient"}, "gain_target must be given with gain=gradient"),
             (
                 {"gain_target": 0.1},
-                "gain_target is of gain=gradient and gain=target alone, got 0.1 .* at null",
+                "gain_target is of gain=target alone, got 0.1 .* at null",
             ),
             ({"gain_length": 0.5}, "gain_length is of gain=ramp alone, got 0.5 .* at 1.0"),
-            ({"gain": "ramp", "gain_rate": 0.5}, "gain_rate is of gain=gradient and gain=target"),
-            ({"gain_limit": 10.0}, "gain_limit is of gain=gradient and gain=target alone"),
+            ({"gain": "ramp", "gain_rate": 0.5}, "gain_rate is of gain=target alone"),
+            ({"gain_limit": 10.0}, "gain_limit is of gain=target alone"),
             (
-                {"gain": "gradient", "gain_target": 0.1, "gain_of": "return"},
-                "gain_of is of gain=target alone, got return with gain=gradient",
+                {"gain": "ramp", "gain_of": "return"},
+                "gain_of is of gain=target alone, got return with gain=ramp",
             ),
-            ({"gain": "pid"}, "gain must be 'constant', 'ramp', 'gradient' or 'target'"),
+            ({"gain": "pid"}, "gain must be 'constant', 'ramp' or 'target'"),
         ],
     )
     def test_settings_that_do_not_go_together_are_refused(self, settings, message):
         """With what would."""
         with pytest.raises(SettingError, match=message):
             L2C2Config(**settings)
-
-    @pytest.mark.parametrize("settings", [{}, {"gain": "gradient", "gain_target": 1.0, "beta": 0}])
-    def test_a_share_of_the_values_needs_their_gradient(self, settings):
-        """Measured, and there at all."""
-        with pytest.raises(SettingError, match="gain_target_value needs gain=gradient and a beta"):
-            L2C2Config(gain_target_value=0.1, **settings)

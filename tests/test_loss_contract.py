@@ -14,9 +14,9 @@ from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
 
 from torchrl_l2c2 import CAPSLoss, L2C2Loss, Neighborhood, NeighborTransform
 
-SHARED = {"l2c2_distance", "l2c2_gain"}
+SHARED = {"l2c2_distance", "l2c2_gain", "l2c2_counted"}
 # A wide neighborhood, so that the terms are well above the rounding of the others.
-NEAR = Neighborhood(sigma=1.0, lambda_min=0.1, lambda_max=1.0)
+NEAR = Neighborhood(sigma=1.0, lambda_min=0.2, lambda_max=2.0)
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 
@@ -152,12 +152,14 @@ class TestWhatIsAdded:
             (loss.value_regularizer if case.values else loss.policy_regularizer)(batch)
 
     def test_next_observations_that_are_not_finite_do_no_harm(self, case):
-        """NaN at an episode's end counts as no displacement, in values and gradients."""
+        """Rows with NaN at an episode's end do not count: values and gradients of the others."""
         batch = batch_of(case)
         successor = batch[unravel_key(("next", case.observation))]
         successor[0], successor[1] = torch.nan, torch.inf
         loss = regularized(case)
-        terms = loss.value_regularizer(batch).update(loss.policy_regularizer(batch))
+        with pytest.warns(UserWarning, match=r"33\.33% of the next observations"):
+            terms = loss.value_regularizer(batch).update(loss.policy_regularizer(batch))
+        assert terms["l2c2_counted"].item() == pytest.approx(4 / 6)
         assert all(value.isfinite().all() for value in terms.values())
         found = gradients(loss, total(terms)).values()
         assert all(gradient is None or gradient.isfinite().all() for gradient in found)
@@ -440,7 +442,7 @@ class TestSchedules:
         else:
             with warnings.catch_warnings():
                 warnings.simplefilter("error")
-                L2C2Loss(base)
+                L2C2Loss(base, NEAR)
 
 
 def test_regularizers_can_be_combined(case):
@@ -454,7 +456,8 @@ def test_regularizers_can_be_combined(case):
     expected, found = run(loss, batch_of(case)), run(both, batch_of(case))
     assert isinstance(both, L2C2Loss) and isinstance(both, CAPSLoss)
     assert all(equal(value, found[key]) for key, value in expected.items())
-    assert {"loss_caps_temporal", "loss_caps_spatial"} == set(found.keys()) - set(expected.keys())
+    added = {"loss_caps_temporal", "loss_caps_spatial", "caps_counted"}
+    assert added == set(found.keys()) - set(expected.keys())
     assert set(found.keys()) - set(run(plain(case), batch_of(case)).keys()) <= set(both.out_keys)
     both.l2c2_coeff = 0.0
     both.caps_lambda_spatial = 0.0

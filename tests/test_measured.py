@@ -11,7 +11,6 @@ from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl_l2c2 import action_variation, make_actor
 from torchrl_l2c2.experiment import (
     AdamConfig,
-    CAPSConfig,
     DQNConfig,
     EpisodeCollector,
     Experiment,
@@ -159,14 +158,6 @@ def test_epsilon_falls_with_the_frames_of_an_episode():
     run = Experiment(small(task=task, algorithm=algorithm, regularizer=none, **others))
     run.player.play()
     assert run.agent.exploration.eps.item() == pytest.approx(1 - run.player.frames / 1000)
-
-
-def test_the_larger_of_several_terms_counts(monkeypatch):
-    """Where one gain scales them all, and follows their gradients."""
-    run = Experiment(small(regularizer=CAPSConfig(gain="gradient", gain_target=0.3)))
-    shares = {"loss_caps_temporal": 0.1, "loss_caps_spatial": 0.4}
-    monkeypatch.setattr(run.learner, "shares", lambda batch: shares)
-    assert run.train()[-1]["gain_measured_policy"] == 0.4
 
 
 def test_a_late_share_is_one_episode_at_least():

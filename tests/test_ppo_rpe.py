@@ -19,7 +19,7 @@ from torchrl_l2c2 import (
     make_actor,
     make_critic,
 )
-from torchrl_l2c2.objectives.relative_pearson import of_each_transition
+from torchrl_l2c2.objectives.ppo_rpe import of_each_transition
 
 
 class Heads(nn.Module):

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from torchrl_l2c2.objectives.relative_pearson import (
+from torchrl_l2c2.objectives.ppo_rpe import (
     actor_loss,
     critic_loss,
     penalty_gain,

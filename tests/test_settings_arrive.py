@@ -154,15 +154,15 @@ def test_those_of_a_regularizer(config, attributes):
     [config for config in REGULARIZERS.values() if isinstance(config, GainConfig)],
     ids=lambda config: config.name,
 )
-def test_a_gain_scales_every_term_of_the_policy(config):
-    """Else ramps and targets change nothing."""
+def test_one_gain_scales_every_term_of_the_policy(config):
+    """Otherwise ramps and targets would change nothing."""
     loss, batch, found = config.add_to(normal()), transitions(6), []
     batch["previous_observation"] = batch["observation"] + 0.1
     if config.name == "asap":  # whose prediction is the policy's at first
         for parameter in loss.asap_predictor.parameters():
             parameter.data.add_(0.1)
     for gain in (1.0, 0.5):
-        config.apply(loss, {"all": gain})
+        loss.regularizer_gain = gain
         torch.manual_seed(1)
         found.append(loss.policy_regularizer(batch.copy()))
     for key in loss.policy_terms:

@@ -147,33 +147,6 @@ def ddpg_batch():
     )
 
 
-@pytest.mark.parametrize(
-    ("neighborhood", "num_samples", "told"),
-    [
-        (Neighborhood(sigma=2.0), 1, "sigma 2 and 1, lambda_min 0.01 and 0.01"),
-        (Neighborhood(lambda_max=0.5), 1, "lambda_max 0.5 and 1"),
-        (Neighborhood(), 3, "num_samples 3 and 1"),
-        (Neighborhood(), 1, None),
-    ],
-)
-def test_a_transform_with_another_neighborhood_than_the_losss_is_told_once(
-    neighborhood, num_samples, told
-):
-    """At the first batch, with both numbers; the same one says nothing."""
-    loss = L2C2Loss(ddpg())
-    transform = NeighborTransform(neighborhood, num_samples=num_samples)
-    messages = warned(lambda: [loss(transform(ddpg_batch())) for _ in range(2)])
-    assert len(messages) == (told is not None)
-    assert told is None or told in messages[0]
-
-
-def test_neighbors_of_ones_own_making_are_not_compared():
-    """Without a word of their neighborhood, any are right."""
-    loss, batch = L2C2Loss(ddpg()), NeighborTransform(Neighborhood(sigma=2.0))(ddpg_batch())
-    del batch["neighbor", "neighborhood"]
-    assert not warned(lambda: loss(batch))
-
-
 def test_actions_of_several_ranges_are_told_of_td3s_noise():
     """Which has one deviation for all of them."""
     env = GymEnv("LunarLanderContinuous-v3")
@@ -188,17 +161,6 @@ def test_actions_of_several_ranges_are_told_of_td3s_noise():
 
 def make_td3(env):
     return TD3Config(hidden=(8,)).make_agent(env, NoRegularizerConfig(), AdamConfig())
-
-
-def test_an_experiment_compares_before_anything_is_compiled(monkeypatch):
-    """A compiled loss looks at no values."""
-
-    def another(self, generator):
-        return NeighborTransform(Neighborhood(), generator=generator)
-
-    monkeypatch.setattr(L2C2Config, "neighbors", another)
-    (message,) = warned(lambda: make("td3", regularizer=L2C2Config(num_samples=2), compile=True))
-    assert "num_samples 1 and 2" in message
 
 
 def test_gradient_shares_are_the_quotients_of_the_norms():

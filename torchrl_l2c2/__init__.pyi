@@ -18,6 +18,7 @@ from .objectives import (
     SR2LLoss,
 )
 from .optim import AdaTerm
+from .smoothing import smooth
 from .transforms import NeighborTransform, ObservationNoise
 from .updaters import TSoftUpdate
 
@@ -43,6 +44,7 @@ __all__ = [
     "make_actor",
     "make_critic",
     "register_hellinger",
+    "smooth",
     "squared_error",
     "squared_hellinger",
 ]

@@ -1,15 +1,16 @@
 r"""Gains that set themselves: how strong a regularizer is, from what comes of it.
 
 A gain has a ``value`` that multiplies a term, a ``step`` that is told something between updates and
-returns the next value, and a ``state_dict``. A regularized loss's coefficients are assigned to,
-also between calls of a compiled loss::
+returns the next value, and a ``state_dict``. The gain of a regularized loss is assigned to, also
+between calls of a compiled loss::
 
-    loss.l2c2_coeff = gain.step(measured)
+    loss.regularizer_gain = gain.step(measured)
 """
 
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterable
 from copy import deepcopy
 from numbers import Real
@@ -112,89 +113,7 @@ class RampGain(ConstantGain):
         return self.value
 
 
-class _BoundedGain(ConstantGain):
-    """A gain that moves by factors, within bounds around one of its values."""
-
-    def __init__(self, rate: float, limit: float, value: float) -> None:
-        check_real("rate", rate, above=0, at_most=1)
-        check_real("value", value, above=0)
-        check_real("limit", limit, above=1)
-        super().__init__(value)
-        self.rate, self.limit = float(rate), float(limit)
-        self._center = self.value
-
-    def _multiply(self, factor: float) -> None:
-        low, high = self._center / self.limit, self._center * self.limit
-        self.value = min(max(self.value * factor, low), high)
-
-
-class GradientGain(_BoundedGain):
-    r"""A gain that keeps a term's gradient at a share of that of the loss's own terms.
-
-    .. math::
-        \lambda \leftarrow \lambda\, \left(\frac{c}{\rho}\right)^{\max(\eta, 1/k)}, \qquad
-        \rho = \frac{\lVert \nabla_\theta\, \lambda L_r \rVert}{\lVert \nabla_\theta L \rVert},
-
-    the average, on the logarithm, of the gains at which the share would have been :math:`c`: over
-    all :math:`k` measurements and, once these are more than :math:`1 / \eta`, a moving one; kept
-    within bounds. The first measurement sets the gain by itself, so that the size of the term does
-    not matter. Norms of gradients are compared, as the value of an actor's loss has no natural
-    zero. A gain for each network: :math:`\theta` is what the term trains.
-
-    Args:
-        share (float): :math:`c`, greater than 0. Larger values regularize more.
-        rate (float): :math:`\eta`, in (0, 1]. Smaller values average over more steps. Defaults to
-            ``0.1``.
-        limit (float): the gain stays between the first that was measured divided by this, and
-            multiplied by it, greater than 1: a term whose gradient vanishes raises it no further.
-            Defaults to ``1000``.
-        value (float): the gain until something is measured, greater than 0: what the loss's
-            coefficient has to be at the first measurement. Defaults to ``1.0``.
-
-    Raises:
-        TypeError: if a value is not a real number.
-        ValueError: if it is out of its range.
-
-    Examples:
-        >>> gain = GradientGain(0.1)
-        >>> gain.step(0.001), gain.step(10.0)  # a hundredth of it; then, of two, a hundred times it
-        (100.0, 10.0)
-    """
-
-    def __init__(
-        self, share: float, rate: float = 0.1, limit: float = 1000.0, value: float = 1.0
-    ) -> None:
-        check_real("share", share, above=0)
-        super().__init__(rate, limit, value)
-        self.share, self._measurements = float(share), 0
-
-    def step(self, measured: float = math.nan) -> float:
-        r"""The next value after a share :math:`\rho`; 0 and what is not finite change nothing.
-
-        Raises:
-            TypeError: it is no number.
-        """
-        measured = _measured(measured)
-        if 0.0 < measured < math.inf:
-            wanted = self.share / measured
-            self._measurements += 1
-            if self._measurements == 1:
-                self._center = self.value * wanted
-            self._multiply(wanted ** max(self.rate, 1 / self._measurements))
-        return self.value
-
-    def state_dict(self) -> dict[str, float]:
-        """As :meth:`ConstantGain.state_dict`."""
-        measured = {"center": self._center, "measurements": self._measurements}
-        return {**super().state_dict(), **measured}
-
-    def load_state_dict(self, state: dict[str, float]) -> None:
-        """As :meth:`ConstantGain.load_state_dict`."""
-        super().load_state_dict(state)
-        self._center, self._measurements = state["center"], int(state["measurements"])
-
-
-class TargetGain(_BoundedGain):
+class TargetGain(ConstantGain):
     r"""A gain that rises while a measure is above its target, and falls while it is below.
 
     .. math::
@@ -228,8 +147,14 @@ class TargetGain(_BoundedGain):
         self, target: float, rate: float = 0.1, limit: float = 1000.0, value: float = 1.0
     ) -> None:
         check_real("target", target, above=0)
-        super().__init__(rate, limit, value)
+        check_real("rate", rate, above=0, at_most=1)
+        check_real("value", value, above=0)
+        check_real("limit", limit, above=1)
+        super().__init__(value)
         self.target = float(target)
+        self.rate = float(rate)
+        self.limit = float(limit)
+        self._first = self.value
 
     def step(self, measured: float = math.nan) -> float:
         """The next value after a measure :math:`m`; one that is not finite changes nothing.
@@ -240,7 +165,8 @@ class TargetGain(_BoundedGain):
         measured = _measured(measured)
         if math.isfinite(measured):
             excess = min(max(measured / self.target - 1.0, -1.0), 1.0)
-            self._multiply(math.exp(self.rate * excess))
+            value = self.value * math.exp(self.rate * excess)
+            self.value = min(max(value, self._first / self.limit), self._first * self.limit)
         return self.value
 
 
@@ -269,8 +195,8 @@ def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]
         \frac{\lVert \nabla_\theta L_r \rVert_2}{\lVert \nabla_\theta L \rVert_2}
 
     for every term :math:`L_r` that a regularizer has added to a loss :math:`L`, in the parameters
-    :math:`\theta` that the term trains. Nothing of the loss changes, and no number is drawn from
-    torch's global generators.
+    :math:`\theta` that the term trains, whether it is separate or folded into the loss's own.
+    Nothing of the loss changes, and no number is drawn from torch's global generators.
 
     Args:
         loss (LossModule): as it is trained; one that is not regularized has no shares.
@@ -279,6 +205,10 @@ def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]
     Returns:
         dict: at least 0 for every added ``loss_*`` key; infinite where the loss's own gradient is
         zero and the term's is not, 0 of a term that trains nothing, as with frozen networks.
+
+    Warns:
+        UserWarning: the loss was called in training, and a term was never differentiated: the
+            training loop does not add it, whatever its share is here.
 
     Raises:
         ValueError: a term is not a single number.
@@ -297,19 +227,29 @@ def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]
         >>> then = {"observation": torch.randn(8, 3), "reward": torch.randn(8, 1)}
         >>> now = {"observation": torch.randn(8, 3), "action": torch.randn(8, 1)}
         >>> batch = TensorDict({**now, "next": {**then, "done": flags, "terminated": flags}}, [8])
-        >>> gain = GradientGain(0.1, value=0.5)
-        >>> loss.cats_lambda_temporal = gain.step(gradient_shares(loss, batch)["loss_cats"])
-        >>> round(gradient_shares(loss, batch)["loss_cats"], 6)
-        0.1
+        >>> share = gradient_shares(loss, batch)["loss_cats"]
+        >>> loss.regularizer_gain = 2.0
+        >>> round(gradient_shares(loss, batch)["loss_cats"] / share, 3)
+        2.0
     """
-    added = [key for key in loss.out_keys if key in getattr(loss, "added_terms", ())]
+    names = getattr(loss, "added_terms", ())
+    shown = {f"penalty_{key.removeprefix('loss_')}": key for key in names}
+    added = [shown.get(key, key) for key in loss.out_keys if key in names or key in shown]
     if not added:
         return {}
     check_takes_gradients("gradient_shares")
+    if unused := getattr(getattr(loss, "_watch", None), "pending", None):
+        warnings.warn(
+            f"{sorted(unused)} were never differentiated: the training loop does not add them to "
+            "the loss that is minimized. Add them, or call loss.fold() after making it.",
+            stacklevel=3,
+        )
     # A copy, as some losses keep statistics of what they have seen.
     devices = {parameter.device for parameter in loss.parameters() if parameter.is_cuda}
     with torch.random.fork_rng(devices=devices):
         twin = deepcopy(loss)
+        if getattr(twin, "folded", False):
+            twin.unfold()
         terms = twin(batch.copy())
     if any(terms[key].ndim for key in terms.keys() if is_loss(key)):
         raise ValueError(

@@ -119,12 +119,6 @@ class Neighborhood:
         r"""The constant gain :math:`\lambda_\pi` in front of the regularization."""
         return self.lambda_max * self.epsilon
 
-    @property
-    def numbers(self) -> tuple[float, ...]:
-        """What it is, in numbers to be written beside its neighbors; without a bound infinity."""
-        bound = math.inf if self.max_step is None else self.max_step
-        return self.sigma, self.lambda_min, self.lambda_max, float(self.shared), bound
-
     def gain(self, distance: Tensor) -> Tensor:
         """The gain applied at a distance: :attr:`scale` over it.
 
@@ -149,8 +143,9 @@ class Neighborhood:
         """Draws neighbors of each state and their distances.
 
         The distance follows from the draw, not from the quotient of displacements, so it is
-        right for coordinates that did not move. Coordinates of ``next_state`` that are not finite,
-        as at the ends of some episodes, count as not having moved.
+        right for coordinates that did not move. Coordinates of ``next_state`` that are not finite
+        count as not having moved. If none is finite, as at the ends of some episodes, the
+        neighbor is the state itself, at an infinite distance with a gain of 0.
 
         Args:
             state: states, shape ``[*B, *F]`` with features of any shape, floating point.
@@ -163,7 +158,8 @@ class Neighborhood:
 
         Returns:
             The neighbors, shape ``[*B, K, *F]`` in the dtype of ``state``, and their distances,
-            shape ``[*B, K]``; infinite for steps longer than ``max_step``.
+            shape ``[*B, K]``; infinite for steps longer than ``max_step`` and for successors that
+            are not finite.
 
         Raises:
             TypeError: if the states are not floating point, or ``num_samples`` is no integer.
@@ -246,10 +242,11 @@ class Neighborhood:
         # Shared numbers may be those of an entry of another dtype.
         u = ((2.0 * uniform - 1.0) * self.radius).to(state.dtype)
         displacement = (next_state - state).to(state.dtype)
+        known = displacement.isfinite().reshape(*batch, features.numel()).any(-1)
         displacement = torch.nan_to_num(displacement, nan=0.0, posinf=0.0, neginf=0.0)
         # An explicit size: -1 is ambiguous for empty batches.
         distance = u.abs().reshape(*uniform.shape[: batch_dims + 1], drawn.numel()).amax(-1)
-        distance = distance + self.epsilon
+        distance = (distance + self.epsilon).masked_fill(~known.unsqueeze(-1), math.inf)
         if self.max_step is not None:
             step = displacement.reshape(*batch, features.numel()).square().sum(-1).sqrt()
             too_long = step > self.max_step

@@ -24,7 +24,14 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_l2c2.experiment.composition import CONF, composing, read, register, tell_sweep, tuned
+from torchrl_l2c2.experiment.composition import (
+    CONF,
+    composing,
+    preset_used,
+    read,
+    register,
+    tell_sweep,
+)
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.errors import EXPECTED, show_cause, warnings_told
 from torchrl_l2c2.experiment.progress import log, say
@@ -210,7 +217,7 @@ def run(
     chosen = (config.task, config.algorithm, config.regularizer)
     named = f"{', '.join(group.name for group in chosen)}, seed {config.seed}: {folder}"
     print(f"{standing}: {named}" if standing else named, flush=True)
-    if (told := tuned(config)) is not None:
+    if (told := preset_used(config)) is not None:
         print(told, flush=True)
     wait_for_folder(folder, patience)
     check_elsewhere(values["resume"])
@@ -253,7 +260,7 @@ def _train(
         closing(Experiment(config, folder, **going_on)) as experiment,
         _end_logged(folder),
     ):
-        if (told := tuned(config)) is not None:
+        if (told := preset_used(config)) is not None:
             log(folder, told)
         experiment.train(progress=standing or True)
         if not config.test_episodes:

@@ -22,9 +22,10 @@ from omegaconf.errors import OmegaConfBaseException
 from torchrl_l2c2.experiment.config import GROUPS, STEERING, ExperimentConfig
 from torchrl_l2c2.experiment.manual import manual
 from torchrl_l2c2.experiment.naming import run_name
-from torchrl_l2c2.experiment.regularizers import BEGIN_TUNED, TUNED, TUNED_ON
+from torchrl_l2c2.experiment.regularizers import BEGIN_WITH_PRESET, preset_settings
 from torchrl_l2c2.experiment.settings import SettingError, describe
-from torchrl_l2c2.experiment.tasks import PAPER_TASKS, TASKS
+from torchrl_l2c2.experiment.tasks import TASKS
+from torchrl_l2c2.presets import KINDS, preset
 
 PACKAGE = Path(__file__).parents[1]
 # Beside the package in a clone, within it when installed.
@@ -43,9 +44,9 @@ def register() -> None:
     for group, choices in GROUPS.items():
         for name, chosen in choices.items():
             store.store(group=group, name=name, node=_node(chosen))
-    for (name, own), (algorithm, tuned) in product(BEGIN_TUNED.items(), TUNED.items()):
-        node = {"regularizer": {**tuned, **own}}
-        store.store(group="tuned", name=f"{name}_{algorithm}", node=node)
+    for name, algorithm in product(BEGIN_WITH_PRESET, KINDS):
+        node = {"regularizer": preset_settings(name, algorithm)}
+        store.store(group="regularizer_preset", name=f"{name}_{algorithm}", node=node)
     unknown = dict.fromkeys(("env_id", "noise_scale", "max_steps", "solved_at"))
     any_task = {"name": "${task.env_id}", **unknown}
     store.store(
@@ -257,25 +258,22 @@ def folder_named(setting: str, given: Any) -> str | None:
     return named
 
 
-def tuned(config: ExperimentConfig) -> str | None:
-    """Where L2C2's settings begin with the algorithm, or that none were found for it; in a line."""
+def preset_used(config: ExperimentConfig) -> str | None:
+    """The preset that the regularizer's settings begin with, or that there is none; in a line."""
     regularizer, algorithm = config.regularizer, config.algorithm.name
-    if regularizer.name not in BEGIN_TUNED:
+    if regularizer.name not in BEGIN_WITH_PRESET:
         return None
-    if algorithm in TUNED:
-        chosen = ", ".join(f"{name}={getattr(regularizer, name)}" for name in TUNED[algorithm])
-        where = (
-            f"found for {algorithm} on {TUNED_ON[algorithm]}, or given; larger rewards may want "
-            "larger gains; regularizer=l2c2_paper is the paper's"
-        )
-        return f"regularizer={regularizer.name}: {chosen} ({where})"
-    if algorithm != ExperimentConfig().algorithm.name or config.task.name not in PAPER_TASKS:
-        found = ", ".join(TUNED)
+    method, _ = BEGIN_WITH_PRESET[regularizer.name]
+    if algorithm not in KINDS:
         return (
-            f"regularizer={regularizer.name}: the paper's gains, which are for its own tasks and "
-            f"algorithm; others were found for {found} alone"
+            f"regularizer={regularizer.name}: there is no preset for {algorithm}; the settings are "
+            "the paper's, or given"
         )
-    return None
+    begins = preset_settings(regularizer.name, algorithm)
+    chosen = ", ".join(f"{name}={getattr(regularizer, name)}" for name in begins)
+    where = preset(method, algorithm)
+    origin = f"{where.evidence}, on {where.tasks}" if where.evidence else "its authors' settings"
+    return f"regularizer={regularizer.name}: {chosen} (the preset for {algorithm}: {origin})"
 
 
 def tell_sweep() -> None:

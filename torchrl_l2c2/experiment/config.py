@@ -13,7 +13,12 @@ from pydantic import Field
 
 from torchrl_l2c2.experiment.algorithms import ALGORITHMS, AlgorithmConfig, PPORPEConfig
 from torchrl_l2c2.experiment.optimizers import OPTIMIZERS, OptimizerConfig
-from torchrl_l2c2.experiment.regularizers import REGULARIZERS, TUNED, L2C2Config, RegularizerConfig
+from torchrl_l2c2.experiment.regularizers import (
+    REGULARIZERS,
+    L2C2Config,
+    RegularizerConfig,
+    preset_settings,
+)
 from torchrl_l2c2.experiment.replay import REPLAYS, ReplayConfig
 from torchrl_l2c2.experiment.settings import SettingError, read, settings
 from torchrl_l2c2.experiment.tasks import TASKS, TaskConfig
@@ -59,8 +64,8 @@ class ExperimentConfig:
     """Everything one run depends on; the defaults are those of ``python train.py``.
 
     Left out, ``replay`` and ``optimizer`` are the algorithm's usual ones, and
-    ``regularizer`` is L2C2 with what was found for the algorithm, or else the paper's; an
-    ``L2C2Config()`` that is given begins from the paper's with any.
+    ``regularizer`` is L2C2 with the preset of the algorithm, or else the paper's settings; an
+    ``L2C2Config()`` that is given begins with the paper's settings.
 
     Raises:
         SettingError: a setting that is not known or lies outside its range.
@@ -146,8 +151,8 @@ class ExperimentConfig:
     def __post_init__(self) -> None:
         # Frozen: this is how a default that depends on another field is set.
         if self.regularizer is None:
-            tuned = TUNED.get(self.algorithm.name, {})
-            object.__setattr__(self, "regularizer", L2C2Config(**tuned))
+            begins = preset_settings("l2c2", self.algorithm.name)
+            object.__setattr__(self, "regularizer", L2C2Config(**begins))
         if self.replay is None:
             object.__setattr__(self, "replay", REPLAYS[self.algorithm.usual_replay])
         if self.optimizer is None:
@@ -314,6 +319,7 @@ NEUTRAL_SETTINGS = {
     "regularizer.over_neighbors": "mean",
     "regularizer.fraction": 1.0,
     "regularizer.gain": "constant",
+    "regularizer.strength": 1.0,
     "regularizer.gain_of": "action_variation",
     "regularizer.gain_rate": 0.1,
     "regularizer.gain_limit": 1000.0,

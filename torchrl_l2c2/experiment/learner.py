@@ -17,8 +17,6 @@ from torchrl_l2c2.experiment.frames import Frame
 from torchrl_l2c2.experiment.row_writer import RowWriter
 from torchrl_l2c2.experiment.update import ReplayUpdate
 from torchrl_l2c2.gains import gradient_shares, is_loss
-from torchrl_l2c2.objectives import L2C2Loss
-from torchrl_l2c2.transforms import NeighborTransform
 
 # Updates after which the regularizer's gradients are measured, and the share of the loss's own
 # below which they are told to be too small. It is far below what changes a result: the share of
@@ -94,10 +92,6 @@ class Learner:
             # Where they are missing, TorchRL's loss estimates them anew, along a minibatch, whose
             # rows do not follow each other in time.
             self._read_keys += [agent.advantage.advantage_key, agent.advantage.value_target_key]
-        # Here, as a compiled update would not tell.
-        for transform in replay.transform.transforms:
-            if isinstance(agent.loss, L2C2Loss) and isinstance(transform, NeighborTransform):
-                agent.loss.compare_neighbors(transform.neighborhood, transform.num_samples)
         self.renew()
 
     def renew(self) -> None:

@@ -10,8 +10,9 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from torchrl_l2c2.experiment.config import GROUPS, ExperimentConfig
-from torchrl_l2c2.experiment.regularizers import BEGIN_TUNED, TUNED
+from torchrl_l2c2.experiment.regularizers import BEGIN_WITH_PRESET, preset_settings
 from torchrl_l2c2.experiment.settings import describe
+from torchrl_l2c2.presets import KINDS
 
 HEAD = """\
 Trains the paper's experiment: task=swingup regularizer=l2c2, and what else is chosen below.
@@ -62,12 +63,16 @@ def _about(name: str, chosen: Any, first: Any) -> str:
     names = [n for n in describe(type(chosen)) if getattr(chosen, n) != getattr(first, n)]
     differing = _together({name: getattr(chosen, name) for name in names})
     doc = (chosen.__doc__ or "").splitlines()[0]
-    tuned = TUNED.items() if name in BEGIN_TUNED else ()
-    own = BEGIN_TUNED.get(name, {})
-    begins = (f" (With algorithm={a} from {_together({**values, **own})}.)" for a, values in tuned)
-    # Where the first begins elsewhere with some algorithms, the paper's does not.
-    like = "l2c2_paper" if first.name in BEGIN_TUNED and name not in BEGIN_TUNED else first.name
-    return (f"{like} with {differing}" if differing else doc) + "".join(begins)
+    begins = {}
+    for kind in KINDS if name in BEGIN_WITH_PRESET else ():
+        settings = preset_settings(name, kind)
+        others = {n: v for n, v in settings.items() if getattr(chosen, n) != v}
+        if others:
+            begins[kind] = f" (With algorithm={kind}: {_together(others)}.)"
+    # The first of its kind begins with a preset; the paper's does not.
+    of_first = first.name == "l2c2" and name not in BEGIN_WITH_PRESET
+    like = "l2c2_paper" if of_first else first.name
+    return (f"{like} with {differing}" if differing else doc) + "".join(begins.values())
 
 
 def _together(values: Mapping[str, Any]) -> str:

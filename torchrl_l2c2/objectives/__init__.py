@@ -1,5 +1,6 @@
 """Losses: L2C2, its rivals, what they are built on, and PPO-RPE."""
 
+from torchrl_l2c2.objectives._networks import SharedEvaluation
 from torchrl_l2c2.objectives.asap import ASAPLoss
 from torchrl_l2c2.objectives.caps import CAPSLoss
 from torchrl_l2c2.objectives.cats import CATSLoss
@@ -8,7 +9,6 @@ from torchrl_l2c2.objectives.l2c2 import L2C2Loss
 from torchrl_l2c2.objectives.lcp import LCPLoss
 from torchrl_l2c2.objectives.ppo_rpe import PPORPELoss
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
-from torchrl_l2c2.objectives.shared_evaluation import SharedEvaluation
 from torchrl_l2c2.objectives.sr2l import SR2LLoss
 
 __all__ = [

@@ -7,12 +7,11 @@ from typing import Literal
 
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_l2c2.distances import squared_error
+from torchrl_l2c2.objectives._networks import POLICY_NETWORK
 from torchrl_l2c2.objectives.grad_caps import GradCAPSLoss
-from torchrl_l2c2.objectives.wiring import POLICY_NETWORK
 from torchrl_l2c2.policy_distances import policy_mean
 
 
@@ -57,6 +56,8 @@ class ASAPLoss(GradCAPSLoss):
         frames_key (NestedKey): as for :class:`GradCAPSLoss`.
         previous_key (NestedKey, optional): likewise.
         mean (str): likewise.
+        fraction (float): likewise.
+        skip_ends (bool): likewise; leaves these transitions out of Grad-CAPS's term.
 
     Raises:
         TypeError: as for :class:`GradCAPSLoss`.
@@ -88,6 +89,8 @@ class ASAPLoss(GradCAPSLoss):
         frames_key: NestedKey = "frames",
         previous_key: NestedKey | None = None,
         mean: Literal["loc", "action"] = "loc",
+        fraction: float = 1.0,
+        skip_ends: bool = False,
     ) -> None:
         super().__init__(
             base_loss,
@@ -96,6 +99,8 @@ class ASAPLoss(GradCAPSLoss):
             frames_key=frames_key,
             previous_key=previous_key,
             mean=mean,
+            fraction=fraction,
+            skip_ends=skip_ends,
         )
         self.register_coefficient("asap_lambda_spatial", lambda_spatial)
         self.register_coefficient("asap_lambda_temporal", lambda_temporal)
@@ -104,18 +109,17 @@ class ASAPLoss(GradCAPSLoss):
 
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
         terms = super().policy_regularizer(tensordict)
-        _, mean, _ = self.successive_means(tensordict)
-        predicted = self._predicted(tensordict)
-        for kind, trained, fixed in (("spatial", mean, predicted), ("temporal", predicted, mean)):
-            term = self.reduce_term(2.0 * squared_error(trained, fixed.detach()), tensordict)
-            terms.set(f"loss_asap_{kind}", self.scaled(term, f"asap_lambda_{kind}"))
-        return terms
-
-    def _predicted(self, tensordict: TensorDictBase) -> Tensor:
-        """The action ``[*B, A]`` that was predicted at the states before."""
-        before = self.states_around(tensordict)[:1]
-        predicted = self._evaluation.policy_at(self, tensordict, before, "asap_predictor")
-        return policy_mean(predicted, squashed=self.grad_caps_mean == "action").squeeze(0)
+        near = self.successive_means(tensordict)
+        predictor = self.policy_at(near.batch, near.states_before, "asap_predictor")
+        squashed = self.grad_caps_mean == "action"
+        predicted = policy_mean(predictor, squashed=squashed).squeeze(0)
+        spatial = 2.0 * squared_error(near.mean, predicted.detach())
+        spatial = self.reduce_term(spatial, tensordict, rows=near.rows)
+        terms.set("loss_asap_spatial", self.scaled(spatial, "asap_lambda_spatial"))
+        temporal = 2.0 * squared_error(predicted, near.mean.detach())
+        temporal = self.reduce_term(temporal, tensordict, rows=near.rows)
+        temporal = self.scaled(temporal, "asap_lambda_temporal", auxiliary=True)
+        return terms.set("loss_asap_temporal", temporal)
 
 
 def _copy_of_policy(loss: LossModule) -> TensorDictModuleBase:

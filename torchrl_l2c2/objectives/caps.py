@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import ClassVar, Literal
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_l2c2._checks import check_choice, check_real
 from torchrl_l2c2.distances import squared_error
+from torchrl_l2c2.objectives._batch import at_rows, finite_successor, is_floating_point
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
-from torchrl_l2c2.objectives.transitions import finite_successor, is_floating_point
 from torchrl_l2c2.policy_distances import policy_mean
 
 
@@ -35,7 +36,9 @@ class CAPSLoss(RegularizedLoss):
     vector; the heads of composite ones add up.
     The next state is that of the batch, with its masks and labels, several steps away behind
     ``MultiStepTransform``; the noisy one has those of the state. Coordinates of the next
-    observation that are not finite, as at the ends of some episodes, count as not having moved.
+    observation that are not finite count as not having moved; transitions without a finite one, as
+    at the ends of some episodes, do not count in the temporal term, and ``caps_counted`` is the
+    share of the batch that does.
 
     .. note:: The noise is drawn with torch's global generator. The gains are buffers that can be
         assigned to, as in ``loss.caps_lambda_spatial = 0.1``, also between calls of a compiled
@@ -55,6 +58,12 @@ class CAPSLoss(RegularizedLoss):
             policies as well; ``"action"`` compares deterministic actions, which hardly move once
             they are saturated. The same for policies that are not squashed, and for deterministic
             ones, which give their action alone. [inferred] Defaults to ``"loc"``.
+        fraction (float): share of the batch, in (0, 1], whose states are compared, drawn anew each
+            time with torch's global generator. Smaller ones cost less time and memory, pay in large
+            batches, and are noisier; the terms' expectation stays. Defaults to ``1.0``.
+        skip_ends (bool): whether transitions at which an episode ends are left out of the temporal
+            term: for environments whose next observation is the reset state there. Defaults to
+            ``False``.
 
     Raises:
         TypeError: the loss has no policy or cannot be regularized, or an argument has the wrong
@@ -78,6 +87,8 @@ class CAPSLoss(RegularizedLoss):
         0.0
     """
 
+    _settings: ClassVar[tuple[str, ...]] = ("caps_sigma", "caps_mean", "caps_fraction")
+
     def __init__(
         self,
         base_loss: LossModule,
@@ -86,30 +97,47 @@ class CAPSLoss(RegularizedLoss):
         lambda_spatial: float = 0.05,
         *,
         mean: Literal["loc", "action"] = "loc",
+        fraction: float = 1.0,
+        skip_ends: bool = False,
     ) -> None:
         check_choice("mean", mean, ("loc", "action"))
         check_real("sigma", sigma, above=0)
         self.caps_sigma = float(sigma)
+        check_real("fraction", fraction, above=0, at_most=1)
         self.caps_mean = mean
+        self.caps_fraction = float(fraction)
+        self.skip_ends = self.skip_ends or bool(skip_ends)
         self.register_coefficient("caps_lambda_temporal", lambda_temporal)
         self.register_coefficient("caps_lambda_spatial", lambda_spatial)
         self.declare_policy()
-        self.declare_terms(policy=["loss_caps_temporal", "loss_caps_spatial"])
+        self.declare_terms(
+            policy=["loss_caps_temporal", "loss_caps_spatial"], diagnostics=["caps_counted"]
+        )
 
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
         terms = super().policy_regularizer(tensordict)
-        policies = self.policies_at(tensordict, self._states(tensordict))
+        rows = self.sample_rows("caps", tensordict, self.caps_fraction)
+        batch = tensordict if rows is None else at_rows(tensordict, rows)
+        transitions = self.transitions(batch, self.policy_networks(), labels=True)
+        counts = self.counted(batch, transitions)
+        policies = self.policies_at(tensordict, self._states(batch, transitions), rows)
         squashed = self.caps_mean == "action"
         means = (policy_mean(policy, squashed=squashed) for policy in policies)
-        for kind, term in zip(("temporal", "spatial"), caps_terms(*means), strict=True):
-            term = self.reduce_term(term, tensordict)
-            terms.set(f"loss_caps_{kind}", self.scaled(term, f"caps_lambda_{kind}"))
-        return terms
+        temporal, spatial = caps_terms(*means)
+        temporal = self.reduce_term(temporal, tensordict, rows=rows, counts=counts)
+        spatial = self.reduce_term(spatial, tensordict, rows=rows)
+        terms.set("loss_caps_temporal", self.scaled(temporal, "caps_lambda_temporal"))
+        terms.set("loss_caps_spatial", self.scaled(spatial, "caps_lambda_spatial"))
+        counted = self.reduce_diagnostic(counts.to(temporal.dtype), tensordict, rows=rows)
+        return terms.set("caps_counted", counted)
 
-    def _states(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def _states(
+        self,
+        batch: TensorDictBase,
+        transitions: Mapping[NestedKey, tuple[Tensor, Tensor]],
+    ) -> TensorDictBase:
         """The next state and a noisy one, ``[2, *B]``."""
-        states = TensorDict(batch_size=[2, *tensordict.batch_size])
-        transitions = self.transitions(tensordict, self.policy_networks(), labels=True)
+        states = TensorDict(batch_size=[2, *batch.batch_size])
         for key, (state, successor) in transitions.items():
             later = finite_successor(state, successor)
             noisy = state

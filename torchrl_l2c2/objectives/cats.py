@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from torchrl_l2c2._checks import check_choice
+from torchrl_l2c2._checks import check_choice, check_real
 from torchrl_l2c2.distances import squared_error
+from torchrl_l2c2.objectives._batch import at_rows, finite_successor
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
-from torchrl_l2c2.objectives.transitions import finite_successor
 from torchrl_l2c2.policy_distances import policy_mean
 
 
@@ -23,15 +23,16 @@ class CATSLoss(RegularizedLoss):
     .. math::
         \frac kK\, \lambda\, \mathbb E\left[\lVert \mu(s) - \mu(s') \rVert_2^2\right]
 
-    as ``loss_cats``, in update :math:`k` of :math:`K`. The ramp is the caller's: assign
-    ``loss.cats_lambda_temporal = RampGain(0.1).step(progress)``
-    (:class:`torchrl_l2c2.gains.RampGain`), as ``regularizer=cats`` does in a run. There is no
-    spatial term: its authors bound it by twice the temporal one. Gradients flow into the policy
+    as ``loss_cats``, in update :math:`k` of :math:`K`. The ramp is that of
+    :meth:`~RegularizedLoss.ramp` and :meth:`~RegularizedLoss.set_progress`. There is no spatial
+    term: its authors bound it by twice the temporal one. Gradients flow into the policy
     alone, through both states.
 
     [inferred] Which side of a squashing is compared and the value of :math:`\lambda` could not be
     read. The next state is that of the batch, with its masks and labels, several steps away behind
-    ``MultiStepTransform``. Its coordinates that are not finite count as not having moved.
+    ``MultiStepTransform``. Its coordinates that are not finite count as not having moved;
+    transitions without a finite one do not count, and ``cats_counted`` is the share of the batch
+    that does.
 
     Args:
         base_loss (LossModule): the loss; see :class:`RegularizedLoss` for how it is wrapped.
@@ -41,6 +42,12 @@ class CATSLoss(RegularizedLoss):
     Keyword Args:
         mean (str): ``"loc"`` compares means before the squashing, ``"action"`` deterministic
             actions. Defaults to ``"loc"``.
+        fraction (float): share of the batch, in (0, 1], whose states are compared, drawn anew each
+            time with torch's global generator. Smaller ones cost less time and memory, pay in large
+            batches, and are noisier; the terms' expectation stays. Defaults to ``1.0``.
+        skip_ends (bool): whether transitions at which an episode ends are left out of the temporal
+            term: for environments whose next observation is the reset state there. Defaults to
+            ``False``.
 
     Raises:
         TypeError: the loss has no policy or cannot be regularized, or an argument has the wrong
@@ -61,28 +68,42 @@ class CATSLoss(RegularizedLoss):
         0.0
     """
 
+    _settings: ClassVar[tuple[str, ...]] = ("cats_mean", "cats_fraction")
+
     def __init__(
         self,
         base_loss: LossModule,
         lambda_temporal: float = 0.1,
         *,
         mean: Literal["loc", "action"] = "loc",
+        fraction: float = 1.0,
+        skip_ends: bool = False,
     ) -> None:
         check_choice("mean", mean, ("loc", "action"))
+        check_real("fraction", fraction, above=0, at_most=1)
         self.cats_mean = mean
+        self.cats_fraction = float(fraction)
+        self.skip_ends = self.skip_ends or bool(skip_ends)
         self.register_coefficient("cats_lambda_temporal", lambda_temporal)
         self.declare_policy()
-        self.declare_terms(policy=["loss_cats"])
+        self.declare_terms(policy=["loss_cats"], diagnostics=["cats_counted"])
 
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
         terms = super().policy_regularizer(tensordict)
-        transitions = self.transitions(tensordict, self.policy_networks(), labels=True)
+        rows = self.sample_rows("cats", tensordict, self.cats_fraction)
+        batch = tensordict if rows is None else at_rows(tensordict, rows)
+        transitions = self.transitions(batch, self.policy_networks(), labels=True)
+        counts = self.counted(batch, transitions)
         later = {key: finite_successor(*pair)[None] for key, pair in transitions.items()}
-        states = TensorDict(later, batch_size=[1, *tensordict.batch_size])
+        states = TensorDict(later, batch_size=[1, *batch.batch_size])
+        policies = self.policies_at(tensordict, states, rows)
         squashed = self.cats_mean == "action"
-        means = (policy_mean(p, squashed=squashed) for p in self.policies_at(tensordict, states))
-        term = self.reduce_term(cats_term(*means).squeeze(0), tensordict)
-        return terms.set("loss_cats", self.scaled(term, "cats_lambda_temporal"))
+        means = (policy_mean(policy, squashed=squashed) for policy in policies)
+        difference = cats_term(*means).squeeze(0)
+        term = self.reduce_term(difference, tensordict, rows=rows, counts=counts)
+        terms.set("loss_cats", self.scaled(term, "cats_lambda_temporal"))
+        counted = self.reduce_diagnostic(counts.to(term.dtype), tensordict, rows=rows)
+        return terms.set("cats_counted", counted)
 
 
 def cats_term(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar, Literal, NamedTuple
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -10,9 +10,31 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_l2c2._checks import check_choice, check_real, read_key
+from torchrl_l2c2.objectives._batch import at_rows, finite_successor, is_floating_point
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
-from torchrl_l2c2.objectives.transitions import finite_successor, is_floating_point
 from torchrl_l2c2.policy_distances import policy_mean
+
+
+class SuccessiveMeans(NamedTuple):
+    """A policy's means in three successive states of a batch ``[*B]``, or of ``M`` of its rows.
+
+    Attributes:
+        before: the means at the states before, ``[*B, A]`` or ``[M, A]``.
+        mean: the means at the states.
+        later: the means at the next states.
+        batch: the batch, or these rows of it.
+        states_before: the states before, ``[1, *B]`` or ``[1, M]``.
+        counts: which transitions count, ``[*B]`` or ``[M]``.
+        rows: ``[M]``, in the batch written as one row; ``None``: all.
+    """
+
+    before: Tensor
+    mean: Tensor
+    later: Tensor
+    batch: TensorDictBase
+    states_before: TensorDictBase
+    counts: Tensor
+    rows: Tensor | None
 
 
 class GradCAPSLoss(RegularizedLoss):
@@ -54,6 +76,12 @@ class GradCAPSLoss(RegularizedLoss):
             in the place of frames. Defaults to ``None``.
         mean (str): ``"loc"`` compares means before the squashing, ``"action"`` deterministic
             actions. Defaults to ``"loc"``.
+        fraction (float): share of the batch, in (0, 1], whose states are compared, drawn anew each
+            time with torch's global generator. Smaller ones cost less time and memory, pay in large
+            batches, and are noisier; the terms' expectation stays. Defaults to ``1.0``.
+        skip_ends (bool): whether transitions at which an episode ends are left out of the
+            term: for environments whose next observation is the reset state there. Defaults to
+            ``False``.
 
     Raises:
         TypeError: the loss has no policy or cannot be regularized, or an argument has the wrong
@@ -78,6 +106,12 @@ class GradCAPSLoss(RegularizedLoss):
         True
     """
 
+    _settings: ClassVar[tuple[str, ...]] = (
+        "grad_caps_epsilon",
+        "grad_caps_mean",
+        "grad_caps_fraction",
+    )
+
     def __init__(
         self,
         base_loss: LossModule,
@@ -87,10 +121,16 @@ class GradCAPSLoss(RegularizedLoss):
         frames_key: NestedKey = "frames",
         previous_key: NestedKey | None = None,
         mean: Literal["loc", "action"] = "loc",
+        fraction: float = 1.0,
+        skip_ends: bool = False,
     ) -> None:
         check_choice("mean", mean, ("loc", "action"))
         check_real("epsilon", epsilon, above=0)
-        self.grad_caps_epsilon, self.grad_caps_mean = float(epsilon), mean
+        check_real("fraction", fraction, above=0, at_most=1)
+        self.grad_caps_epsilon = float(epsilon)
+        self.grad_caps_mean = mean
+        self.grad_caps_fraction = float(fraction)
+        self.skip_ends = self.skip_ends or bool(skip_ends)
         self.grad_caps_frames_key = read_key("frames_key", frames_key)
         self.grad_caps_previous_key = previous_key
         if previous_key is not None:
@@ -98,30 +138,39 @@ class GradCAPSLoss(RegularizedLoss):
         self._grad_caps_checked = False
         self.register_coefficient("grad_caps_lambda_temporal", lambda_temporal)
         self.declare_policy()
-        self.declare_terms(policy=["loss_grad_caps"])
+        self.declare_terms(policy=["loss_grad_caps"], diagnostics=["grad_caps_counted"])
         self.declare_inputs([self.grad_caps_previous_key or self.grad_caps_frames_key])
 
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
         terms = super().policy_regularizer(tensordict)
-        means = self.successive_means(tensordict)
-        term = self.reduce_term(grad_caps_term(*means, self.grad_caps_epsilon), tensordict)
-        return terms.set("loss_grad_caps", self.scaled(term, "grad_caps_lambda_temporal"))
+        near = self.successive_means(tensordict)
+        means = near.before, near.mean, near.later
+        difference = grad_caps_term(*means, self.grad_caps_epsilon)
+        term = self.reduce_term(difference, tensordict, rows=near.rows, counts=near.counts)
+        terms.set("loss_grad_caps", self.scaled(term, "grad_caps_lambda_temporal"))
+        counted = near.counts.to(term.dtype)
+        counted = self.reduce_diagnostic(counted, tensordict, rows=near.rows)
+        return terms.set("grad_caps_counted", counted)
 
-    def successive_means(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
-        """The policy's means ``[*B, A]`` at the states before, the states and the next ones.
+    def successive_means(self, tensordict: TensorDictBase) -> SuccessiveMeans:
+        """The policy's means at the states before, the states and the next ones.
 
         Args:
             tensordict: the batch, ``[*B]``.
         """
         return self.made_once("grad_caps_means", lambda: self._evaluate_means(tensordict))
 
-    def _evaluate_means(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
+    def _evaluate_means(self, tensordict: TensorDictBase) -> SuccessiveMeans:
         squashed = self.grad_caps_mean == "action"
-        policies = self.policies_at(tensordict, self.states_around(tensordict))
+        rows = self.sample_rows("grad_caps", tensordict, self.grad_caps_fraction)
+        batch = tensordict if rows is None else at_rows(tensordict, rows)
+        counts = self.counted(batch, self.transitions(batch, self.policy_networks()))
+        states = self._states_around(batch)
+        policies = self.policies_at(tensordict, states, rows)
         here, there = (policy_mean(policy, squashed=squashed) for policy in policies)
-        return there[0], here[0], there[1]
+        return SuccessiveMeans(there[0], here[0], there[1], batch, states[:1], counts, rows)
 
-    def states_around(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def _states_around(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The state before and the next one, ``[2, *B]``."""
         transitions = self.transitions(tensordict, self.policy_networks(), labels=True)
         observations = [key for key, (s, _) in transitions.items() if is_floating_point(s)]

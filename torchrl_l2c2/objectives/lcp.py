@@ -1,6 +1,8 @@
-"""LCP: policies whose log-likelihood has a small gradient in the state."""
+"""LCP: policies whose log-likelihood, or whose mean, has a small gradient in the state."""
 
 from __future__ import annotations
+
+from typing import ClassVar, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -9,11 +11,12 @@ from torch import Tensor
 from torch.distributions import Distribution
 from torchrl.objectives import LossModule
 
-from torchrl_l2c2._checks import check_takes_gradients
+from torchrl_l2c2._checks import check_choice, check_real, check_takes_gradients
 from torchrl_l2c2.distances import log_prob_of
-from torchrl_l2c2.objectives.precision import in_full_precision
+from torchrl_l2c2.objectives._batch import at_rows
+from torchrl_l2c2.objectives._networks import POLICY_NETWORK, Policy, in_full_precision
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
-from torchrl_l2c2.objectives.wiring import POLICY_NETWORK
+from torchrl_l2c2.policy_distances import policy_mean
 
 
 class LCPLoss(RegularizedLoss):
@@ -25,8 +28,16 @@ class LCPLoss(RegularizedLoss):
         \lambda\, \mathbb E\left[\lVert \nabla_s \ln\pi(a|s) \rVert_2^2\right]
 
     at the states and actions of the batch ("Learning Smooth Humanoid Locomotion through
-    Lipschitz-Constrained Policies", arXiv 2410.11825). Nothing is drawn, and no next state is
-    needed. Gradients flow into the policy alone.
+    Lipschitz-Constrained Policies", arXiv 2410.11825). No next state is needed. Gradients flow into
+    the policy alone. With ``of="mean"`` it is the squared norm of the Jacobian of the mean instead,
+
+    .. math::
+        \lambda\, \mathbb E\left[\lVert \nabla_s \mu(s) \rVert_F^2\right]
+        = \lambda\, \mathbb E\left[\lVert \nabla_s\, v^\top \mu(s) \rVert_2^2\right],
+        \qquad v_i = \pm 1,
+
+    which does not depend on how wide the policy is, and which deterministic policies have as well.
+    One random sign vector :math:`v` for each state estimates it without bias.
 
     .. note:: ``torch.compile`` does not take it, as it differentiates twice (the experiment's
         updates are compiled otherwise, and are). A narrow policy has a steep likelihood: as the
@@ -37,9 +48,15 @@ class LCPLoss(RegularizedLoss):
         coeff (float): :math:`\lambda`, at least 0. Larger values flatten the policy. Scheduled as
             ``lcp_coeff``. Defaults to ``0.002``.
 
+    Keyword Args:
+        of (str): ``"log_prob"``, the method's, or ``"mean"``. Defaults to ``"log_prob"``.
+        fraction (float): share of the batch, in (0, 1], whose states are compared, drawn anew each
+            time with torch's global generator. Smaller ones cost less time and memory, pay in large
+            batches, and are noisier; the terms' expectation stays. Defaults to ``1.0``.
+
     Raises:
-        TypeError: the loss has no stochastic policy or cannot be regularized, or an argument has
-            the wrong type.
+        TypeError: the loss has no policy, or no stochastic one for ``of="log_prob"``, or cannot be
+            regularized, or an argument has the wrong type.
         ValueError: an argument is out of its range.
 
     Examples:
@@ -54,35 +71,61 @@ class LCPLoss(RegularizedLoss):
         True
     """
 
-    def __init__(self, base_loss: LossModule, coeff: float = 0.002) -> None:
+    _settings: ClassVar[tuple[str, ...]] = ("lcp_of", "lcp_fraction")
+
+    def __init__(
+        self,
+        base_loss: LossModule,
+        coeff: float = 0.002,
+        *,
+        of: Literal["log_prob", "mean"] = "log_prob",
+        fraction: float = 1.0,
+    ) -> None:
+        check_choice("of", of, ("log_prob", "mean"))
+        check_real("fraction", fraction, above=0, at_most=1)
+        self.lcp_of = of
+        self.lcp_fraction = float(fraction)
         self.register_coefficient("lcp_coeff", coeff)
         self.declare_policy(successors=False)
-        if not self.has_stochastic_policy():
+        if of == "log_prob" and not self.has_stochastic_policy():
             raise TypeError(
                 f"LCPLoss needs a stochastic policy: that of {type(base_loss).__name__} has no "
-                "likelihood. All other regularizers take deterministic ones."
+                "likelihood. Use of='mean', or another regularizer."
             )
         self.declare_terms(policy=["loss_lcp"])
 
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
         terms = super().policy_regularizer(tensordict)
         check_takes_gradients("LCPLoss")
-        read = self.policy_states(tensordict)
+        rows = self.sample_rows("lcp", tensordict, self.lcp_fraction)
+        batch = tensordict if rows is None else at_rows(tensordict, rows)
+        read = self.policy_states(batch)
         with torch.enable_grad():
             states = {key: state.unsqueeze(0).requires_grad_() for key, state in read.items()}
-            others = TensorDict(states, batch_size=[1, *tensordict.batch_size])
-            policy = self.policy_at(tensordict, others)
-            assert isinstance(policy, Distribution)
-            actions = tensordict.detach().unsqueeze(0)
-            if not isinstance(policy, CompositeDistribution):
-                # Of a loss that does not name it, what the policy writes.
-                written = self._evaluation.wiring[POLICY_NETWORK].output
-                actions = actions.get(getattr(self.tensor_keys, "action", written))
-            log_prob = log_prob_of(policy, actions)
-            with in_full_precision(tensordict):
-                term = lcp_term(log_prob, list(states.values()), tensordict.batch_dims + 1)
-        term = self.reduce_term(term.squeeze(0), tensordict)
+            others = TensorDict(states, batch_size=[1, *batch.batch_size])
+            policy = self.policy_at(batch, others)
+            output = self._log_prob(policy, batch) if self.lcp_of == "log_prob" else _signed(policy)
+            with in_full_precision(batch):
+                term = lcp_term(output, list(states.values()), batch.batch_dims + 1)
+        term = self.reduce_term(term.squeeze(0), tensordict, rows=rows)
         return terms.set("loss_lcp", self.scaled(term, "lcp_coeff"))
+
+    def _log_prob(self, policy: Policy, batch: TensorDictBase) -> Tensor:
+        """The log-likelihood of the batch's actions, ``[1, *B]``."""
+        assert isinstance(policy, Distribution)
+        actions = batch.detach().unsqueeze(0)
+        if not isinstance(policy, CompositeDistribution):
+            # If the loss does not name the action, it is the output of the policy.
+            written = self.networks[POLICY_NETWORK].output
+            actions = actions.get(getattr(self.tensor_keys, "action", written))
+        return log_prob_of(policy, actions)
+
+
+def _signed(policy: Policy) -> Tensor:
+    """The sum of the mean's coordinates with random signs, ``[1, *B]``."""
+    mean = policy_mean(policy)
+    signs = 2.0 * torch.randint_like(mean, 2) - 1.0
+    return (signs * mean).sum(-1)
 
 
 def lcp_term(

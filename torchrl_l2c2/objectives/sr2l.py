@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -13,8 +13,8 @@ from torchrl.objectives import LossModule
 
 from torchrl_l2c2._checks import check_positive_int, check_real, check_takes_gradients
 from torchrl_l2c2.divergences import kl_divergence
-from torchrl_l2c2.objectives.evaluation import Policy
-from torchrl_l2c2.objectives.precision import in_full_precision
+from torchrl_l2c2.objectives._batch import at_rows
+from torchrl_l2c2.objectives._networks import Policy, in_full_precision
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
 from torchrl_l2c2.policy_distances import (
     PolicyDistance,
@@ -58,6 +58,9 @@ class SR2LLoss(RegularizedLoss):
             either way, the paper's; or as for :class:`L2C2Loss`. Of deterministic
             policies half the squared distance of the actions, the paper's but for the half, or with
             ``"mse"`` their mean squared error. Defaults to ``"jeffreys"``.
+        fraction (float): share of the batch, in (0, 1], whose states are compared, drawn anew each
+            time with torch's global generator. Smaller ones cost less time and memory, pay in large
+            batches, and are noisier; the terms' expectation stays. Defaults to ``1.0``.
 
     Raises:
         TypeError: the loss has no policy or cannot be regularized, or an argument has the wrong
@@ -79,6 +82,8 @@ class SR2LLoss(RegularizedLoss):
         tensor(0.0450, grad_fn=<MulBackward0>)
     """
 
+    _settings: ClassVar[tuple[str, ...]] = ("sr2l_epsilon", "sr2l_steps", "sr2l_fraction")
+
     def __init__(
         self,
         base_loss: LossModule,
@@ -88,7 +93,10 @@ class SR2LLoss(RegularizedLoss):
         steps: int = 10,
         policy_distance: Literal["jeffreys", "hellinger", "mean", "mse", "kl"]
         | PolicyDistance = "jeffreys",
+        fraction: float = 1.0,
     ) -> None:
+        check_real("fraction", fraction, above=0, at_most=1)
+        self.sr2l_fraction = float(fraction)
         check_real("epsilon", epsilon, above=0)
         check_positive_int("steps", steps)
         self.sr2l_epsilon, self.sr2l_steps = float(epsilon), int(steps)
@@ -104,12 +112,14 @@ class SR2LLoss(RegularizedLoss):
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
         terms = super().policy_regularizer(tensordict)
         check_takes_gradients("SR2LLoss")
-        states = self.policy_states(tensordict)
+        rows = self.sample_rows("sr2l", tensordict, self.sr2l_fraction)
+        batch = tensordict if rows is None else at_rows(tensordict, rows)
+        states = self.policy_states(batch)
 
         def policy_at(places: States) -> Policy:
-            batch = {key: place.unsqueeze(0) for key, place in places.items()}
-            others = TensorDict(batch, batch_size=[1, *tensordict.batch_size])
-            return self.policy_at(tensordict, others)
+            moved = {key: place.unsqueeze(0) for key, place in places.items()}
+            others = TensorDict(moved, batch_size=[1, *batch.batch_size])
+            return self.policy_at(batch, others)
 
         here = policy_at(states)
 
@@ -117,7 +127,7 @@ class SR2LLoss(RegularizedLoss):
             return compare_policies(self._sr2l_distance, here, policy_at(moved)).squeeze(0)
 
         farthest = ascend(distance, states, self.sr2l_epsilon, self.sr2l_steps)
-        term = self.reduce_term(distance(farthest), tensordict)
+        term = self.reduce_term(distance(farthest), tensordict, rows=rows)
         return terms.set("loss_sr2l", self.scaled(term, "sr2l_coeff"))
 
 

@@ -77,26 +77,23 @@ def _place(
         neighbors.set(key, neighbor)
         distances.append(distance)
     distance = torch.stack(distances).amax(0)
-    if len(transitions) > 1 and neighborhood.max_step is not None:
-        # One step that is too long leaves the whole transition out.
+    if len(transitions) > 1:
+        # One entry that is too far away or not known leaves the whole transition out.
         far = distance.isinf()
         for key, (state, _) in transitions.items():
             near, ndim = neighbors.get(key), tensordict.batch_dims
             left_out = far.reshape(*far.shape, *(1,) * (near.ndim - far.ndim))
             neighbors.set(key, torch.where(left_out, state.unsqueeze(ndim), near))
-    # Filled in and not copied: a copy from the CPU would wait for the device, every time.
-    numbers = torch.stack([distance.new_full((), number) for number in neighborhood.numbers])
-    numbers = numbers.expand(*tensordict.batch_size, -1)
-    return neighbors.set("neighborhood", numbers).set("distance", distance)
+    return neighbors.set("distance", distance)
 
 
 def _check_names(keys: Sequence[NestedKey]) -> None:
     roots = [key if isinstance(key, str) else key[0] for key in keys]
-    if not roots or {"distance", "neighborhood"} & set(roots):
+    if not roots or "distance" in roots:
         raise ValueError(
-            "in_keys must name at least one entry and none called 'distance' or 'neighborhood', "
-            f"which say how far away neighbors are; got {list(keys)}. Rename it in the "
-            "environment, or choose other in_keys (or moved_keys)."
+            "in_keys must name at least one entry and none called 'distance', which says how far "
+            f"away neighbors are; got {list(keys)}. Rename it in the environment, or choose other "
+            "in_keys (or moved_keys)."
         )
 
 
@@ -130,14 +127,14 @@ class NeighborTransform(RandomTransform):
 
     Appended to a replay buffer, it adds to every batch the states
     :math:`\tilde s = s + (s' - s)\, u` of a :class:`Neighborhood` and their distances (Kobayashi,
-    L2C2, 2022, "Implementation"). It can equally be called on any tensordict with states and
-    successors. The batch keeps its size; with batch size ``[*B]`` and ``K`` samples the new entry
-    is, with the same batch size::
+    L2C2, 2022, "Implementation"). :meth:`L2C2Loss.neighbor_transform` makes it with the settings of
+    a loss; made by itself, it has to have the same. It can equally be called on any tensordict with
+    states and successors. The batch keeps its size; with batch size ``[*B]`` and ``K`` samples the
+    new entry is, with the same batch size::
 
         neighbor = {
             "observation": [*B, K, *F],   # one per key of in_keys, nested as there
-            "distance": [*B, K],
-            "neighborhood": [*B, 5],      # its numbers, for the loss to compare
+            "distance": [*B, K],          # infinite where the transition does not count
         }
 
     Several keys are parts of one state: their displacements are independent, unless ``shared``, and

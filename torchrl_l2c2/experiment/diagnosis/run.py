@@ -33,8 +33,7 @@ from torchrl_l2c2.experiment.saved import read_config, read_rows
 from torchrl_l2c2.experiment.trained import load_policy
 from torchrl_l2c2.experiment.video import play_pictures
 from torchrl_l2c2.gains import gradient_shares
-from torchrl_l2c2.objectives.evaluation import EvaluatedNetworks, is_ensemble
-from torchrl_l2c2.objectives.wiring import VALUE_NETWORKS
+from torchrl_l2c2.objectives._networks import VALUE_NETWORKS, EvaluatedNetworks, is_ensemble
 
 
 def diagnose_run(
@@ -109,7 +108,7 @@ def value_function(loss: LossModule, normalization: Normalization | None = None)
     if not present:
         return None
     network, evaluation = present[0], EvaluatedNetworks()
-    evaluation.wire(loss, [network])
+    evaluation.inspect(loss, [network])
     dim = int(is_ensemble(loss, network))
 
     def value(observation: Tensor, action: Tensor) -> Tensor:
@@ -133,8 +132,7 @@ def _trained(folder: Path, config: ExperimentConfig, env: EnvBase) -> Agent | No
     agent.load_networks(newest[1])
     gains = newest[1].get("gain", {}).get("gains", {})
     if gains and isinstance(config.regularizer, GainConfig):
-        values = {name: gain["value"] for name, gain in gains.items()}
-        config.regularizer.apply(agent.loss, values)
+        agent.loss.regularizer_gain = config.regularizer.strength * gains["all"]["value"]
     return agent
 
 

@@ -11,12 +11,11 @@ from torchrl_l2c2.experiment.regularizers.l2c2 import L2C2Config
 from torchrl_l2c2.experiment.regularizers.lcp import LCPConfig
 from torchrl_l2c2.experiment.regularizers.none import NoRegularizerConfig
 from torchrl_l2c2.experiment.regularizers.sr2l import SR2LConfig
+from torchrl_l2c2.presets import KINDS, METHODS, preset
 
 __all__ = [
-    "BEGIN_TUNED",
+    "BEGIN_WITH_PRESET",
     "REGULARIZERS",
-    "TUNED",
-    "TUNED_ON",
     "ASAPConfig",
     "CAPSConfig",
     "CATSConfig",
@@ -27,40 +26,42 @@ __all__ = [
     "NoRegularizerConfig",
     "RegularizerConfig",
     "SR2LConfig",
+    "preset_settings",
 ]
 
-# What begins from settings that were found for the algorithm, with what each has of its own;
-# l2c2_paper is the paper's with any.
-BEGIN_TUNED: dict[str, dict[str, Any]] = {
-    "l2c2": {},
-    "l2c2_constant": {"gain": "constant"},
-    "l2c2_ramp": {"gain": "ramp"},
+# Choices that begin with the preset of the algorithm, with what they replace in it; l2c2_paper has
+# the paper's settings with any algorithm.
+BEGIN_WITH_PRESET: dict[str, tuple[str, dict[str, Any]]] = {
+    "l2c2": ("l2c2", {}),
+    "l2c2_constant": ("l2c2", {"gain": "constant"}),
+    "l2c2_ramp": ("l2c2", {"gain": "ramp"}),
+    **{method: (method, {}) for method in METHODS if method != "l2c2"},
 }
-# These settings, by algorithm, of runs in results/; with others there are none.
-TUNED: dict[str, dict[str, Any]] = {
-    "ppo": {
-        "policy_distance": "mse",
-        "gain": "ramp",
-        "shared": True,
-        "lambda_min": 1.0,
-        "lambda_max": 100.0,
-        "beta": 0.0,
-    },
-    "sac": {
-        "policy_distance": "mean",
-        "shared": True,
-        "lambda_min": 10.0,
-        "lambda_max": 1000.0,
-        "beta": 0.0,
-    },
-    "td3": {"lambda_min": 0.1, "lambda_max": 10.0},
-}
-TUNED_ON = {
-    "ppo": "Pendulum, LunarLander and Walker2d",
-    "sac": "Pendulum",
-    # Its loss has the rewards' size, beside which a gain weighs.
-    "td3": "Pendulum with algorithm.reward_scale=null",
-}
+
+
+def preset_settings(regularizer: str, algorithm: str) -> dict[str, Any]:
+    """The settings that a choice of regularizer begins with, for an algorithm.
+
+    Args:
+        regularizer (str): a name of :data:`REGULARIZERS`.
+        algorithm (str): a name of an algorithm.
+
+    Returns:
+        dict: settings by name; empty if there is no preset.
+
+    Examples:
+        >>> preset_settings("l2c2_constant", "ppo")["gain"], preset_settings("l2c2_paper", "ppo")
+        ('constant', {})
+    """
+    if regularizer not in BEGIN_WITH_PRESET or algorithm not in KINDS:
+        return {}
+    method, own = BEGIN_WITH_PRESET[regularizer]
+    chosen = preset(method, algorithm)
+    gain: dict[str, Any] = {"gain": "constant" if chosen.ramp is None else "ramp"}
+    if chosen.ramp not in (None, 1.0):
+        gain["gain_length"] = chosen.ramp
+    return {**chosen.settings, **gain, **own}
+
 
 REGULARIZERS: dict[str, RegularizerConfig] = {
     "none": NoRegularizerConfig(),

@@ -53,8 +53,3 @@ class ASAPConfig(GainConfig):
             previous_key=PREVIOUS,
             mean=self.mean,
         )
-
-    def set_gains(self, loss: LossModule, policy: float, value: float) -> None:
-        # Not the predictor's own, which trains no policy.
-        loss.asap_lambda_spatial = policy * self.lambda_spatial
-        loss.grad_caps_lambda_temporal = policy * self.lambda_grad

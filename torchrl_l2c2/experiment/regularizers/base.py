@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
@@ -19,10 +18,10 @@ if TYPE_CHECKING:
 
 # The gains that read a setting: with the others it would have no effect.
 READ_BY = {
-    "gain_target": ("gradient", "target"),
+    "gain_target": ("target",),
     "gain_of": ("target",),
-    "gain_rate": ("gradient", "target"),
-    "gain_limit": ("gradient", "target"),
+    "gain_rate": ("target",),
+    "gain_limit": ("target",),
     "gain_length": ("ramp",),
 }
 # A setting of all who compare means.
@@ -78,37 +77,41 @@ class RegularizerConfig:
 class GainConfig(RegularizerConfig):
     """A regularizer whose terms have a gain: how it is set in the course of a run."""
 
-    gain: Literal["constant", "ramp", "gradient", "target"] = Field(
+    strength: float = Field(
+        default=1.0,
+        ge=0,
+        description="factor on the penalty; larger values smooth more, at some point at the cost "
+        "of return",
+    )
+    gain: Literal["constant", "ramp", "target"] = Field(
         default="constant",
-        description="what multiplies the regularizer's gains: 1, a linear ramp from 0 to 1, what "
-        "keeps the terms' gradients at gain_target of the loss's own, network by network, or what "
-        "keeps gain_of at gain_target or below; set after every episode",
+        description="schedule of the gain: constant, a linear ramp from 0 to 1, or the gain that "
+        "keeps gain_of at or below gain_target; set after every episode",
     )
     gain_target: float | None = Field(
-        default=None, gt=0, description="of gain=gradient, a ratio of norms, or gain=target"
+        default=None, gt=0, description="largest value of gain_of with gain=target"
     )
     gain_of: str = Field(
         default="action_variation",
-        description="of gain=target: the column of metrics.csv, of numbers of at least 0, that is "
-        "to be at most gain_target",
+        description="metrics.csv column that gain=target keeps at or below gain_target; its "
+        "numbers must be at least 0",
     )
     gain_rate: float = Field(
         default=0.1,
         gt=0,
         le=1,
-        description="of gain=gradient and gain=target: how fast the gain's logarithm follows",
+        description="largest change of the gain's logarithm in a step of gain=target",
     )
     gain_limit: float = Field(
         default=1000.0,
         gt=1,
-        description="of gain=gradient and gain=target: the gain is at most this times the first "
-        "that was measured, or 1, and at least that divided by this",
+        description="largest gain of gain=target; the smallest is 1 over it",
     )
     gain_length: float = Field(
         default=1.0,
         gt=0,
         le=1,
-        description="of gain=ramp: share of the whole training after which the gain is 1",
+        description="share of training after which the gain of gain=ramp is 1",
     )
 
     def __post_init__(self) -> None:
@@ -125,26 +128,13 @@ class GainConfig(RegularizerConfig):
                     f"{'null' if usual is None else usual}.",
                 )
 
+    def add_to(self, loss: LossModule) -> LossModule:
+        """As :meth:`RegularizerConfig.add_to`, at its strength."""
+        loss = super().add_to(loss)
+        loss.regularizer_gain = self.strength
+        return loss
+
     @property
     def ramped(self) -> bool:
         """As :attr:`RegularizerConfig.ramped`."""
         return self.gain == "ramp"
-
-    @property
-    def targets(self) -> dict[str, float]:
-        """What gains are to meet, by the names of the settings; nothing where there is none."""
-        return {} if self.gain_target is None else {"gain_target": self.gain_target}
-
-    def apply(self, loss: LossModule, gains: Mapping[str, float]) -> None:
-        """Sets the gains that a loss has now.
-
-        Args:
-            loss (LossModule): made by :meth:`wrap`.
-            gains (Mapping): of ``"policy"`` and ``"value"``, or of ``"all"``; 1 where it has none.
-        """
-        for_all = gains.get("all", 1.0)
-        self.set_gains(loss, gains.get("policy", for_all), gains.get("value", for_all))
-
-    def set_gains(self, loss: LossModule, policy: float, value: float) -> None:
-        """Multiplies the terms that train the policy and the values, from what the settings say."""
-        raise NotImplementedError

@@ -33,7 +33,3 @@ class CAPSConfig(GainConfig):
         from torchrl_l2c2.objectives import CAPSLoss
 
         return CAPSLoss(loss, self.sigma, self.lambda_temporal, self.lambda_spatial, mean=self.mean)
-
-    def set_gains(self, loss: LossModule, policy: float, value: float) -> None:
-        loss.caps_lambda_temporal = policy * self.lambda_temporal
-        loss.caps_lambda_spatial = policy * self.lambda_spatial

@@ -18,7 +18,7 @@ class CATSConfig(GainConfig):
     """A rival, CATSLoss, with its linear ramp over the training."""
 
     name: str = "cats"
-    gain: Literal["constant", "ramp", "gradient", "target"] = Field(
+    gain: Literal["constant", "ramp", "target"] = Field(
         default="ramp", description="as for the others; the ramp is the method's own"
     )
     lambda_temporal: float = Field(
@@ -30,6 +30,3 @@ class CATSConfig(GainConfig):
         from torchrl_l2c2.objectives import CATSLoss
 
         return CATSLoss(loss, self.lambda_temporal, mean=self.mean)
-
-    def set_gains(self, loss: LossModule, policy: float, value: float) -> None:
-        loss.cats_lambda_temporal = policy * self.lambda_temporal

@@ -35,6 +35,3 @@ class GradCAPSConfig(GainConfig):
         return GradCAPSLoss(
             loss, self.lambda_temporal, self.epsilon, previous_key=PREVIOUS, mean=self.mean
         )
-
-    def set_gains(self, loss: LossModule, policy: float, value: float) -> None:
-        loss.grad_caps_lambda_temporal = policy * self.lambda_temporal

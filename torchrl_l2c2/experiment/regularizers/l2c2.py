@@ -47,12 +47,6 @@ class L2C2Config(GainConfig):
         ge=0,
         description="gain of the value's regularization relative to the policy's [paper]",
     )
-    gain_target_value: float | None = Field(
-        default=None,
-        ge=0,
-        description="of gain=gradient: gain_target of the value's regularization, where it is to "
-        "be another than the policy's; 0: none of it",
-    )
     num_samples: int = Field(default=1, ge=1, description="neighbors per transition [inferred: 1]")
     over_neighbors: Literal["mean", "max"] = Field(
         default="mean",
@@ -96,22 +90,11 @@ class L2C2Config(GainConfig):
             )
         if self.over_neighbors == "max" and self.num_samples == 1:
             raise SettingError("num_samples", "must be above 1 with over_neighbors=max, got 1.")
-        if self.gain_target_value is not None and (self.gain != "gradient" or not self.beta):
-            raise SettingError(
-                "gain_target_value",
-                f"needs gain=gradient and a beta above 0, got gain={self.gain} and "
-                f"beta={self.beta}: set these, or leave it at null.",
-            )
         if self.tchebycheff_ideal is not None and self.tchebycheff_mu is None:
             raise SettingError(
                 "tchebycheff_ideal",
                 f"is of tchebycheff_mu, which is null, got {self.tchebycheff_ideal}: set both.",
             )
-
-    @property
-    def targets(self) -> dict[str, float]:
-        both = {"gain_target": self.gain_target, "gain_target_value": self.gain_target_value}
-        return {name: target for name, target in both.items() if target is not None}
 
     @property
     def neighborhood(self) -> Neighborhood:
@@ -145,9 +128,3 @@ class L2C2Config(GainConfig):
         return NeighborTransform(
             self.neighborhood, num_samples=self.num_samples, generator=generator
         )
-
-    def set_gains(self, loss: LossModule, policy: float, value: float) -> None:
-        loss.l2c2_coeff = policy
-        if self.beta:
-            # The value terms have the factor l2c2_coeff * l2c2_beta.
-            loss.l2c2_beta = self.beta * value / policy if policy else self.beta

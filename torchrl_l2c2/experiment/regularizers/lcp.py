@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
@@ -19,11 +19,13 @@ class LCPConfig(GainConfig):
 
     name: str = "lcp"
     coeff: float = Field(default=0.002, ge=0, description="gain of the squared gradient")
+    of: Literal["log_prob", "mean"] = Field(
+        default="log_prob",
+        description="gradient of the log-likelihood, its authors', or of the mean action, which "
+        "noise does not lower",
+    )
 
     def wrap(self, loss: LossModule) -> LossModule:
         from torchrl_l2c2.objectives import LCPLoss
 
-        return LCPLoss(loss, self.coeff)
-
-    def set_gains(self, loss: LossModule, policy: float, value: float) -> None:
-        loss.lcp_coeff = policy * self.coeff
+        return LCPLoss(loss, self.coeff, of=self.of)

@@ -34,6 +34,3 @@ class SR2LConfig(GainConfig):
         return SR2LLoss(
             loss, self.epsilon, self.coeff, steps=self.steps, policy_distance=self.policy_distance
         )
-
-    def set_gains(self, loss: LossModule, policy: float, value: float) -> None:
-        loss.sr2l_coeff = policy * self.coeff

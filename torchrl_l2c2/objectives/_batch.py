@@ -1,4 +1,4 @@
-"""The transitions that a loss is trained on: which losses are, and what lies in their batches."""
+"""The transitions of a batch: which losses have them, and where they are."""
 
 from __future__ import annotations
 
@@ -232,3 +232,50 @@ def read_taken(tensordict: TensorDictBase, key: NestedKey, otherwise: str = "") 
     if (entry := tensordict.get(key, None)) is None:
         raise KeyError(f"the batch has no {key!r}: keep it{otherwise}.")
     return entry.detach()
+
+
+def draw_rows(
+    tensordict: TensorDictBase, fraction: float, device: torch.device | None = None
+) -> Tensor | None:
+    """A random share of a batch, with torch's global generator: no row twice, each as likely.
+
+    Args:
+        tensordict (TensorDictBase): the batch, ``[*B]``.
+        fraction (float): its share, in (0, 1]; rounded to whole rows, at least one.
+        device (torch.device, optional): of the batch's tensors.
+
+    Returns:
+        Tensor: ``[M]``, in the batch written as one row; ``None`` stands for all of them.
+    """
+    count = tensordict.numel()
+    drawn = max(1, round(fraction * count))
+    if drawn >= count:
+        return None
+    return torch.randperm(count, device=device)[:drawn]
+
+
+def spread_rows(value: Tensor, rows: Tensor, shape: torch.Size) -> Tensor:
+    """Numbers of some rows, as numbers of the whole batch with the same expectation.
+
+    Drawn rows stand for the others: they count ``B / M`` times, the others 0. That leaves the
+    expectation of every sum and mean over the batch as it is, with weights and masks or without.
+
+    Args:
+        value (Tensor): ``[M, ...]``.
+        rows (Tensor): ``[M]``, in the batch written as one row.
+        shape (torch.Size): of the batch, ``[*B]``.
+
+    Returns:
+        Tensor: ``[*B, ...]``.
+    """
+    count, rest = shape.numel(), value.shape[1:]
+    spread = value.new_zeros(count, *rest)
+    spread = spread.index_copy(0, rows, value * (count / len(rows)))
+    return spread.reshape(*shape, *rest)
+
+
+def at_rows(tensordict: TensorDictBase, rows: Tensor, dim: int = 0) -> TensorDictBase:
+    """Some rows of a batch ``[*B]``, behind ``dim`` other dimensions, written as one row."""
+    if tensordict.ndim > dim + 1:
+        tensordict = tensordict.flatten(dim, tensordict.ndim - 1)
+    return tensordict[:, rows] if dim else tensordict[rows]

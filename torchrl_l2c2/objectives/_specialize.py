@@ -1,21 +1,40 @@
-"""A class for a class: ``Extension[Loss]``, whose objects are made of a loss's very state."""
+"""Classes made at run time: ``Extension[Loss]``, which shares the state of a loss."""
 
 from __future__ import annotations
 
 import copy
 import functools
 import types
+import warnings
+import weakref
 from typing import Any, SupportsIndex
+from weakref import WeakKeyDictionary
 
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.objectives import LossModule
 
-from torchrl_l2c2.objectives.mixin import LossMixin
+# The loss that each was made of, while it lives, with its keys and its value estimator of then.
+_ORIGINALS: WeakKeyDictionary[SpecializedLoss, tuple[weakref.ref[LossModule], Any, Any]] = (
+    WeakKeyDictionary()
+)
 
 # What nn.Module itself keeps: dictionaries that two losses must not share.
 _REGISTRIES = frozenset(vars(nn.Module()))
+
+
+class _WithoutCopies(type(LossModule)):  # type: ignore[misc]
+    """TorchRL's metaclass gives every class a forward of its own, which would hide the loss's."""
+
+    def __init__(cls, name: str, bases: tuple[type, ...], namespace: dict[str, Any]) -> None:
+        super().__init__(name, bases, namespace)
+        if "forward" not in namespace:
+            del cls.forward
+
+
+class LossMixin(LossModule, metaclass=_WithoutCopies):
+    """A part of losses: ``forward`` is that of the first class that defines one."""
 
 
 class SpecializedLoss(LossMixin):
@@ -38,7 +57,7 @@ class SpecializedLoss(LossMixin):
         >>> import torch
         >>> from torchrl.modules import Actor, ValueOperator
         >>> from torchrl.objectives import DDPGLoss
-        >>> from torchrl_l2c2.objectives.specialization import SpecializedLoss
+        >>> from torchrl_l2c2.objectives._specialize import SpecializedLoss
         >>> class CountingLoss(SpecializedLoss):
         ...     def __init__(self, base_loss):
         ...         self.calls = 0
@@ -80,6 +99,34 @@ class SpecializedLoss(LossMixin):
         _adopt(self, base_loss)
         return self
 
+    @classmethod
+    def _made_methods(cls, original: type[LossModule]) -> dict[str, Any]:
+        """Methods that the subclass of this class and of a class of losses has."""
+        return {}
+
+    def _warn_of_changed_base(self) -> None:
+        """Warns once if keys or the value estimator of the wrapped loss changed after wrapping."""
+        if (original := _ORIGINALS.get(self)) is None:
+            return
+        base, keys, estimator = original
+        if (loss := base()) is None:
+            return
+        changed = []
+        if loss.tensor_keys != keys:
+            changed.append("set_keys")
+        theirs = getattr(loss, "_value_estimator", None)
+        ours = getattr(self, "_value_estimator", None)
+        if theirs is not estimator and _describe(theirs) != _describe(ours):
+            changed.append("make_value_estimator")
+        if changed:
+            del _ORIGINALS[self]
+            warnings.warn(
+                f"{' and '.join(changed)} of the {type(loss).__name__} was called after it was "
+                f"wrapped, which does not reach the {type(self).__name__}: call it on the wrapped "
+                "loss, or before wrapping.",
+                stacklevel=3,
+            )
+
     def set_keys(self, **kwargs: NestedKey | None) -> None:
         """As for the loss itself."""
         super().set_keys(**kwargs)
@@ -106,6 +153,7 @@ def _specialize(extension: type[SpecializedLoss], base: type[LossModule]) -> typ
         "__module__": extension.__module__,
         "__doc__": extension.__doc__,
         "_parts": (extension, *getattr(base, "_parts", (base,))),
+        **extension._made_methods(getattr(base, "_parts", (base,))[-1]),
     }
     name = f"{extension.__name__}[{base.__name__}]"
     return types.new_class(name, (extension, base), exec_body=lambda ns: ns.update(namespace))
@@ -156,8 +204,16 @@ def _adopt(self: SpecializedLoss, base_loss: LossModule) -> None:
     for key, hook in self._load_state_dict_pre_hooks.items():
         if hook.with_module:
             self._load_state_dict_pre_hooks[key] = type(hook)(hook.hook, self)
+    estimator = getattr(base_loss, "_value_estimator", None)
+    _ORIGINALS[self] = weakref.ref(base_loss), copy.copy(base_loss.tensor_keys), estimator
     self.in_keys = getattr(base_loss, "in_keys", [])
     self.out_keys = getattr(base_loss, "out_keys", [])
+
+
+def _describe(estimator: Any) -> tuple[Any, ...]:
+    """The kind of a value estimator and its numbers."""
+    numbers = (getattr(estimator, name, None) for name in ("gamma", "lmbda"))
+    return type(estimator), *(None if n is None else float(n) for n in numbers)
 
 
 def _make_empty(*parts: Any) -> SpecializedLoss:

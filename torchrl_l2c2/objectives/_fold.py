@@ -1,0 +1,220 @@
+"""Where penalties belong among a loss's own terms, and checks that a training loop uses them."""
+
+from __future__ import annotations
+
+import functools
+import warnings
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.compiler import is_compiling
+
+POLICY_LOSSES = ("loss_actor", "loss_objective", "loss_bc")
+"""Keys of the term that trains the policy."""
+
+ALTERNATIVE_LOSSES = ("loss_actor_bc",)
+"""Keys of a term that loops use instead of the policy's: cloning in the first steps of CQL."""
+
+# The loss of a value function, by the name of its network; longer names first.
+VALUE_LOSSES = {
+    "local_value": ("loss",),
+    "qvalue": ("loss_qvalue",),
+    "critic": ("loss_critic", "loss_value"),
+    "value": ("loss_value", "loss", "loss_qvalue"),
+}
+
+# Methods that loops call instead of forward: what they train, and the key of what they return.
+PARTS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "actor_loss": ("policy", POLICY_LOSSES),
+    "loss_actor": ("policy", POLICY_LOSSES),
+    "actor_bc_loss": ("policy", ALTERNATIVE_LOSSES),
+    "value_loss": ("value", ("loss_value", "loss_qvalue")),
+    "loss_value": ("value", ("loss_value",)),
+    "qvalue_loss": ("value", ("loss_qvalue",)),
+    "q_loss": ("value", ("loss_qvalue",)),
+}
+
+PATIENCE = 50
+"""Calls of a loss after which what is missing in its training loop is reported."""
+
+
+def fold_targets(term: str, trains_policy: bool, own: Iterable[str]) -> list[str]:
+    """The terms of a loss that a penalty is added to.
+
+    Args:
+        term: the penalty's key, such as ``"loss_l2c2_qvalue"``, which ends with its network.
+        trains_policy: whether it trains the policy.
+        own: the keys of the loss's own output.
+
+    Raises:
+        TypeError: there is none, or it is not known which.
+
+    Examples:
+        >>> fold_targets("loss_caps_spatial", True, ["loss_objective", "loss_critic"])
+        ['loss_objective']
+        >>> fold_targets("loss_l2c2_critic", False, ["loss_objective", "loss_critic"])
+        ['loss_critic']
+    """
+    own = [key for key in own if isinstance(key, str)]
+    if trains_policy:
+        found = [key for key in own if key in POLICY_LOSSES][:1]
+        found += [key for key in own if key in ALTERNATIVE_LOSSES]
+    else:
+        network = next((name for name in VALUE_LOSSES if term.endswith(f"_{name}")), None)
+        every = dict.fromkeys(key for keys in VALUE_LOSSES.values() for key in keys)
+        wanted = every if network is None else VALUE_LOSSES[network]
+        found = [key for key in wanted if key in own]
+        found = found if network is None else found[:1]
+        if network is None and len(found) > 1:
+            raise TypeError(
+                f"{term!r} may belong to {found}: end its name with that of its network, such as "
+                f"{term}_qvalue, or use fold=False and add it in the training loop."
+            )
+    if not found:
+        losses = [key for key in own if key.startswith("loss")]
+        raise TypeError(
+            f"the loss has no term that {term!r} can be added to, but {losses}: use fold=False, "
+            "and add it in the training loop."
+        )
+    return found
+
+
+def add_penalty(own: Tensor, penalty: Tensor, key: str) -> Tensor:
+    """The sum of a loss's own term and a penalty, which have one shape or can be made to.
+
+    Raises:
+        ValueError: without a reduction, they have different shapes.
+    """
+    if own.ndim == penalty.ndim + 1 and own.shape[-1] == 1 and penalty.ndim:
+        penalty = penalty.unsqueeze(-1)
+    if penalty.ndim and own.shape != penalty.shape:
+        raise ValueError(
+            f"{key} has the shape {tuple(own.shape)} and its penalty {tuple(penalty.shape)}: use a "
+            "loss with reduction='mean', or fold=False."
+        )
+    return own + penalty.to(own.dtype)
+
+
+def make_part(
+    method: Callable[..., Any], kind: str, targets: tuple[str, ...]
+) -> Callable[..., Any]:
+    """A method such as ``actor_loss`` that includes the penalty where this is folded.
+
+    Args:
+        method: of the class of the loss.
+        kind: ``"policy"`` or ``"value"``.
+        targets: keys of the loss's own output that it may return the term of; the first counts
+            that the loss has.
+    """
+
+    @functools.wraps(method)
+    def part(self: Any, tensordict: TensorDictBase, *args: Any, **kwargs: Any) -> Any:
+        out = method(self, tensordict, *args, **kwargs)
+        # Within forward, the penalty is added there.
+        if self._evaluation.forward_pass is not None or not torch.is_grad_enabled():
+            return out
+        if not self.folded:
+            self._watch.see_part(self, kind)
+            return out
+        regularize = self.policy_regularizer if kind == "policy" else self.value_regularizer
+        value, *rest = out if isinstance(out, tuple) else (out,)
+        metadata = rest[0] if rest and hasattr(rest[0], "update") else {}
+        own = [key for key in self.out_keys if key.startswith("loss")] or list(targets)
+        returned = next((key for key in targets if key in own), None)
+        for key, term in list(regularize(tensordict).items()):
+            if key not in self.added_terms:
+                metadata[key] = term
+            elif returned in fold_targets(key, kind == "policy", own):
+                value = add_penalty(value, term, str(returned))
+                metadata["penalty_" + key.removeprefix("loss_")] = term.detach()
+        return (value, *rest) if isinstance(out, tuple) else value
+
+    return part
+
+
+class TermWatch:
+    """Notices, in eager calls, what a training loop leaves out; warns once of each.
+
+    Attributes:
+        progress_set: whether a ramp was moved.
+        pending: added terms that were never differentiated; ``None`` before the first call.
+    """
+
+    def __init__(self) -> None:
+        self.progress_set = False
+        self.pending: set[str] | None = None
+        self._forwards = 0
+        self._parts = 0
+        self._counted = 0
+        self._warned: set[str] = set()
+
+    def see_forward(self, loss: Any, terms: TensorDictBase) -> None:
+        """Counts a call of a loss in training, and follows the gradients of its added terms."""
+        self._forwards += 1
+        if self._forwards == PATIENCE and loss._ramp is not None and not self.progress_set:
+            warnings.warn(
+                f"the gain of {type(loss).__name__} follows the progress of training, and "
+                f"set_progress was not called in {PATIENCE} updates: it stays at its last value, "
+                f"{loss._ramp[0]:g}. Call loss.set_progress(frames / total_frames) after every "
+                "rollout, or choose ramp=None.",
+                stacklevel=4,
+            )
+        if loss.folded:
+            return
+        if self.pending is None:
+            self.pending = set(loss.added_terms)
+        for key in tuple(self.pending):
+            term = terms.get(key, None)
+            if isinstance(term, Tensor) and term.requires_grad:
+                term.register_hook(functools.partial(_forget, self.pending, key))
+        if self._forwards == PATIENCE and self.pending:
+            warnings.warn(
+                f"{sorted(self.pending)} of {type(loss).__name__} were not differentiated in "
+                f"{PATIENCE} calls: the training loop does not add them, so the regularizer has no "
+                "effect. Add them to the loss that is minimized, or call loss.fold() after making "
+                "it (as smooth(loss) does), which adds them to the loss's own terms.",
+                stacklevel=4,
+            )
+
+    def see_regularizer(self, loss: Any) -> None:
+        """Notices that a loop computes the terms itself."""
+        if not is_compiling() and loss._evaluation.forward_pass is None:
+            self._warned.add("parts")
+
+    def see_part(self, loss: Any, kind: str) -> None:
+        """Counts a call of ``actor_loss`` or ``value_loss``, which lack separate terms."""
+        policy = bool(loss.policy_terms)
+        has_terms = policy if kind == "policy" else bool(loss.added_terms - loss._policy_side)
+        if is_compiling() or not has_terms or "parts" in self._warned:
+            return
+        self._parts += 1
+        if self._parts == PATIENCE:
+            self._warned.add("parts")
+            warnings.warn(
+                f"actor_loss and value_loss of {type(loss).__name__} were called {PATIENCE} times "
+                "without its terms: add policy_regularizer(batch) and value_regularizer(batch), or "
+                "call loss.fold() after making it (as smooth(loss) does).",
+                stacklevel=4,
+            )
+
+    def see_counts(self, name: str, counts: Tensor) -> None:
+        """Looks for next observations that are not finite."""
+        self._counted += 1
+        if "counts" in self._warned or (counts.is_cuda and self._counted % 100 != 1):
+            return
+        if not bool(counts.all()):
+            self._warned.add("counts")
+            share = 1.0 - counts.float().mean().item()
+            warnings.warn(
+                f"{share:.2%} of the next observations in the batch are not finite, as some "
+                f"environments give at resets: {name} leaves these transitions out. If all are not "
+                "finite, the regularizer has no effect: keep the true next observations.",
+                stacklevel=5,
+            )
+
+
+def _forget(pending: set[str], key: str, gradient: Tensor) -> None:
+    pending.discard(key)

@@ -1,0 +1,578 @@
+"""Evaluation of the networks of a loss at the states of a batch and at other states."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass, field
+from threading import get_ident
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
+from tensordict.nn import ProbabilisticTensorDictModule
+from torch import Tensor, nn
+from torch.compiler import is_compiling
+from torch.distributions import Distribution, Independent
+from torch.nn.modules.batchnorm import _BatchNorm
+from torch.nn.modules.dropout import _DropoutNd
+from torchrl.envs.utils import set_exploration_type
+from torchrl.modules import Delta, GRUModule, LSTMModule, TanhDelta
+from torchrl.objectives import IQLLoss, LossModule, PPOLoss, ReinforceLoss
+from torchrl.objectives.utils import _vmap_func
+
+from torchrl_l2c2.objectives._batch import at_rows
+from torchrl_l2c2.objectives._specialize import LossMixin
+
+POLICY_NETWORK = "actor_network"
+"""The name under which losses hold their policy."""
+
+VALUE_NETWORKS = ("critic_network", "qvalue_network", "value_network", "local_value_network")
+"""The names under which losses hold their value functions."""
+
+RECURRENT = (LSTMModule, GRUModule, nn.RNNBase, nn.RNNCellBase)
+
+# The vector of an ensemble, or of all actions, comes before the one number made of it.
+_VALUE_KEYS = ("value_heads", "state_action_value", "action_value", "value")
+
+
+@dataclass(frozen=True)
+class NetworkSpec:
+    """The inputs and outputs of a network of a loss.
+
+    Attributes:
+        inputs: entries of the batch that the evaluation reads.
+        states: the inputs that are observations.
+        trunk: inputs that are hidden outputs of the policy network.
+        trains_trunk: whether gradients of the network's own term reach the policy through these.
+        output: the value of a value function, or the action of a policy.
+        stochastic: whether the policy is a distribution.
+        has_buffers: whether it keeps running statistics.
+        rowwise: whether a row of the output depends on the same row of the input only, and on no
+            random numbers.
+        has_dropout: whether it has dropout layers.
+    """
+
+    inputs: tuple[NestedKey, ...]
+    states: tuple[NestedKey, ...]
+    trunk: tuple[NestedKey, ...]
+    trains_trunk: bool
+    output: NestedKey | None
+    stochastic: bool
+    has_buffers: bool
+    rowwise: bool
+    has_dropout: bool
+
+
+def inspect_network(loss: LossModule, network: str) -> NetworkSpec:
+    """Inspects a network of a loss; refuses a network that cannot be evaluated at other states.
+
+    Args:
+        loss (LossModule): the loss.
+        network (str): its name, such as ``"actor_network"``.
+
+    Raises:
+        TypeError: it is recurrent, does not declare its keys, or has several distributions.
+    """
+    net, actor = getattr(loss, network), getattr(loss, POLICY_NETWORK, None)
+    _check_declares_keys(net, network)
+    _check_not_recurrent(net, network)
+    stochastic, actions, made = False, _action_keys(loss), set()
+    if actor is not None:
+        stochastic = _is_stochastic(actor)
+        made = set(actor.out_keys) - set(actor.in_keys)
+        if stochastic:
+            actions += actor.dist_sample_keys
+        elif not made & set(actions):
+            actions = [_unnamed_action(loss, actor, made)]
+    trunk = [key for key in net.in_keys if key in made - set(actions)]
+    inputs = dict.fromkeys([*net.in_keys, *(actor.in_keys if trunk and actor is not None else ())])
+    if network == POLICY_NETWORK:
+        output = next((key for key in actions if key in made), None)
+    else:
+        output = _value_key(loss, network)
+    return NetworkSpec(
+        inputs=tuple(key for key in inputs if key not in trunk),
+        states=tuple(k for k in inputs if k not in made.union(actions) and not _is_private(k)),
+        trunk=tuple(trunk),
+        trains_trunk=_trains_trunk(loss, network),
+        output=output,
+        stochastic=stochastic,
+        has_buffers=_has_buffers(loss, network),
+        rowwise=not any(isinstance(m, _BatchNorm | _DropoutNd) for m in net.modules()),
+        has_dropout=any(isinstance(m, _DropoutNd) for m in net.modules()),
+    )
+
+
+def _unnamed_action(loss: LossModule, actor: Any, made: set[NestedKey]) -> NestedKey:
+    """What a deterministic policy acts with, by a loss that does not name it."""
+    networks: list[Any] = [getattr(loss, name, None) for name in VALUE_NETWORKS]
+    read = {key for network in networks if network is not None for key in network.in_keys}
+    written: list[NestedKey] = list(actor.out_keys)
+    # What a policy hands on to the values beside its action, such as a trunk, it writes before.
+    found = [key for key in written if key in made & read]
+    return "action" if "action" in found else (found or written)[-1]
+
+
+def _trains_trunk(loss: LossModule, network: str) -> bool:
+    """Whether a value function trains the policy by its hidden outputs in the plain loss.
+
+    That is where the loss evaluates the policy before, in the same batch; others read what the
+    batch holds.
+    """
+    of_values = isinstance(loss, IQLLoss) and network == "value_network"
+    whole = not getattr(loss, "separate_losses", False)
+    return of_values or (isinstance(loss, PPOLoss | ReinforceLoss) and whole)
+
+
+def _is_private(key: NestedKey) -> bool:
+    """Whether it is TorchRL's own bookkeeping, such as the noise matrix of gSDE."""
+    return (key if isinstance(key, str) else key[-1]).startswith("_")
+
+
+def _action_keys(loss: LossModule) -> list[NestedKey]:
+    keys = getattr(loss.tensor_keys, "action", [])
+    return [unravel_key(key) for key in (keys if isinstance(keys, list) else [keys])]
+
+
+def _value_key(loss: LossModule, network: str) -> NestedKey | None:
+    # A network's name does not tell what it is: a value_network is V, Q or a vector of Q.
+    keys = (getattr(loss.tensor_keys, name, None) for name in _VALUE_KEYS)
+    written = getattr(loss, network).out_keys
+    return next((key for key in keys if key and unravel_key(key) in written), None)
+
+
+def _has_buffers(loss: LossModule, network: str) -> bool:
+    params = parameters_of(loss, network)
+    if params is None:
+        return any(True for _ in getattr(loss, network).buffers())
+    return not all(isinstance(p, nn.Parameter) for p in params.values(True, True))
+
+
+def _is_stochastic(actor: nn.Module) -> bool:
+    classes = [
+        getattr(module.distribution_class, "func", module.distribution_class)  # of a partial
+        for module in actor.modules()
+        if isinstance(module, ProbabilisticTensorDictModule)
+    ]
+    if all(isinstance(one, type) and issubclass(one, Delta | TanhDelta) for one in classes):
+        return False
+    if getattr(actor, "return_composite", False) or not hasattr(actor, "get_dist_params"):
+        raise TypeError(
+            "the policy must be a ProbabilisticTensorDictSequential, such as a ProbabilisticActor, "
+            f"with one distribution, got a {type(actor).__name__} with {len(classes)}: join "
+            "several heads in one CompositeDistribution."
+        )
+    return True
+
+
+def _check_declares_keys(net: nn.Module, name: str) -> None:
+    if not (hasattr(net, "in_keys") and hasattr(net, "out_keys")):
+        raise TypeError(
+            f"{name} is a {type(net).__name__}, which does not say what it reads and writes: make "
+            "it a TensorDictModule with in_keys and out_keys."
+        )
+
+
+def _check_not_recurrent(net: Any, name: str) -> None:
+    recurrent = any(isinstance(module, RECURRENT) for module in net.modules())
+    # What it hands on to the next step.
+    written = {unravel_key(key) for key in net.out_keys}
+    handed_on = any(unravel_key(("next", key)) in written for key in net.in_keys)
+    if recurrent or handed_on or "is_init" in net.in_keys:
+        raise TypeError(
+            f"{name} is recurrent: its output depends on the states before, so that it has no "
+            "value at a state near the current one alone. Only feed-forward networks can be "
+            "regularized."
+        )
+
+
+def parameters_of(loss: LossModule, network: str) -> TensorDictBase | None:
+    """The parameters that a loss keeps beside a network; ``None``: in it."""
+    return getattr(loss, f"{network}_params", None) if loss.functional else None
+
+
+Policy = Distribution | Tensor
+"""A policy at some states: a distribution or, where it is deterministic, its actions."""
+
+ONE_PASS_STATES = 256
+"""Up to so many states, a batch and the other states share a pass over a network when compiled.
+
+There a pass through a small network costs what calling it costs; in larger batches arithmetic
+decides, and two passes stay nearer to the caches.
+"""
+
+
+@dataclass
+class ForwardPass:
+    """What one forward pass of a loss has evaluated and made so far."""
+
+    at_batch: dict[str, TensorDictBase] = field(default_factory=dict)
+    """A network's outputs at the batch's states, ``[*B]``."""
+    at_others: dict[str, tuple[TensorDictBase, TensorDictBase]] = field(default_factory=dict)
+    """Other states, ``[K, *B]``, and a network's outputs there, with an ensemble's dimension."""
+    made: dict[str, Any] = field(default_factory=dict)
+    """What regularizers make once for all their terms."""
+
+
+class EvaluatedNetworks:
+    """The networks of a loss that are evaluated, and what a forward pass shares of it.
+
+    Methods take the loss itself, so that this object, one of its attributes, does not refer back.
+
+    Args:
+        specs (dict, optional): specs of networks that were inspected before.
+    """
+
+    def __init__(self, specs: dict[str, NetworkSpec] | None = None) -> None:
+        self.specs = {} if specs is None else dict(specs)
+        self._forward_passes: dict[int, ForwardPass] = {}
+        self._repeatable: set[str] = set()
+
+    @property
+    def forward_pass(self) -> ForwardPass | None:
+        """What this thread's forward pass shares; ``None`` outside of one."""
+        return self._forward_passes.get(_thread())
+
+    def begin_forward_pass(self) -> ForwardPass | None:
+        """From here on evaluations are shared; the pass that this one lies in, to end it with."""
+        outer = self.forward_pass
+        self._forward_passes[_thread()] = ForwardPass()
+        return outer
+
+    def end_forward_pass(self, outer: ForwardPass | None) -> None:
+        """What was shared is forgotten; the outer pass goes on, if a loss called itself."""
+        if outer is None:
+            del self._forward_passes[_thread()]
+        else:
+            self._forward_passes[_thread()] = outer
+
+    def inspect(self, loss: LossModule, networks: Iterable[str]) -> None:
+        """Inspects these networks; refuses networks that cannot be evaluated at other states."""
+        self.specs = {name: inspect_network(loss, name) for name in networks}
+        if any(spec.trunk for spec in self.specs.values()):
+            self.specs[POLICY_NETWORK] = inspect_network(loss, POLICY_NETWORK)
+
+    def policies_at(
+        self,
+        loss: LossModule,
+        tensordict: TensorDictBase,
+        states: TensorDictBase,
+        rows: Tensor | None = None,
+    ) -> tuple[Policy, Policy]:
+        """The policy at the batch's states and at others, both ``[K, *B]``.
+
+        With ``rows``, ``[M]``, at these of the batch's states, written as one row, and at others in
+        their place, ``[K, M]``; likewise for the values.
+        """
+        actor, spec = getattr(loss, POLICY_NETWORK), self.specs[POLICY_NETWORK]
+        keys = actor.dist_params_keys if spec.stochastic else [spec.output]
+        here, there = self._outputs_at(loss, POLICY_NETWORK, tensordict, states, keys, rows)
+        here = here.expand(states.batch_size)
+        return self._policy(loss, here), self._policy(loss, there)
+
+    def policy_at(
+        self,
+        loss: LossModule,
+        tensordict: TensorDictBase,
+        states: TensorDictBase,
+        network: str = POLICY_NETWORK,
+    ) -> Policy:
+        """The policy at other states alone, ``[K, *B]``, by a pass that nothing else shares.
+
+        Or a network that was copied from it, by its name: a regularizer's own.
+        """
+        rows = self._rows(POLICY_NETWORK, tensordict, states, with_batch=False)
+        out = self._evaluate(loss, network, rows)
+        (there,) = _split(out, 0, [len(states)], tensordict)
+        return self._policy(loss, there)
+
+    def values_at(
+        self,
+        loss: LossModule,
+        network: str,
+        tensordict: TensorDictBase,
+        states: TensorDictBase,
+        rows: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """A value function at the batch's states, ``[1, *B, ...]``, and at others, ``[K, ...]``."""
+        key = self.specs[network].output
+        if key is None:
+            # Not earlier: set_keys may come after the wrapping, as after the making of any loss.
+            raise ValueError(
+                f"{network} writes {list(getattr(loss, network).out_keys)}, and none of it is a "
+                f"value to this loss, whose keys are {loss.tensor_keys}: name it with set_keys."
+            )
+        here, there = self._outputs_at(loss, network, tensordict, states, [key], rows)
+        return here.get(key), there.get(key)
+
+    def at_batch(
+        self,
+        loss: LossModule,
+        network: str,
+        tensordict: TensorDictBase,
+        evaluate: Callable[[str, TensorDictBase], TensorDictBase],
+        known_states: Callable[[TensorDictBase], TensorDictBase | None],
+    ) -> TensorDictBase:
+        """Evaluates a network as the loss does, and keeps the result for the forward pass.
+
+        Not of inputs that hang on an encoder, which a regularizer does not train. Compiled, small
+        batches are evaluated together with the other states, where these are known by now: that
+        differs by rounding, and so it is left to where compiling does anyway.
+        """
+        spec = self.specs.get(network)
+        if self.forward_pass is None or spec is None or _requires_grad(tensordict, spec.inputs):
+            return evaluate(network, tensordict)
+        if spec.has_dropout:  # The loss evaluates with dropout, a regularizer without.
+            return evaluate(network, tensordict)
+        states = None
+        alone = not is_compiling() or autocast_at(tensordict)
+        if not alone and self._fits_one_pass(network, tensordict):
+            states = known_states(tensordict)
+        if states is None:
+            here = evaluate(network, tensordict)
+        else:
+            rows = self._rows(network, tensordict, states, with_batch=True)
+            dim = int(is_ensemble(loss, network))
+            here, there = _split(evaluate(network, rows), dim, [1, len(states)], tensordict)
+            here = here.squeeze(dim)
+            self.forward_pass.at_others[network] = states, there
+        self.forward_pass.at_batch[network] = here
+        return here
+
+    def _policy(self, loss: LossModule, outputs: TensorDictBase) -> Policy:
+        spec = self.specs[POLICY_NETWORK]
+        if not spec.stochastic:
+            return outputs.get(spec.output)
+        policy: Distribution = getattr(loss, POLICY_NETWORK).build_dist_from_params(outputs)
+        separate = len(policy.batch_shape) > outputs.batch_dims and not policy.event_shape
+        if separate and not policy.has_enumerate_support:
+            return Independent(policy, 1)  # Its actions' dimensions, as of torch's plain Normal.
+        return policy
+
+    def _fits_one_pass(self, network: str, tensordict: TensorDictBase) -> bool:
+        spec = self.specs[network]
+        if spec.trunk or spec.has_buffers or not spec.rowwise:
+            return False
+        return tensordict.ndim == 1 and tensordict.numel() <= ONE_PASS_STATES
+
+    def _outputs_at(
+        self,
+        loss: LossModule,
+        network: str,
+        tensordict: TensorDictBase,
+        states: TensorDictBase,
+        keys: Iterable[NestedKey],
+        chosen: Tensor | None,
+    ) -> tuple[TensorDictBase, TensorDictBase]:
+        """A network's outputs at the batch's states, ``[1, *B]``, and at others, ``[K, *B]``."""
+        shared = self.forward_pass
+        if shared is None or autocast_at(states):
+            shared = ForwardPass()  # What the loss has evaluated is rounded.
+        spec, known = self.specs[network], shared.at_batch.get(network)
+        dim, num = int(is_ensemble(loss, network)), len(states)
+        if chosen is not None:
+            known = None if known is None else at_rows(known.select(*keys), chosen, dim)
+            tensordict = at_rows(tensordict.select(*spec.inputs, strict=False), chosen)
+        evaluated, there = shared.at_others.get(network, (None, None))
+        if evaluated is states and known is not None and there is not None:
+            return known.select(*keys).unsqueeze(dim), there.select(*keys)
+        rows = self._rows(network, tensordict, states, with_batch=known is None)
+        self._check_repeatable(loss, network, rows)
+        if spec.trunk:
+            hidden = self._evaluate(loss, POLICY_NETWORK, rows).select(*spec.trunk)
+            rows.update(hidden if spec.trains_trunk else hidden.detach())
+        out = self._evaluate(loss, network, rows).select(*keys)
+        if known is None:
+            return _split(out, dim, [1, num], tensordict)
+        return known.select(*keys).unsqueeze(dim), _split(out, dim, [num], tensordict)[0]
+
+    def _check_repeatable(self, loss: LossModule, network: str, rows: TensorDictBase) -> None:
+        """Refuses a network that draws random numbers: once, at the first eager evaluation.
+
+        The distance of two evaluations would measure these numbers, also where the states are
+        equal. Dropout is off by now; noise that a layer keeps between calls does no harm.
+
+        Raises:
+            TypeError: two evaluations of the same states differ.
+        """
+        spec = self.specs[network]
+        if network in self._repeatable or is_compiling() or spec.trunk or not len(rows):
+            return
+        self._repeatable.add(network)
+        some = rows[:8]
+        devices = {value.device for value in some.values(True, True) if value.is_cuda}
+        with torch.random.fork_rng(devices), torch.no_grad():
+            first, second = (self._evaluate(loss, network, some.clone()) for _ in range(2))
+        if spec.stochastic and network == POLICY_NETWORK:
+            keys = getattr(loss, network).dist_params_keys
+        else:
+            keys = [spec.output]
+        for key in keys:
+            a, b = first.get(key), second.get(key)
+            if isinstance(a, Tensor) and not torch.allclose(
+                a.double(), b.double(), rtol=1e-3, atol=1e-5, equal_nan=True
+            ):
+                raise TypeError(
+                    f"{network} gives two different outputs for the same states: it draws random "
+                    "numbers in its forward pass, and a regularizer would measure these. Make the "
+                    "random numbers an input of the network, or draw them outside of it."
+                )
+
+    def _rows(
+        self, network: str, tensordict: TensorDictBase, states: TensorDictBase, with_batch: bool
+    ) -> TensorDictBase:
+        """A network's inputs at the batch's states and at the others: ``[(1 + K) * B0, ...]``."""
+        spec, batch = self.specs[network], tensordict.batch_size
+        # The batch's action may still hang on the policy that made it.
+        inputs = tensordict.select(*spec.inputs, strict=False).detach()
+        moved = {key: states.get(key, None) for key in spec.inputs}
+        moved = {key: state for key, state in moved.items() if state is not None}
+        if not moved:
+            raise KeyError(
+                f"none of the inputs of {network}, {list(spec.inputs)}, is among the states to "
+                f"compare, {list(states.keys(True, True))}: name its observation in the in_keys "
+                "of the transform that wrote them."
+            )
+        rows = inputs.expand(states.batch_size[0] + with_batch, *batch)
+        for key, state in moved.items():
+            here = inputs.get(key).unsqueeze(0)
+            rows.set(key, torch.cat((here, state)) if with_batch else state)
+        return rows.flatten(0, 1) if batch else rows
+
+    def _evaluate(self, loss: LossModule, network: str, rows: TensorDictBase) -> TensorDictBase:
+        net, spec = getattr(loss, network), self.specs.get(network)
+        params = parameters_of(loss, network)
+        parameters = net.parameters() if params is None else params.values(True, True)
+        rows = as_parameters(rows.select(*net.in_keys, strict=False), parameters)
+        if spec is not None and spec.has_buffers:
+            # Running statistics are the loss's own: spare copies take the update.
+            params = TensorDict.from_module(net) if params is None else params
+            params = params.apply(lambda p: p if p.requires_grad else p.clone())
+        policy = spec is None or network == POLICY_NETWORK  # or a copy of it, which has no spec
+        run = net.get_dist_params if policy and self.specs[POLICY_NETWORK].stochastic else net
+        dropout_off = without_dropout(net) if spec is None or spec.has_dropout else nullcontext()
+        exploration = set_exploration_type(loss.deterministic_sampling_mode)
+        with exploration, in_full_precision(rows), dropout_off:
+            if params is None:
+                return run(rows)
+            if not params.ndim:
+                with params.to_module(net, preserve_module_state=False):
+                    return run(rows)
+            return _vmap_func(
+                net,
+                (None, 0),
+                randomness=loss.vmap_randomness,
+                pseudo_vmap=getattr(loss, "deactivate_vmap", False),
+            )(rows, params)
+
+
+def _requires_grad(tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> bool:
+    inputs = tensordict.select(*keys, strict=False).values(True, True)
+    return any(value.requires_grad for value in inputs)
+
+
+def is_ensemble(loss: LossModule, network: str) -> bool:
+    """Whether the loss has expanded a network's parameters to those of several."""
+    params = parameters_of(loss, network)
+    return params is not None and params.ndim > 0
+
+
+def _split(
+    out: TensorDictBase, dim: int, parts: list[int], tensordict: TensorDictBase
+) -> tuple[TensorDictBase, ...]:
+    """Outputs at rows, by what the rows are: ``[part, *B]``, behind ``dim`` other dimensions."""
+    if tensordict.batch_size:
+        # Explicit sizes: an inferred one does not compile.
+        out = out.unflatten(dim, (sum(parts), tensordict.batch_size[0]))
+    return out.split(parts, dim)
+
+
+def _thread() -> int:
+    # get_ident does not compile, and need not: a pass begins and ends while it is traced.
+    return 0 if is_compiling() else get_ident()
+
+
+class SharedEvaluation(LossMixin):
+    """A loss that evaluates its networks at the batch's states through one method.
+
+    A loss that inherits from this class, and evaluates its networks with
+    :meth:`evaluate_at_batch`, is spared a second evaluation by every regularizer around it:
+    :class:`RegularizedLoss` overrides the method, keeps what it returns until the forward pass is
+    done, and evaluates the network at the other states alone. :class:`PPORPELoss` is such a loss.
+
+    A loss that does not inherit from it works as well; its networks are evaluated once more.
+
+    Examples:
+        >>> from torchrl.objectives import DDPGLoss
+        >>> from torchrl_l2c2.objectives import SharedEvaluation
+        >>> class ThriftyLoss(DDPGLoss, SharedEvaluation):
+        ...     def evaluate_at_batch(self, network, tensordict):
+        ...         net = getattr(self, network)
+        ...         with getattr(self, f"{network}_params").to_module(net):
+        ...             return net(tensordict.select(*net.in_keys))
+        ...
+        ...     def loss_value(self, tensordict):
+        ...         value = self.evaluate_at_batch("value_network", tensordict)
+        ...         return value["state_action_value"].square().mean(), {}
+    """
+
+    def evaluate_at_batch(self, network: str, tensordict: TensorDictBase) -> TensorDictBase:
+        """What a network writes, or the parameters of its distribution, at the batch's states.
+
+        Must depend on the given tensordict alone: compiled, it may be called with the rows of
+        other states beside those of the batch.
+
+        Args:
+            network (str): its name, such as ``"actor_network"``.
+            tensordict (TensorDictBase): the batch, ``[*B]``.
+
+        Returns:
+            TensorDictBase: the outputs, ``[*B]``; for a stochastic policy what
+            ``get_dist_params`` returns.
+        """
+        raise NotImplementedError
+
+
+def autocast_at(tensordict: TensorDictBase) -> str | None:
+    """The kind of device of these entries, such as ``"cuda"``, if autocast is on there."""
+    kinds = {value.device.type for value in tensordict.values(True, True)}
+    return next((kind for kind in kinds if torch.is_autocast_enabled(kind)), None)
+
+
+def in_full_precision(tensordict: TensorDictBase) -> AbstractContextManager[object]:
+    """A context without autocast on the device of these entries.
+
+    A regularizer compares outputs at states that lie close together. bfloat16 keeps 8 bits of
+    each, so that of a difference of 1 % little is left and of one of 0.1 % nothing but rounding,
+    whose square is larger than that of the difference.
+    """
+    kind = autocast_at(tensordict)
+    return nullcontext() if kind is None else torch.autocast(kind, enabled=False)
+
+
+@contextmanager
+def without_dropout(net: nn.Module) -> Iterator[None]:
+    """A context in which the dropout layers of a network pass everything on.
+
+    With dropout, two evaluations of one state differ, and a distance would measure that.
+    """
+    layers = [m for m in net.modules() if isinstance(m, _DropoutNd) and m.training]
+    for layer in layers:
+        layer.training = False
+    try:
+        yield
+    finally:
+        for layer in layers:
+            layer.training = True
+
+
+def as_parameters(rows: TensorDictBase, parameters: Iterable[Tensor]) -> TensorDictBase:
+    """Inputs in the precision of the parameters, where autocast would have brought both to one."""
+    if autocast_at(rows) is None:
+        return rows
+    # A list: a generator that is left halfway does not compile.
+    dtypes = [p.dtype for p in parameters if p.is_floating_point()]
+    # Autocast leaves double precision alone, too.
+    wanted = {torch.float16, torch.bfloat16, torch.float32}
+    return rows.apply(lambda v: v.to(dtypes[0]) if dtypes and v.dtype in wanted else v)

@@ -1,0 +1,269 @@
+"""Settings of regularizers that worked, in one table by method and kind of loss.
+
+Losses are named by their classes, so that settings can be read without importing torch.
+:func:`torchrl_l2c2.smooth` applies them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+NEIGHBORHOOD_FIELDS = frozenset({"sigma", "lambda_min", "lambda_max", "shared", "max_step"})
+"""Settings of L2C2 that are fields of its neighborhood."""
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Settings of a regularizer for a kind of loss.
+
+    Attributes:
+        settings: keyword arguments of the regularizer, and of its ``Neighborhood``.
+        ramp: the share of training over which the gain rises from 0; ``None``: a constant gain.
+        evidence: the page with the runs of these settings; ``None``: its authors' settings, which
+            have no recorded runs with this kind of loss.
+        tasks: what the runs trained.
+    """
+
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    ramp: float | None = None
+    evidence: str | None = None
+    tasks: str = ""
+
+    def overridden(self, overrides: Mapping[str, Any]) -> Preset:
+        """The preset with other settings; ``ramp`` is one of them.
+
+        Raises:
+            TypeError: a neighborhood is given both whole and by its fields.
+        """
+        settings, overrides = dict(self.settings), dict(overrides)
+        ramp = overrides.pop("ramp", self.ramp)
+        if "neighborhood" in overrides:
+            if both := sorted(overrides.keys() & NEIGHBORHOOD_FIELDS):
+                raise TypeError(f"Expected a neighborhood or its fields, got both it and {both}.")
+            settings = {k: v for k, v in settings.items() if k not in NEIGHBORHOOD_FIELDS}
+        return Preset({**settings, **overrides}, ramp, self.evidence, self.tasks)
+
+
+METHODS = {
+    "l2c2": "L2C2Loss",
+    "caps": "CAPSLoss",
+    "cats": "CATSLoss",
+    "grad_caps": "GradCAPSLoss",
+    "asap": "ASAPLoss",
+    "lcp": "LCPLoss",
+    "sr2l": "SR2LLoss",
+}
+"""The regularizers by the name of the method."""
+
+KINDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "ppo": (
+        ("PPOLoss", "ClipPPOLoss", "ActorCriticLoss"),
+        ("A2CLoss", "KLPENPPOLoss", "MAPPOLoss", "IPPOLoss"),
+    ),
+    "sac": (("SACLoss",), ("REDQLoss", "TQCLoss", "CrossQLoss", "CQLLoss")),
+    "td3": (("TD3Loss",), ("DDPGLoss",)),
+    "ppo_rpe": (("PPORPELoss",), ()),
+}
+"""Kinds of losses, which share a preset: the classes that it was found with, and similar ones."""
+
+NEAREST = {
+    "ReinforceLoss": "ppo",
+    "BCLoss": "ppo",
+    "TD3BCLoss": "td3",
+    "IQLLoss": "sac",
+    "DiscreteIQLLoss": "sac",
+    "DiscreteSACLoss": "sac",
+}
+"""Losses without a preset, with the kind that is most like them."""
+
+_PPO_TASKS = "Pendulum, LunarLander, Walker2d and Hopper"
+
+_SR2L = {"coeff": 0.1, "epsilon": 0.05, "steps": 10}
+
+PRESETS: dict[str, dict[str, Preset]] = {
+    "l2c2": {
+        "ppo": Preset(
+            {
+                "policy_distance": "mse",
+                "shared": True,
+                "lambda_min": 1.0,
+                "lambda_max": 100.0,
+                "beta": 0.0,
+            },
+            ramp=1.0,
+            evidence="results/one_setting.md",
+            tasks=_PPO_TASKS,
+        ),
+        "sac": Preset(
+            {
+                "policy_distance": "mean",
+                "shared": True,
+                "lambda_min": 10.0,
+                "lambda_max": 1000.0,
+                "beta": 0.0,
+            },
+            evidence="results/sac_pendulum.md",
+            tasks="Pendulum",
+        ),
+        "td3": Preset(
+            {
+                "policy_distance": "mean",
+                "shared": True,
+                "lambda_min": 10.0,
+                "lambda_max": 1000.0,
+                "beta": 0.0,
+            },
+            evidence="results/td3.md",
+            tasks="Pendulum",
+        ),
+        "ppo_rpe": Preset(
+            {"lambda_min": 0.01, "lambda_max": 1.0, "beta": 0.1},
+            evidence="results/paper.md",
+            tasks="Swingup and Reacher",
+        ),
+    },
+    "caps": {
+        "ppo": Preset(
+            {"sigma": 0.2, "lambda_temporal": 0.01, "lambda_spatial": 0.05},
+            evidence="results/one_setting.md",
+            tasks=_PPO_TASKS,
+        ),
+        "sac": Preset(
+            {"sigma": 0.2, "lambda_temporal": 1.0, "lambda_spatial": 5.0},
+            evidence="results/sac_pendulum.md",
+            tasks="Pendulum",
+        ),
+        "td3": Preset(
+            {"sigma": 0.2, "lambda_temporal": 1.0, "lambda_spatial": 5.0},
+            evidence="results/td3.md",
+            tasks="Pendulum",
+        ),
+        "ppo_rpe": Preset(
+            {"sigma": 0.2, "lambda_temporal": 0.01, "lambda_spatial": 0.05},
+            evidence="results/paper.md",
+            tasks="Swingup and Reacher",
+        ),
+    },
+    "cats": {
+        "ppo": Preset(
+            {"lambda_temporal": 0.1},
+            ramp=1.0,
+            evidence="results/one_setting.md",
+            tasks=_PPO_TASKS,
+        ),
+        "sac": Preset(
+            {"lambda_temporal": 10.0},
+            ramp=1.0,
+            evidence="results/sac_pendulum.md",
+            tasks="Pendulum",
+        ),
+        "td3": Preset(
+            {"lambda_temporal": 10.0}, ramp=1.0, evidence="results/td3.md", tasks="Pendulum"
+        ),
+        "ppo_rpe": Preset({"lambda_temporal": 0.1}, ramp=1.0),
+    },
+    "grad_caps": {kind: Preset({"lambda_temporal": 0.01, "epsilon": 0.1}) for kind in KINDS},
+    "asap": {
+        kind: Preset({"lambda_spatial": 0.3, "lambda_temporal": 2.0, "lambda_grad": 0.05})
+        for kind in KINDS
+    },
+    # Of the mean: a learned deviation would grow to lower the likelihood's gradient, or the KL.
+    "lcp": {
+        **{kind: Preset({"coeff": 0.002, "of": "mean"}) for kind in KINDS},
+        "ppo_rpe": Preset({"coeff": 0.002, "of": "log_prob"}),
+    },
+    "sr2l": {
+        **{kind: Preset({**_SR2L, "policy_distance": "mean"}) for kind in KINDS},
+        "ppo_rpe": Preset({**_SR2L, "policy_distance": "jeffreys"}),
+    },
+}
+"""The settings, by method and kind of loss. This is the only place that has them."""
+
+GAIN_SETTING = {
+    "l2c2": "lambda_min",
+    "caps": "lambda_temporal",
+    "cats": "lambda_temporal",
+    "grad_caps": "lambda_temporal",
+    "asap": "lambda_spatial",
+    "lcp": "coeff",
+    "sr2l": "coeff",
+}
+"""The setting that has to be given if there is no preset, by method."""
+
+# The largest gain of L2C2 that had no measurable effect with these kinds of losses.
+_PAPERS_LAMBDA_MAX = 1.0
+_WITHOUT_EFFECT = ("ppo", "sac", "td3")
+
+
+def kind_of(loss_class: type) -> tuple[str | None, bool]:
+    """The kind of a loss, by the first of its classes in :data:`KINDS`.
+
+    Args:
+        loss_class (type): the class of the loss, or a subclass of it.
+
+    Returns:
+        tuple: the kind, or ``None``; and whether the preset was found with this very class.
+
+    Examples:
+        >>> from torchrl.objectives import REDQLoss, SACLoss
+        >>> kind_of(SACLoss), kind_of(REDQLoss), kind_of(dict)
+        (('sac', True), ('sac', False), (None, False))
+    """
+    for part in loss_class.__mro__:
+        if not part.__module__.startswith(("torchrl.", "torchrl_l2c2.")):
+            continue
+        for kind, (exact, similar) in KINDS.items():
+            if part.__name__ in exact:
+                return kind, True
+            if part.__name__ in similar:
+                return kind, False
+        if part.__name__ in NEAREST:
+            return None, False
+    return None, False
+
+
+def preset(method: str, kind: str) -> Preset:
+    """The settings of a method for a kind of loss.
+
+    Args:
+        method (str): one of :data:`METHODS`.
+        kind (str): one of :data:`KINDS`.
+
+    Raises:
+        ValueError: there is no such method or kind.
+
+    Examples:
+        >>> preset("l2c2", "sac").settings["lambda_min"], preset("l2c2", "ppo").ramp
+        (10.0, 1.0)
+    """
+    if method not in METHODS:
+        raise ValueError(f"Expected method to be one of {list(METHODS)}, got {method!r}.")
+    if kind not in KINDS:
+        raise ValueError(f"Expected kind to be one of {list(KINDS)}, got {kind!r}.")
+    return PRESETS[method][kind]
+
+
+def without_effect(loss_class: type, lambda_max: float) -> bool:
+    """Whether L2C2 with gains up to this had no measurable effect with such losses."""
+    kind, _ = kind_of(loss_class)
+    return kind in _WITHOUT_EFFECT and lambda_max <= _PAPERS_LAMBDA_MAX
+
+
+def presets_table() -> str:
+    """The table of presets as Markdown, for the docs.
+
+    Examples:
+        >>> print(presets_table().splitlines()[0])
+        | loss | method | settings | evidence |
+    """
+    lines = ["| loss | method | settings | evidence |", "| --- | --- | --- | --- |"]
+    for kind, (exact, _) in KINDS.items():
+        for method, kinds in PRESETS.items():
+            chosen = kinds[kind]
+            settings = {**chosen.settings, **({} if chosen.ramp is None else {"ramp": chosen.ramp})}
+            shown = ", ".join(f"`{name}={value!r}`" for name, value in settings.items())
+            page = f"[{chosen.tasks}](../{chosen.evidence})" if chosen.evidence else "no runs"
+            lines.append(f"| {exact[0]} | {method} | {shown} | {page} |")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,164 @@
+"""The front door: :func:`smooth` adds a regularizer to a loss, with the preset of such losses."""
+
+from __future__ import annotations
+
+import inspect
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+from torchrl.objectives import LossModule
+
+from torchrl_l2c2 import objectives
+from torchrl_l2c2._checks import check_real
+from torchrl_l2c2.neighborhood import Neighborhood
+from torchrl_l2c2.objectives import RegularizedLoss
+from torchrl_l2c2.presets import (
+    GAIN_SETTING,
+    KINDS,
+    METHODS,
+    NEAREST,
+    NEIGHBORHOOD_FIELDS,
+    Preset,
+    kind_of,
+    preset,
+)
+
+
+def smooth(
+    loss: LossModule,
+    method: str = "l2c2",
+    strength: float = 1.0,
+    fold: bool = True,
+    **overrides: Any,
+) -> RegularizedLoss:
+    """Adds a smoothness regularizer to a loss, with settings that worked for such losses.
+
+    The result is still a loss of the same class, with the same parameters; train it as before. The
+    penalty is part of its own terms (``loss_actor`` or ``loss_objective``), so that loops that sum
+    terms by name, or all ``loss_*`` keys, need no change. It is reported as ``penalty_*``.
+
+    Settings come from one table, :data:`torchrl_l2c2.presets.PRESETS`, by the class of the loss.
+    PPO's gain rises with the progress of training: call
+    ``loss.set_progress(frames / total_frames)`` after every rollout. Without that it stays at its
+    last value.
+
+    Args:
+        loss (LossModule): a loss with a policy that is trained on transitions.
+        method (str): the regularizer: ``"l2c2"``, ``"caps"``, ``"cats"``, ``"grad_caps"``,
+            ``"asap"``, ``"lcp"`` or ``"sr2l"``. ``grad_caps`` and ``asap`` need the observation
+            before each state in the batch. Defaults to ``"l2c2"``.
+        strength (float): multiplies the penalty, at least 0. Larger values smooth more, at some
+            point at the cost of return; 0 leaves the loss's values and gradients. Defaults to
+            ``1.0``, the preset.
+        fold (bool): whether the penalty is part of the loss's own terms. ``False`` returns it as
+            ``loss_*`` terms of its own, for loops that weigh or log them; the loss's own terms are
+            then unchanged, bit for bit. Defaults to ``True``.
+        **overrides: settings that replace the preset's: keyword arguments of the regularizer's
+            class, fields of its :class:`~torchrl_l2c2.Neighborhood`, and ``ramp``, the share of
+            training over which the gain rises, or ``None`` for a constant one.
+
+    Returns:
+        RegularizedLoss: an instance of the regularizer and of the loss's class.
+
+    Raises:
+        TypeError: the loss cannot be regularized, already is, or has no preset and no gain is
+            given; or an override is not a setting of the method.
+        ValueError: the method is not known, or a value is out of its range.
+
+    Warns:
+        UserWarning: the preset was found with a similar loss; or it is the settings of the method's
+            authors, without runs here.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl.modules import Actor, ValueOperator
+        >>> from torchrl.objectives import TD3Loss
+        >>> from torchrl_l2c2 import smooth
+        >>> qvalue = ValueOperator(torch.nn.Bilinear(3, 1, 1), in_keys=["observation", "action"])
+        >>> loss = smooth(TD3Loss(Actor(torch.nn.Linear(3, 1)), qvalue, bounds=(-1, 1)))
+        >>> isinstance(loss, TD3Loss), loss.regularizer_gain.item()
+        (True, 1.0)
+        >>> [key for key in loss.out_keys if key.startswith(("loss_", "penalty_"))]
+        ['loss_actor', 'loss_qvalue', 'penalty_l2c2_actor']
+    """
+    if not isinstance(loss, LossModule):
+        raise TypeError(
+            f"Expected a torchrl.objectives.LossModule, got a {type(loss).__name__}. Call smooth "
+            "before the loss is compiled."
+        )
+    if isinstance(loss, RegularizedLoss):
+        raise TypeError(
+            f"Expected a loss without a regularizer, got a {type(loss).__name__}. Call smooth once "
+            "with overrides, or combine the classes: CATSLoss(L2C2Loss(loss, ...), ...)."
+        )
+    if method not in METHODS:
+        raise ValueError(f"Expected method to be one of {list(METHODS)}, got {method!r}.")
+    check_real("strength", strength, at_least=0)
+    chosen = _chosen(loss, method, overrides)
+    make = getattr(objectives, METHODS[method])
+    regularized = make(loss, **_arguments(method, make, chosen.settings))
+    regularized.regularizer_gain = strength
+    if chosen.ramp is not None:
+        regularized.ramp(chosen.ramp, end=strength)
+    return regularized.fold() if fold else regularized
+
+
+def _chosen(loss: LossModule, method: str, overrides: Mapping[str, Any]) -> Preset:
+    """The preset of a loss with what replaces its settings; warns if it is none of this loss."""
+    name = type(loss).__name__
+    kind, exact = kind_of(type(loss))
+    if kind is None:
+        if GAIN_SETTING[method] in overrides:
+            return Preset().overridden(overrides)
+        raise TypeError(_no_preset(loss, method))
+    chosen = preset(method, kind)
+    found_with = KINDS[kind][0][0]
+    if chosen.evidence is None and GAIN_SETTING[method] not in overrides:
+        warnings.warn(
+            f"{method} takes the settings of its authors, {_shown(chosen.settings)}: there are no "
+            f"recorded runs of it with losses like {found_with}.",
+            stacklevel=3,
+        )
+    elif not exact:
+        warnings.warn(
+            f"{name} takes the preset of {found_with}, the nearest: it was found with that on "
+            f"{chosen.tasks}, and not tried with {name}.",
+            stacklevel=3,
+        )
+    return chosen.overridden(overrides)
+
+
+def _no_preset(loss: LossModule, method: str) -> str:
+    name = type(loss).__name__
+    names = [part.__name__ for part in type(loss).__mro__]
+    kind = next((NEAREST[each] for each in names if each in NEAREST), None)
+    if kind is None:
+        kind = "sac" if getattr(loss, "qvalue_network", None) is not None else "ppo"
+    nearest = preset(method, kind)
+    settings = dict(nearest.settings) | ({} if nearest.ramp is None else {"ramp": nearest.ramp})
+    return (
+        f"{name} has no preset. The nearest is that of {KINDS[kind][0][0]}; to use it, pass its "
+        f"settings: smooth(loss, {method!r}, {_shown(settings)})."
+    )
+
+
+def _shown(settings: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name}={value!r}" for name, value in settings.items())
+
+
+def _arguments(method: str, make: type, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The arguments of a regularizer's class, with its neighborhood made of its fields."""
+    arguments = dict(settings)
+    known = list(inspect.signature(make).parameters)
+    known.remove("base_loss")
+    near = {}
+    if "neighborhood" in known:
+        near = {name: arguments.pop(name) for name in NEIGHBORHOOD_FIELDS & arguments.keys()}
+        known += sorted(NEIGHBORHOOD_FIELDS)
+    unknown = sorted(arguments.keys() - set(known))
+    if unknown:
+        raise TypeError(f"Expected settings of {method}, {[*known, 'ramp']}, got {unknown}.")
+    if "neighborhood" not in arguments and near:
+        arguments["neighborhood"] = Neighborhood(**near)
+    return arguments
