@@ -22,11 +22,11 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from benchmarks.timing import machine
+from studies.paper import is_as_usual
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig
 from torchrl_l2c2.experiment.composition import CONF
 from torchrl_l2c2.experiment.regularizers import REGULARIZERS
 from torchrl_l2c2.experiment.reports import Record, read_records
-from torchrl_l2c2.experiment.reports.page import is_as_usual
 from torchrl_l2c2.experiment.tasks import TASKS
 
 RECORDS = Path(__file__).parents[1] / "results" / "runs.csv"

@@ -56,21 +56,17 @@ experiment.algorithms.__init__
 experiment.config
 experiment.naming experiment.saved
 experiment.identity
-experiment.folder
-experiment.reports.statistics experiment.reports.names experiment.reports.paper
-experiment.reports.differences
-experiment.reports.records experiment.reports.document
+experiment.folder experiment.differences
+experiment.finished
+experiment.reports.statistics experiment.reports.names experiment.reports.document
+experiment.reports.records
 experiment.reports.runs experiment.reports.groups
-experiment.reports.score
 experiment.reports.tables
 experiment.reports.comparison experiment.reports.measures
-experiment.reports.front experiment.reports.field experiment.reports.paper_table
-experiment.reports.faster_targets experiment.reports.gain_targets
 experiment.reports.figures
-experiment.reports.choice experiment.reports.pairwise experiment.reports.against
-experiment.reports.page experiment.reports.report experiment.reports.results
+experiment.reports.report experiment.reports.results
 experiment.reports.__init__
-experiment.reports.__main__
+experiment.reports.__main__ experiment.front
 experiment.trained
 experiment.video
 experiment.workers
@@ -131,9 +127,18 @@ def test_only_the_experiment_needs_its_extra():
             assert not [line for line in found if any(name in line for name in foreign)], module
 
 
+def test_a_run_starts_without_tables_and_pictures():
+    """Training and its command import reports only within functions; nothing imports the lab."""
+    for name in ("training", "command"):
+        tree = ast.parse(MODULES[f"experiment.{name}"].read_text())
+        begun = {getattr(node, "module", "") or "" for node in tree.body}
+        assert not [module for module in begun if ".reports" in module]
+    assert not [path for path in MODULES.values() if "studies" in path.read_text()]
+
+
 def test_paths_that_are_written_down_lead_somewhere():
     """Comments, pages and settings name files and folders that are there."""
-    folders = "benchmarks|conf|docs|examples|notebooks|results|tests|torchrl_l2c2"
+    folders = "benchmarks|conf|docs|examples|notebooks|results|studies|tests|torchrl_l2c2"
     written = re.compile(rf"(?<![\w/.])(?:{folders})/[\w./-]*\w")
     files = [
         *(path for name in folders.split("|") for path in (ROOT / name).rglob("*")),

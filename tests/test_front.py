@@ -8,14 +8,9 @@ import pytest
 
 from tests.test_reports import make_config, make_run
 from torchrl_l2c2.experiment import L2C2Config
+from torchrl_l2c2.experiment.front import draw_front, front_table, front_test, pareto_front
 from torchrl_l2c2.experiment.reports import read_runs, write_report
-from torchrl_l2c2.experiment.reports.front import (
-    front_table,
-    front_test,
-    pareto_front,
-    searched,
-)
-from torchrl_l2c2.experiment.reports.groups import group_records
+from torchrl_l2c2.experiment.reports.groups import by_task, group_records
 
 # beta -> return and action variation; 1 and 3 are alike, 5 is beaten in one by 4.
 SETTINGS = {
@@ -69,51 +64,37 @@ def test_the_front_is_optunas(tmp_path):
     assert found == {trial.number + 1.0 for trial in study.best_trials}
 
 
-def test_the_report_has_the_front_and_its_picture(tmp_path):
-    """Numbered alike; fewer than four settings of a method are a comparison, not a search."""
-    few = groups(tmp_path / "few", {beta: SETTINGS[beta] for beta in (1, 4, 6)})
-    assert searched(few) == []
+def test_the_table_and_its_picture_are_numbered_alike(tmp_path):
+    """From the smoothest on; and the number of settings is that of those that were measured."""
     many = groups(tmp_path / "many", SETTINGS)
-    assert searched(many) == [many]
-    rows = front_table(many, "late_mean").rows
+    table = front_table(many, "late_mean")
     # make_run: the late policies' mean is 12 more than the total.
-    assert rows[0] == ["1", "L2C2, beta=6", "0, 1", "62.00 (5.66)", "0.032 (0.000)"]
-    assert rows[3][:2] == ["4", "L2C2, beta=4"] and len(rows) == 4
-    runs = read_runs(tmp_path / "many")
-    page = write_report(tmp_path / "report", [run.record for run in runs], runs)
-    assert "Pareto front" in page.read_text()
-    picture = (page.parent / "front_1_swingup.svg").read_text()
+    assert table.rows[0] == ["1", "L2C2, beta=6", "0, 1", "62.00 (5.66)", "0.032 (0.000)"]
+    assert table.rows[3][:2] == ["4", "L2C2, beta=4"] and len(table.rows) == 4
+    assert "of 7 settings" in table.notes[0]
+    draw_front(many, "late_mean", tmp_path / "front.svg")
+    picture = (tmp_path / "front.svg").read_text()
     assert set("1234") <= set(re.findall(r">(\d)</text>", picture))
 
 
 def test_without_late_tests_the_front_is_of_the_last_policies(tmp_path):
-    """``late_share=0``, as presets have it; where neither was tested, there is none."""
+    """``late_share=0``, as presets have it."""
     groups(tmp_path / "runs", SETTINGS)
     forget(tmp_path / "runs", "test_return", "test_action_variation")
-    records = [run.record for run in read_runs(tmp_path / "runs")]
-    found = group_records(records)
+    (found,) = by_task(group_records(run.record for run in read_runs(tmp_path / "runs")))
     assert front_test(found) == "last_mean"
-    page = write_report(tmp_path / "report", records)
-    assert "Pareto front, last policy, mean actions" in page.read_text()
     # make_run: the last policy's is 20 more than the total.
-    assert "| 1 | L2C2, beta=6 | 0, 1 | 70.00 (5.66) | 0.040 (0.000) |" in (
-        page.with_suffix(".md").read_text()
-    )
-    assert page.with_name("front_1_swingup.svg").exists()
-    cut = [run.until(19).record for run in read_runs(tmp_path / "runs")]
-    assert searched(group_records(cut)) == []
-    page = write_report(tmp_path / "cut", cut)
-    assert not list(page.parent.glob("front_*")) and "Pareto" not in page.read_text()
+    row = front_table(found, "last_mean").rows[0]
+    assert row == ["1", "L2C2, beta=6", "0, 1", "70.00 (5.66)", "0.040 (0.000)"]
 
 
-def test_a_report_that_cannot_be_drawn_leaves_none(tmp_path, monkeypatch):
+def test_a_report_that_cannot_be_drawn_leaves_none(tmp_path):
     """Nor a half of one: a picture without its page would pass for all there is."""
-    many = groups(tmp_path / "runs", SETTINGS)
+    records = [r for group in groups(tmp_path / "runs", SETTINGS) for r in group.records]
 
-    def fail(*_):
+    def fail(_):
         raise ValueError("no picture")
 
-    monkeypatch.setattr("torchrl_l2c2.experiment.reports.report.draw_front", fail)
     with pytest.raises(ValueError, match="no picture"):
-        write_report(tmp_path / "report", [record for group in many for record in group.records])
+        write_report(tmp_path / "report", records, pictures={"front.svg": fail})
     assert not (tmp_path / "report").exists()

@@ -18,7 +18,7 @@ TESTS = Path(__file__).parent
 TEXT = (TESTS.parent / "docs" / "paper.md").read_text()
 ROWS = [line for line in TEXT.splitlines() if line.startswith("| ") and "---" not in line]
 NAMED = re.findall(r"`([^`]+)`", TEXT)
-FUNCTIONS = sorted({name for name in NAMED if name.startswith("torchrl_l2c2.")})
+FUNCTIONS = sorted({name for name in NAMED if name.startswith(("torchrl_l2c2.", "studies."))})
 HOLDING = sorted({name for name in NAMED if "::" in name})
 GROUPS = ("task", "algorithm", "regularizer", "replay", "optimizer")
 SETTING = re.compile(rf"`((?:{'|'.join(GROUPS)})\.\w+|test_episodes)(?:=([^` ]+))?`")

@@ -8,22 +8,11 @@ import pytest
 
 from tests.test_reports import make_config, make_run
 from torchrl_l2c2.experiment import L2C2Config, PPOConfig
-from torchrl_l2c2.experiment.reports import (
-    compare_with_paper,
-    find_runs,
-    finished_run,
-    read_runs,
-)
-from torchrl_l2c2.experiment.reports.__main__ import main
-from torchrl_l2c2.experiment.reports.choice import choice_table
-from torchrl_l2c2.experiment.reports.field import field_table
-from torchrl_l2c2.experiment.reports.figures import draw_plane, styles
-from torchrl_l2c2.experiment.reports.front import front_table
-from torchrl_l2c2.experiment.reports.groups import baseline_of, by_task, group_records
-from torchrl_l2c2.experiment.reports.pairwise import pairwise_tables
-from torchrl_l2c2.experiment.reports.paper_table import paper_table
+from torchrl_l2c2.experiment.reports import find_runs, finished_run, read_runs, result_lines
+from torchrl_l2c2.experiment.reports.comparison import comparison_table
+from torchrl_l2c2.experiment.reports.figures import styles
+from torchrl_l2c2.experiment.reports.groups import baseline_of, group_records
 from torchrl_l2c2.experiment.reports.records import read_records, write_records
-from torchrl_l2c2.experiment.reports.score import readings
 
 METHODS = ("none", "caps", "cats")
 GAINS = {gain: L2C2Config(lambda_min=gain, lambda_max=100 * gain) for gain in (0.1, 1.0)}
@@ -58,16 +47,6 @@ def of(records, task, method="l2c2"):
 
 
 class TestLatePolicies:
-    def test_of_a_cut_training_they_are_its_own_share(self, tmp_path):
-        """As of the uncut one, and not the last tenth whatever was asked for."""
-        config = make_config(episodes=20, late_share=0.2)
-        make_run(tmp_path / "0", config, 100.0, 0.1)
-        (run,) = read_runs(tmp_path)
-        # Two of five episodes are late: of returns of 100 and a million less.
-        shorter, last = (run.until(length).record.late_sampled_return for length in (10, 19))
-        assert shorter == -1e6
-        assert last == pytest.approx((3 * -1e6 + 99.0) / 4)
-
     def test_of_several_shares_they_are_told(self, tmp_path):
         """They are pooled, as the training is the same."""
         for seed, share in enumerate((0.1, 0.1, 1.0)):
@@ -95,35 +74,19 @@ class TestPictures:
         assert looks.keys() == {group.name for group in groups}
         assert len({tuple(look.items()) for look in looks.values()}) == len(looks)
 
-    def test_hollow_marks_are_told_of_where_there_are_some(self, field, tmp_path):
-        """Of L2C2 with these gains nothing was published."""
-        drawn = {}
-        for name, chosen in {"all": field, "own": of(field, "pendulum")}.items():
-            path = tmp_path / f"{name}.svg"
-            draw_plane(group_records(chosen), "last_mean", path, measure="sm_asap")
-            drawn[name] = path.read_text()
-        assert "hollow: published" in drawn["all"] and "hollow" not in drawn["own"]
-
 
 class TestTables:
-    def test_another_simulator_is_none_of_the_papers(self, tmp_path):
-        """Whatever the task is called."""
-        config = make_config()
-        task = replace(config.task, env_id="Pendulum-v1")
-        make_run(tmp_path / "0", replace(config, task=task), 100.0, 0.1)
-        assert paper_table(group_records([run.record for run in read_runs(tmp_path)])) is None
-
     def test_runs_of_another_length_are_not_compared(self, field):
-        """Each against each: CATS trained ten times as long is beside nobody."""
+        """CATS trained ten times as long has no baseline."""
         longer = [
             replace(r, length="200 episodes", settings=f"x{r.settings}")
             if r.method == "cats"
             else r
             for r in field
         ]
-        columns = [set(table.columns) for table in pairwise_tables(longer)]
-        assert columns and not any("CATS" in found for found in columns)
-        assert all({"vanilla", "CAPS", "CATS"} <= set(t.columns) for t in pairwise_tables(field))
+        rows = comparison_table("last_mean", group_records(longer)).rows
+        cats = [row for row in rows if row[2].startswith("CATS")]
+        assert len(cats) == 2 and all(row[5] == "" for row in cats)
 
     def test_methods_of_one_name_are_rows_of_their_own(self, field):
         """As L2C2 with beta=0, and the method that is called so."""
@@ -136,15 +99,16 @@ class TestTables:
         named = [replace(r, differences="regularizer.beta=0", settings="beta") for r in twins]
         named = [replace(r, method="l2c2") for r in named]
         vanilla = [r for r in field if r.method == "none"]
-        rows = [row[1] for row in choice_table([*vanilla, *twins, *named]).rows]
+        groups = group_records([*vanilla, *twins, *named])
+        rows = [row[2] for row in comparison_table("last_mean", groups).rows if "tasks" in row[0]]
         assert len(rows) == len(set(rows)) == 2
 
-    def test_a_mean_says_of_how_many_runs_it_is(self, field):
+    def test_a_row_says_of_how_many_runs_it_is(self, field):
         """Those that were cut to a length have no last policy."""
         chosen = of(field, "pendulum", "none")
         chosen[0] = replace(chosen[0], last_mean_return=math.nan)
-        (row,) = [row for row in field_table(chosen).rows if row[3]]
-        assert row[4] == "121.0, of 1 runs" and row[5].startswith("0.505 [")
+        (row,) = comparison_table("last_mean", group_records(chosen)).rows
+        assert row[3:5] == ["1", "121.0"] and row[6].startswith("0.505 [")
 
     def test_beside_two_kinds_of_vanilla_nothing_is_compared(self, field):
         """Their defaults differ, and nothing says which one is the baseline."""
@@ -153,47 +117,6 @@ class TestTables:
         assert [baseline_of(group, groups) for group in groups] == [None] * 3
         groups = group_records([*caps, *vanilla])
         assert {baseline_of(group, groups) is None for group in groups} == {True, False}
-
-    def test_beside_nothing_there_are_no_parts(self, field, recwarn):
-        """Vanilla that returned 0, or did not move: a dash, and no other number suffers."""
-        still = [
-            replace(r, last_mean_return=0.0, last_mean_sm_asap=0.0)
-            if (r.task, r.method) == ("lunarlander", "none")
-            else r
-            for r in field
-        ]
-        table = choice_table(still)
-        cells = {row[1]: row[4:8] for row in table.rows}
-        assert cells["CAPS"] == ["-", "- lunarlander", "-", "- lunarlander"]
-        # 124 and 125 beside 120 and 121 on its one task, Sm .10 and .11 beside .50 and .51.
-        (strong,) = (found for name, found in cells.items() if name == "L2C2, Hellinger 1")
-        assert strong == ["+3%", "+3% pendulum", "0.21", "0.21 pendulum"]
-        assert not recwarn.list and "nan" not in table.markdown()
-
-    def test_a_front_is_of_one_task_and_algorithm(self, field):
-        """And says how many settings were measured, not how many there are."""
-        fronts = by_task(group_records(field))
-        assert [{g.first.task for g in found} for found in fronts] == [
-            {"pendulum"},
-            {"lunarlander"},
-        ]
-        unknown = [replace(r, last_mean_return=math.nan) for r in of(field, "pendulum", "cats")]
-        known = [r for r in of(field, "pendulum", "none") + of(field, "pendulum", "caps")]
-        table = front_table(group_records([*known, *unknown]), "last_mean")
-        assert "of 2 settings" in table.notes[0]
-
-
-def test_each_kind_of_vanilla_is_a_reading(tmp_path):
-    """Of other defaults, when it was run; a score without any is told."""
-    for method in ("none", "caps"):
-        make_run(tmp_path / "runs" / method, make_config(regularizer=method), 100.0, 0.1)
-    records = [run.record for run in read_runs(tmp_path / "runs")]
-    then = [replace(r, settings="then") for r in records if r.method == "none"]
-    found = readings(group_records([*records, *then]))
-    assert len({reading.vanilla.first.settings for reading in found}) == len(found) == 2
-    write_records(tmp_path / "caps.csv", [r for r in records if r.method == "caps"])
-    with pytest.raises(SystemExit, match="error: --score is of runs of vanilla and of CAPS"):
-        main(["--from", str(tmp_path / "caps.csv"), "--score"])
 
 
 class TestFolders:
@@ -242,7 +165,7 @@ class TestFolders:
         path = tmp_path / "bad" / name
         path.write_text(json.dumps({**json.loads(path.read_text()), **wrong}))
         with pytest.raises(ValueError, match=r"the run in '.*bad' is damaged \(.*restore it"):
-            compare_with_paper(finished_run(tmp_path / "bad", config.to_dict()))
+            result_lines(finished_run(tmp_path / "bad", config.to_dict()))
 
 
 @pytest.mark.parametrize(

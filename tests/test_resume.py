@@ -40,13 +40,12 @@ from torchrl_l2c2.experiment.checkpoints import (
 from torchrl_l2c2.experiment.command import _end_logged, run
 from torchrl_l2c2.experiment.config import GROUPS
 from torchrl_l2c2.experiment.continuation import check_same_settings
+from torchrl_l2c2.experiment.differences import fingerprint
 from torchrl_l2c2.experiment.errors import OtherRunError, warnings_told
 from torchrl_l2c2.experiment.files import write_json
 from torchrl_l2c2.experiment.naming import run_name
 from torchrl_l2c2.experiment.progress import say
-from torchrl_l2c2.experiment.reports import results
-from torchrl_l2c2.experiment.reports.differences import fingerprint
-from torchrl_l2c2.experiment.reports.runs import find_runs, finished_run, read_runs
+from torchrl_l2c2.experiment.reports import find_runs, finished_run, read_runs, results
 from torchrl_l2c2.experiment.trained import load_policy
 
 ROOT = Path(__file__).parent.parent

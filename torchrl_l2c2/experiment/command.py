@@ -45,7 +45,7 @@ from torchrl_l2c2.experiment.signals import (
 from torchrl_l2c2.experiment.sweep import Sweep, begin_sweep, list_jobs
 
 if TYPE_CHECKING:
-    from torchrl_l2c2.experiment.reports import FinishedRun
+    from torchrl_l2c2.experiment.finished import FinishedRun
 
 # How long a file server may hold the lock of a machine that was lost.
 LOST_SECONDS = 180.0
@@ -204,8 +204,8 @@ def run(
     """
     # Here, as settings are checked before anything waits for torch.
     from torchrl_l2c2.experiment.continuation import check_elsewhere, tell_past
+    from torchrl_l2c2.experiment.finished import finished_run
     from torchrl_l2c2.experiment.lock import wait_for_folder
-    from torchrl_l2c2.experiment.reports import finished_run
     from torchrl_l2c2.experiment.video import check_pictures, check_video, record_video
 
     video = folder / "video.mp4"
@@ -249,7 +249,6 @@ def _train(
 ) -> FinishedRun | None:
     """Trains and tests a policy, or trains it alone where no test is asked for."""
     from torchrl_l2c2.experiment.process import keep_freed_memory
-    from torchrl_l2c2.experiment.reports import compare_with_paper
     from torchrl_l2c2.experiment.trained import save_policy
     from torchrl_l2c2.experiment.training import Experiment
 
@@ -268,15 +267,17 @@ def _train(
             return None
         tests = [experiment.test(sampled=s, progress=True) for s in (False, True)]
         finished = experiment.finish(*tests)
-        log(folder, f"finished:\n{compare_with_paper(finished)}")
+        from torchrl_l2c2.experiment.reports import result_lines  # After it: not at start-up.
+
+        log(folder, f"finished:\n{result_lines(finished)}")
         return finished
 
 
 def _show(finished: FinishedRun) -> None:
-    """The result beside the paper's, and a picture of how it was learned."""
-    from torchrl_l2c2.experiment.reports import compare_with_paper, draw_learning_curves
+    """The result, and a picture of how it was learned."""
+    from torchrl_l2c2.experiment.reports import draw_learning_curves, result_lines
 
-    print(compare_with_paper(finished))
+    print(result_lines(finished))
     picture = finished.folder / "learning_curves.png"
     if not picture.exists():
         draw_learning_curves([finished], picture)

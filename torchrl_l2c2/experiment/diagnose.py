@@ -15,10 +15,10 @@ from torchrl_l2c2.experiment.diagnosis import (
     findings,
     write_page,
 )
+from torchrl_l2c2.experiment.differences import differences
 from torchrl_l2c2.experiment.environments import TEST_SEED
 from torchrl_l2c2.experiment.errors import told_in_a_line
 from torchrl_l2c2.experiment.files import make_folder_of, write_atomically
-from torchrl_l2c2.experiment.reports.differences import differences
 from torchrl_l2c2.experiment.reports.names import method_name, name_with_settings
 from torchrl_l2c2.experiment.saved import read_config
 

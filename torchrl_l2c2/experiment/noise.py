@@ -23,12 +23,12 @@ from torchrl_l2c2.experiment.collection import play_episodes
 from torchrl_l2c2.experiment.errors import told_in_a_line
 from torchrl_l2c2.experiment.evaluate import evaluate_policy
 from torchrl_l2c2.experiment.files import make_folder, write_atomically, write_json
+from torchrl_l2c2.experiment.finished import FinishedRun
 from torchrl_l2c2.experiment.frames import check_finite
 from torchrl_l2c2.experiment.naming import plain
 from torchrl_l2c2.experiment.process import ProcessState
-from torchrl_l2c2.experiment.reports import FinishedRun, find_runs
-from torchrl_l2c2.experiment.reports.comparison import Estimate, estimate_cell
-from torchrl_l2c2.experiment.reports.field import FIELD_MEASURES
+from torchrl_l2c2.experiment.reports import find_runs
+from torchrl_l2c2.experiment.reports.comparison import COMPARED, Estimate, estimate_cell
 from torchrl_l2c2.experiment.reports.figures import finish, styles, subplots
 from torchrl_l2c2.experiment.reports.groups import Group, group_records
 from torchrl_l2c2.experiment.reports.statistics import mean
@@ -136,7 +136,7 @@ def noise_table(played: Sequence[Played]) -> Table:
             ),
         ]
         for group in groups
-        for quantity, name in FIELD_MEASURES.items()
+        for quantity, (name, _) in COMPARED.items()
     ]
     columns = ["task", "algorithm", "method", "seeds", "measure", *(f"{x:g}" for x in levels)]
     return Table("Noise on the observations", columns, rows, [LEGEND])
@@ -151,8 +151,8 @@ def draw_noise(played: Sequence[Played], path: str | Path) -> None:
     """
     groups, summaries = _grouped(played)
     looks, levels = styles(groups), list(played[0].summaries)
-    figure, axes = subplots(len(FIELD_MEASURES), 1, (3.4 * len(FIELD_MEASURES) + 0.6, 3.6))
-    for axis, (quantity, name) in zip(axes, FIELD_MEASURES.items(), strict=True):
+    figure, axes = subplots(len(COMPARED), 1, (3.4 * len(COMPARED) + 0.6, 3.6))
+    for axis, (quantity, (name, _)) in zip(axes, COMPARED.items(), strict=True):
         for group in groups:
             found = [_estimate(group, summaries, level, quantity) for level in levels]
             known = [(x, each) for x, each in zip(levels, found, strict=True) if each is not None]

@@ -16,6 +16,7 @@ import sys
 import uuid
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -25,10 +26,11 @@ from filelock import FileLock
 
 from torchrl_l2c2.experiment.errors import told_in_a_line
 from torchrl_l2c2.experiment.files import make_folder
+from torchrl_l2c2.experiment.front import draw_front, front_table, front_test
 from torchrl_l2c2.experiment.lock import FolderInUseError, lock_folder
+from torchrl_l2c2.experiment.naming import plain
 from torchrl_l2c2.experiment.reports import find_runs, write_report
 from torchrl_l2c2.experiment.reports.comparison import SIGNS
-from torchrl_l2c2.experiment.reports.front import front_table, front_test
 from torchrl_l2c2.experiment.reports.groups import by_task, group_records
 from torchrl_l2c2.experiment.search_space import check_settings, read_space, short
 from torchrl_l2c2.experiment.sweep import start_guard
@@ -261,14 +263,20 @@ def _report(search: Search) -> None:
             "no trial has finished: above it is said why, and in the train.log of those runs below "
             f"{str(folder)!r} that began."
         )
+    tasks = by_task(group_records(records))
+    fronts = [front_table(groups, front_test(groups)) for groups in tasks]
+    drawn = {
+        f"front_{number}_{plain(groups[0].first.task)}.svg": partial(
+            draw_front, groups, front_test(groups)
+        )
+        for number, groups in enumerate(tasks, 1)
+    }
     names = ", ".join(path.name for path in search.ended("FAIL"))
     failed = [f"failed, and count for nothing: {names}"] if names else []
-    page = write_report(folder / "report", records, found.runs, [*found.notes, *failed])
-    fronts = [
-        front_table(groups, front_test(groups)).markdown()
-        for groups in by_task(group_records(records))
-    ]
-    print(*fronts, *failed, f"report: {page}", sep="\n\n")
+    notes = [*found.notes, *failed]
+    page = write_report(folder / "report", records, found.runs, notes, fronts, drawn)
+    tables = [table.markdown() for table in fronts]
+    print(*tables, *failed, f"report: {page}", sep="\n\n")
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ from torchrl_l2c2.experiment.continuation import (
 from torchrl_l2c2.experiment.environments import TEST_SEED
 from torchrl_l2c2.experiment.evaluate import Evaluation, LateTests, evaluate_task
 from torchrl_l2c2.experiment.files import make_folder
+from torchrl_l2c2.experiment.finished import FinishedRun
 from torchrl_l2c2.experiment.folder import begin_folder, bring_files
 from torchrl_l2c2.experiment.gain import GainControl
 from torchrl_l2c2.experiment.learner import Learner, untrained
@@ -34,7 +35,6 @@ from torchrl_l2c2.experiment.player import Episode, Player
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.progress import Progress, say
 from torchrl_l2c2.experiment.replay import load_replay_state, replay_state
-from torchrl_l2c2.experiment.reports import FinishedRun, write_results
 from torchrl_l2c2.experiment.schedules import SCHEDULES
 from torchrl_l2c2.experiment.signals import Interrupted, stop_on_signals
 from torchrl_l2c2.experiment.tasks import Budget
@@ -272,15 +272,14 @@ class Experiment:
         """
         if self.folder is None:
             raise ValueError("this experiment has no folder to write to; give it one when made.")
+        from torchrl_l2c2.experiment.reports import write_results  # Not needed to start.
+
         save_policy(self.agent.policy, self.folder / "policy.pt")
         tests = {"mean": result, "sampled": sampled}
         written = {name: test.to_dict() for name, test in tests.items() if test is not None}
-        written["mean"]["training"] = {
-            "episodes": len(self.metrics),
-            "frames": self.player.frames,
-            "updates": self.learner.updates,
-            "untrained": self._untrained(),
-        }
+        training: dict[str, Any] = {"episodes": len(self.metrics), "frames": self.player.frames}
+        training |= {"updates": self.learner.updates, "untrained": self._untrained()}
+        written["mean"]["training"] = training
         return write_results(self.folder, self.config, written)
 
     def close(self) -> None:

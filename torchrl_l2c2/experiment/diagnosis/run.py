@@ -25,10 +25,10 @@ from torchrl_l2c2.experiment.diagnosis.measured import Diagnosis, TermShare, Val
 from torchrl_l2c2.experiment.environments import TEST_SEED, untransformed
 from torchrl_l2c2.experiment.errors import SimulatorError
 from torchrl_l2c2.experiment.export import entry_names
+from torchrl_l2c2.experiment.finished import LATE
 from torchrl_l2c2.experiment.frames import PREVIOUS
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.regularizers.base import GainConfig
-from torchrl_l2c2.experiment.reports.runs import LATE
 from torchrl_l2c2.experiment.saved import read_config, read_rows
 from torchrl_l2c2.experiment.trained import load_policy
 from torchrl_l2c2.experiment.video import play_pictures

@@ -1,8 +1,8 @@
-"""Groups against vanilla: interquartile means and probabilities of improvement, with intervals."""
+"""Groups compared: means and probabilities of improvement over the baseline, with intervals."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import zip_longest
@@ -10,24 +10,39 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_l2c2.experiment.finished import TESTS
 from torchrl_l2c2.experiment.reports.groups import Group, baseline_of, over_tasks
-from torchrl_l2c2.experiment.reports.records import QUANTITIES, TESTS
 from torchrl_l2c2.experiment.reports.statistics import (
     Interval,
     Scores,
     bootstrap_interval,
     interquartile_mean,
+    mean,
     mean_and_deviation,
     probability_of_improvement,
 )
 from torchrl_l2c2.experiment.reports.tables import Table, number, number_range
 
-READING = (
+# The compared quantities, their names in tables, and the names of their probabilities.
+COMPARED = {
+    "return": ("return", "P(returns more)"),
+    "sm_asap": ("Sm", "P(smaller Sm)"),
+    "action_variation": ("action variation", "P(smoother)"),
+}
+# Larger returns and smaller action variations are better.
+SIGNS = {"return": 1.0, "action_variation": -1.0}
+INTERVAL_NOTE = (
     "An interval that contains .50 does not separate the two; one without a width says that all "
     "pairs agree, not that chance is ruled out."
 )
-# What is better: a larger return, a smaller action variation.
-SIGNS = {"return": 1.0, "action_variation": -1.0}
+LEGEND = (
+    "Means over runs with 95% intervals of the stratified bootstrap in brackets (Agarwal et al. "
+    "2021). P: the probability that a run is better than a run of vanilla (no regularizer) with "
+    f"the same other settings; ties count half. {INTERVAL_NOTE} Action variation: mean change of "
+    "the policy's mean action per step; Sm: frequency-weighted spectrum of the actions, which "
+    "grows with episode length. Smaller is smoother. Late policies: policies of the last tenth of "
+    "training, or of its late_share."
+)
 
 
 @dataclass(frozen=True)
@@ -61,7 +76,8 @@ def improvement(
 
     Args:
         groups (sequence of Group): one of each task, which counts with all of its runs.
-        baselines (sequence of Group): vanilla, or another method, of the same tasks in this order.
+        baselines (sequence of Group): the baseline, or another method, of the same tasks in this
+            order.
         test (str): one of ``TESTS``.
         quantity (str): ``"return"``, or a measure of which less is better.
 
@@ -75,77 +91,76 @@ def improvement(
     return Estimate.of(probability_of_improvement, *matrices)
 
 
+def improvement_cell(
+    groups: Sequence[Group], baselines: Sequence[Group | None], test: str, quantity: str
+) -> str:
+    """:func:`improvement` as a table's cell; empty where there is none, or no baseline."""
+    known = [baseline for baseline in baselines if baseline is not None]
+    better = improvement(groups, known, test, quantity) if len(known) == len(groups) else None
+    return "" if better is None else better.text("{:.2f}".format)
+
+
 def improvements_over_tasks(
-    groups: Sequence[Group], test: str
+    groups: Sequence[Group], test: str, quantities: Iterable[str]
 ) -> list[tuple[str, str, list[Group], list[str]]]:
-    """Of methods that several tasks have: probabilities, unlike means, need no common scale.
+    """Probabilities of improvement over several tasks; unlike means they need no common scale.
 
     Args:
-        groups (sequence of Group): of several tasks.
-        test (str): one of ``TESTS``.
+        groups (sequence of Group): Groups of several tasks.
+        test (str): One of ``TESTS``.
+        quantities (iterable of str): Keys of ``COMPARED``.
 
     Returns:
-        list: the algorithm, the method, its group of each task, and of each of ``QUANTITIES`` how
-        probable it is that a run is better than one of vanilla, the mean over these tasks, with
-        its interval.
+        list: for every method that several tasks have, the algorithm, the method, its group of each
+        task, and a cell for each quantity: the mean probability over these tasks.
     """
-    vanilla = {
+    baselines = {
         group: baseline
         for group in groups
         if (baseline := baseline_of(group, groups)) is not None
         and all(len(side.scores(test, "return")) for side in (group, baseline))
     }
-    found = []
-    for algorithm, name, ours in over_tasks(vanilla):
-        if len(ours) > 1:
-            theirs = [vanilla[group] for group in ours]
-            better = [probability(improvement(ours, theirs, test, q)) for q in QUANTITIES]
-            found.append((algorithm, name, ours, better))
-    return found
+    return [
+        (
+            *(algorithm, name, ours),
+            [improvement_cell(ours, [baselines[g] for g in ours], test, q) for q in quantities],
+        )
+        for algorithm, name, ours in over_tasks(baselines)
+        if len(ours) > 1
+    ]
 
 
-def statistics_tables(groups: Sequence[Group]) -> list[Table]:
-    """Interquartile means and probabilities of improvement, a table for each test there is."""
-    known = [f for f in TESTS if any(len(group.scores(f, "return")) for group in groups)]
-    return [statistics_table(test, groups) for test in known]
+def known_tests(groups: Sequence[Group]) -> list[str]:
+    """The tests that some group has, in the order of ``TESTS``."""
+    return [test for test in TESTS if any(len(group.scores(test, "return")) for group in groups)]
 
 
-def statistics_table(test: str, groups: Sequence[Group]) -> Table:
-    """Interquartile means, and probabilities of improvement over vanilla, of one test.
+def comparison_table(
+    test: str, groups: Sequence[Group], center: Callable[..., Scores] = mean
+) -> Table:
+    """Means and probabilities of improvement over the baseline, with intervals.
 
     Args:
         test (str): one of ``TESTS``.
-        groups (sequence of Group): a row each, and one for each method that several tasks have.
+        groups (sequence of Group): a row each, then one for each method that several tasks have.
+        center (callable): the mean, or another statistic of ``[..., runs, tasks]``.
     """
+    known = [name for name in COMPARED if any(len(group.scores(test, name)) for group in groups)]
     columns = ["task", "algorithm", "method", "runs"]
-    for quantity, better in zip(QUANTITIES.values(), ("returns more", "smoother"), strict=True):
-        columns += [f"{quantity}: interquartile mean", f"P({better})"]
-    rows = [_statistics_row(test, group, baseline_of(group, groups)) for group in groups]
-    rows += _across_tasks(test, groups)
-    notes = [
-        "95% intervals of the stratified bootstrap in brackets (Agarwal et al. 2021). P: the "
-        "probability that a run is better than a run of vanilla with the same other settings "
-        f"(ties count half). {READING}"
-    ]
-    return Table(f"Statistics: {TESTS[test]}", columns, rows, notes)
-
-
-def _statistics_row(test: str, group: Group, baseline: Group | None) -> list[str]:
-    runs = str(len(group.scores(test, "return")))
-    cells = [group.first.task, group.first.algorithm, group.name, runs]
-    for quantity in QUANTITIES:
-        center = Estimate.of(interquartile_mean, group.scores(test, quantity))
-        better = improvement([group], [baseline], test, quantity) if baseline else None
-        cells += [estimate_cell(center, quantity), probability(better)]
-    return cells
-
-
-def _across_tasks(test: str, groups: Sequence[Group]) -> list[list[str]]:
+    columns += [column for name in known for column in COMPARED[name]]
     rows = []
-    for algorithm, name, ours, better in improvements_over_tasks(groups, test):
+    for group in groups:
+        cells = [group.first.task, group.first.algorithm, group.name]
+        cells.append(str(len(group.scores(test, "return"))))
+        for name in known:
+            cells.append(estimate_cell(Estimate.of(center, group.scores(test, name)), name))
+            cells.append(improvement_cell([group], [baseline_of(group, groups)], test, name))
+        rows.append(cells)
+    for algorithm, name, ours, better in improvements_over_tasks(groups, test, known):
         runs = number_range(sorted({len(group.scores(test, "return")) for group in ours}))
-        rows.append([f"{len(ours)} tasks", algorithm, name, runs, "", better[0], "", better[1]])
-    return rows
+        across = [cell for each in better for cell in ("", each)]
+        rows.append([f"{len(ours)} tasks", algorithm, name, runs, *across])
+    return Table(TESTS[test].capitalize(), columns, rows, [LEGEND])
 
 
 def summary(groups: Sequence[Group]) -> list[dict[str, Any]]:
@@ -156,7 +171,7 @@ def summary(groups: Sequence[Group]) -> list[dict[str, Any]]:
 def _summary(group: Group, baseline: Group | None) -> dict[str, Any]:
     statistics: dict[str, Any] = {}
     for test in TESTS:
-        for quantity in (*QUANTITIES, *(["sm_asap"] if test == "last_mean" else [])):
+        for quantity in COMPARED:
             scores = group.scores(test, quantity)
             if not len(scores):
                 continue
@@ -179,7 +194,6 @@ def _summary(group: Group, baseline: Group | None) -> dict[str, Any]:
         "differences": first.differences,
         "length": first.length,
         "seeds": group.seeds,
-        "paper": first.paper._asdict() if first.paper else None,
         "statistics": statistics,
     }
 
@@ -200,8 +214,3 @@ def estimate_cell(estimate: Estimate | None, quantity: str) -> str:
     if estimate is None:
         return "-"
     return estimate.text(partial(number, quantity=quantity, beside=estimate.value))
-
-
-def probability(estimate: Estimate | None) -> str:
-    """Of an improvement, with its interval; empty where there is none."""
-    return "" if estimate is None else estimate.text(lambda value: f"{value:.2f}")

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import io
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from torchrl_l2c2.experiment.files import write_atomically
-from torchrl_l2c2.experiment.reports.comparison import Estimate
-from torchrl_l2c2.experiment.reports.field import FIELD_MEASURES, published_of
-from torchrl_l2c2.experiment.reports.front import means, pareto_front
-from torchrl_l2c2.experiment.reports.groups import Group, comparable, group_records
+from torchrl_l2c2.experiment.finished import TESTS, FinishedRun
+from torchrl_l2c2.experiment.reports.comparison import COMPARED, Estimate
+from torchrl_l2c2.experiment.reports.groups import Group, by_task, group_records
 from torchrl_l2c2.experiment.reports.names import METHODS
-from torchrl_l2c2.experiment.reports.records import TESTS, digest
-from torchrl_l2c2.experiment.reports.runs import FinishedRun
+from torchrl_l2c2.experiment.reports.records import digest
 from torchrl_l2c2.experiment.reports.statistics import Scores, curve_band, mean
 
 PANELS = {
@@ -61,79 +59,47 @@ def draw_learning_curves(runs: Sequence[FinishedRun], path: str | Path) -> None:
 
 
 def draw_plane(
-    groups: Sequence[Group], test: str, path: str | Path, measure: str = "action_variation"
+    groups: Sequence[Group],
+    test: str,
+    path: str | Path,
+    measure: str = "action_variation",
+    *,
+    more: Callable[[Any, Group, str], str | None] | None = None,
 ) -> None:
     """Draws return against smoothness: up and to the left is better and smoother.
 
-    A dot for each group, the mean over its seeds with 95% bootstrap intervals; a hollow diamond
-    for what was published: of the paper with its standard deviation, dotted.
+    A dot for each group, the mean over its seeds with 95% bootstrap intervals.
 
     Args:
-        groups (sequence of Group): a panel is drawn for each task and algorithm, and for groups of
-            one that differ in more than the regularizer, as :func:`~.groups.comparable` has it.
+        groups (sequence of Group): a panel is drawn for each task and algorithm.
         test (str): one of ``TESTS``, such as ``"late_mean"``.
         path (str or Path): of the file; its ending, ``.png`` or ``.svg``, decides what it is.
-        measure (str): ``"action_variation"``, as the paper has it, or ``"sm_asap"``, as the
-            published table of the field's tasks does.
+        measure (str): ``"action_variation"`` or ``"sm_asap"``.
+
+    Keyword Args:
+        more (callable, optional): Draws more about a group on its axes in its color, and returns
+            what the title says of it, or ``None``.
     """
-    panels = comparable(groups)
+    panels = by_task(groups)
     across = min(4, len(panels))
     down = -(-len(panels) // across)
     picture, axes = subplots(across, down, (max(3.4 * across, 5.4), 3.2 * down + 0.6))
-    first_of: dict[tuple[str, str], Any] = {}
     # There is one legend for all panels: a name looks the same in each.
-    looks = styles([group for _, together in panels for group in together])
-    hollow = False
-    for axis, (settings, together) in zip(axes, panels, strict=False):
-        of = together[0].first
-        # What is told apart by settings is on one scale, of all that is drawn on it.
-        first = first_of.setdefault((of.task, of.algorithm), axis)
-        if axis is not first:
-            axis.sharex(first)
-            axis.sharey(first)
+    looks = styles(groups)
+    title = {TESTS[test]: None}
+    for axis, together in zip(axes, panels, strict=False):
         for group in together:
-            hollow |= _draw_point(axis, group, test, measure, looks[group.name])
-        title = f"{of.task}, {of.algorithm}"
-        title = f"{title}\n{settings}" if settings else title
-        axis.set_title(title, fontsize=10, parse_math=False)
-        axis.set_xlabel(FIELD_MEASURES[measure])
+            _draw_point(axis, group, test, measure, looks[group.name])
+            if more is not None and (note := more(axis, group, looks[group.name]["color"])):
+                title[note] = None
+        panel = f"{together[0].first.task}, {together[0].first.algorithm}"
+        axis.set_title(panel, fontsize=10, parse_math=False)
+        axis.set_xlabel(COMPARED[measure][0])
         axis.set_ylabel("return")
     for axis in axes[len(panels) :]:
         axis.set_visible(False)
-    title = TESTS[test]
-    if hollow:
-        title += "; hollow: " + ("the paper" if measure == "action_variation" else "published")
     drawn_of = digest(record for group in groups for record in group.records)
-    finish(picture, axes, title, path, description=f"records {drawn_of}")
-
-
-def draw_front(groups: Sequence[Group], test: str, path: str | Path) -> None:
-    """Draws every setting as a dot, and those of the Pareto front with their numbers and a line.
-
-    Along the line, whatever is gained in return is paid for in smoothness.
-
-    Args:
-        groups (sequence of Group): of one task and algorithm.
-        test (str): one of ``TESTS``.
-        path (str or Path): of the file; its ending, ``.png`` or ``.svg``, decides what it is.
-    """
-    picture, axes = subplots(1, 1, (5.4, 4.0))
-    looks = styles(groups)
-    front = pareto_front(groups, test)
-    for group in groups:
-        if place := means(group, test):
-            color = looks[group.name]["color"]
-            axes[0].plot(*place[::-1], "o", color=color, alpha=1.0 if group in front else 0.3)
-    steps = [means(group, test)[::-1] for group in front]
-    axes[0].step(*zip(*steps, strict=True), where="post", color="#444444", linewidth=1)
-    for number, step in enumerate(steps, 1):
-        offset = {"xytext": (4, -10), "textcoords": "offset points"}
-        axes[0].annotate(str(number), step, fontsize=9, **offset)
-    axes[0].set_xlabel("action variation")
-    axes[0].set_ylabel("return")
-    first = groups[0].first
-    title = f"{first.task}, {first.algorithm}: {len(groups)} settings, {TESTS[test]}"
-    finish(picture, axes, title, path)
+    finish(picture, axes, "; ".join(title), path, description=f"records {drawn_of}")
 
 
 def _draw_curve(
@@ -166,27 +132,12 @@ def _moving_average(values: Scores, window: int) -> Scores:
     return averages
 
 
-def _draw_point(axis: Any, group: Group, test: str, measure: str, style: dict[str, str]) -> bool:
-    """Draws a group; whether something was published of it, which is drawn, too."""
-    color = style["color"]
+def _draw_point(axis: Any, group: Group, test: str, measure: str, style: dict[str, str]) -> None:
     estimates = [Estimate.of(mean, group.scores(test, name)) for name in (measure, "return")]
     if None not in estimates:
         (x, x_bars), (y, y_bars) = ((e.value, _bars(e)) for e in estimates if e is not None)
         shape = {"fmt": style["marker"], "markersize": 6, "elinewidth": 1.6, "capsize": 3}
-        axis.errorbar([x], [y], y_bars, x_bars, label=group.name, color=color, **shape)
-    hollow = {"fmt": "D", "markersize": 5, "markerfacecolor": "white", "color": color, "alpha": 0.8}
-    published, paper = published_of(group), group.first.paper
-    if measure == "sm_asap" and published is not None:
-        axis.errorbar([published.sm], [published.total], **hollow)
-        return True
-    if measure == "action_variation" and paper is not None:
-        center = ([paper.action_variation_mean], [paper.return_mean])
-        deviations = {"xerr": paper.action_variation_std, "yerr": paper.return_std}
-        bars = axis.errorbar(*center, **deviations, elinewidth=0.9, **hollow)
-        for line in bars[2]:
-            line.set_linestyle(":")
-        return True
-    return False
+        axis.errorbar([x], [y], y_bars, x_bars, label=group.name, color=style["color"], **shape)
 
 
 def _bars(estimate: Estimate) -> list[list[float]] | None:

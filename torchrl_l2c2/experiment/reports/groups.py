@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 from typing import Any
 
 import numpy as np
 
-from torchrl_l2c2.experiment.reports.names import method_name, name_with_settings
-from torchrl_l2c2.experiment.reports.records import Record
+from torchrl_l2c2.experiment.finished import Record
+from torchrl_l2c2.experiment.reports.names import name_with_settings
+from torchrl_l2c2.experiment.reports.records import place
 from torchrl_l2c2.experiment.reports.statistics import Scores
-
-# A row's settings by name; ``None`` where the default stands.
-Settings = tuple[tuple[str, str | None], ...]
-# What sets groups apart and is no setting of a run: how long it was, and the code of all settings.
-LENGTH, CODE = "length", "settings"
 
 
 @dataclass(frozen=True)
@@ -45,9 +40,12 @@ class Group:
         return [record.seed for record in self.records]
 
     @property
-    def reading(self) -> tuple[Any, ...]:
+    def setup(self) -> tuple[Any, ...]:
         """Every setting but the regularizer's: what is compared with it has the same."""
-        return (self.first.task, self.first.algorithm, *sorted(_others(self).items()))
+        # A run of so many frames has a number of episodes, too, which says nothing.
+        settings = self.first.settings_of_any_length.items()
+        others = sorted(pair for pair in settings if not pair[0].startswith("regularizer."))
+        return (self.first.task, self.first.algorithm, self.first.length, *others)
 
     def by_seed(self, test: str, quantity: str) -> dict[int, float]:
         """A quantity in one of the tests, of every run that has it."""
@@ -62,7 +60,7 @@ class Group:
 def group_records(records: Iterable[Record]) -> list[Group]:
     """Groups records by every setting but the seed, in the order of tables."""
     pooled: dict[tuple[Any, ...], list[Record]] = defaultdict(list)
-    for record in sorted(records, key=lambda record: record.place):
+    for record in sorted(records, key=place):
         # Without the seed, which is the last of it.
         pooled[record.identity[:-1]].append(record)
     groups = (Group(tuple(members), "") for members in pooled.values())
@@ -85,134 +83,38 @@ def baseline_of(group: Group, groups: Iterable[Group]) -> Group | None:
     if group.first.method == "none":
         return None
     vanilla = (other for other in groups if other.first.method == "none")
-    found = [other for other in vanilla if other.reading == group.reading]
+    found = [other for other in vanilla if other.setup == group.setup]
     return found[0] if len(found) == 1 else None
 
 
 def over_tasks(groups: Iterable[Group]) -> list[tuple[str, str, list[Group]]]:
-    """A row for every method and its own settings: of each task that has them, one group.
+    """Groups of several tasks that have the same name and the same settings of the regularizer.
 
-    Other settings and the length may be a task's own, as a preset's are. Where a task has several
-    such groups, only what sets these apart must be the same on all tasks of a row.
-
-    Args:
-        groups (iterable of Group): of several tasks.
+    Other settings may be a task's own, as a preset's are.
 
     Returns:
-        list: the algorithm, the row's name, with what sets it apart from the method's other rows,
-        and its groups.
+        list: the algorithm, the name, and the groups, one of each task.
     """
-    methods: dict[tuple[str, str], dict[Settings, list[Group]]] = {}
+    rows: dict[tuple[Any, ...], list[Group]] = defaultdict(list)
     for group in groups:
-        of_method = methods.setdefault((group.first.algorithm, group.first.method), {})
-        of_method.setdefault(_own(group), []).append(group)
-    rows = []
-    for (algorithm, method), found in methods.items():
-        common = set.intersection(*map(set, found))
-        for own, alike in found.items():
-            name, named = name_with_settings(method, dict(own))
-            told = tuple(pair for pair in own if pair not in common and pair[0] not in named)
-            for others, row in _one_of_each(alike).items():
-                parts = [name, *_told_settings(told + others)]
-                rows.append((algorithm, ", ".join(parts), row))
-    names = Counter((algorithm, name) for algorithm, name, _ in rows)
-    return [
-        # Methods may differ in no more than what they are called, as l2c2_policy from beta=0.
-        (algorithm, name if names[algorithm, name] == 1 else f"{name}, {row[0].first.method}", row)
-        for algorithm, name, row in rows
-    ]
-
-
-def _one_of_each(groups: Sequence[Group]) -> dict[Settings, list[Group]]:
-    """Rows with one group of a task, by the settings that set groups of the same task apart."""
-    apart: set[str] = set()
-    for one, other in combinations(groups, 2):
-        if one.first.task == other.first.task:
-            ours, theirs = _others(one), _others(other)
-            apart |= {k for k in ours | theirs if ours.get(k) != theirs.get(k)} or {CODE}
-    rows: dict[Settings, list[Group]] = defaultdict(list)
-    for group in groups:
-        others = _others(group) | {CODE: group.first.settings}
-        rows[tuple((key, others.get(key)) for key in sorted(apart))].append(group)
-    return rows
-
-
-def _told_settings(settings: Settings) -> list[str]:
-    keys = {key for key, _ in settings}
-    return [
-        value if key in (LENGTH, CODE) else f"{_shortest(key, keys)}={value}"
-        for key, value in settings
-        if value is not None
-    ]
-
-
-def comparable(groups: Iterable[Group]) -> list[tuple[str, list[Group]]]:
-    """Groups that differ in the regularizer alone, together, and what sets them apart from others.
-
-    All of a task and an algorithm are together where no two of them are so: a sweep over other
-    settings is compared for these.
-
-    Returns:
-        list: what sets them apart, such as ``"reduction=mean, 300 episodes"``, empty where there
-        are no others; and the groups, whose names no longer say it.
-    """
-    tasks: dict[tuple[str, str], dict[tuple[Any, ...], list[Group]]] = {}
-    for group in groups:
-        readings = tasks.setdefault((group.first.task, group.first.algorithm), {})
-        readings.setdefault(group.reading, []).append(group)
-    found = []
-    for together in map(list, (readings.values() for readings in tasks.values())):
-        if len(together) == 1 or max(map(len, together)) == 1:
-            found.append(("", [group for members in together for group in members]))
-            continue
-        others = [_others(members[0]) for members in together]
-        keys = sorted({key for one in others for key in one})
-        apart = [key for key in keys if len({one.get(key) for one in others}) > 1]
-        for own, members in zip(others, together, strict=True):
-            told = _told_settings(tuple((key, own.get(key)) for key in apart))
-            found.append((", ".join(told), _named(members)))
-    return found
-
-
-def differing_lengths(groups: Sequence[Group]) -> list[str]:
-    """What was trained for different lengths, which is not pooled."""
-    lengths: dict[tuple[str, ...], list[Group]] = defaultdict(list)
-    for group in groups:
-        # A run's identity without its length and seed.
-        lengths[tuple(map(str, group.first.identity[:-2]))].append(group)
-    several = [
-        (" and of ".join(group.first.length for group in same), same[0])
-        for same in lengths.values()
-        if len(same) > 1
-    ]
-    return _told(
-        (f"runs of {found} are rows of their own", group, method_name(group.first.method))
-        for found, group in several
-    )
+        settings = group.first.other_settings.items()
+        own = tuple(pair for pair in settings if pair[0].startswith("regularizer."))
+        rows[group.first.algorithm, group.name, own].append(group)
+    return [(algorithm, name, found) for (algorithm, name, _), found in rows.items()]
 
 
 def differing_versions(groups: Sequence[Group]) -> list[str]:
-    """What was run by several versions, which are pooled."""
-    found = (
-        (name, sorted({str(getattr(r, name)) or "unknown" for r in group.records}), group)
-        for name in ("torch", "torchrl", "commit")
-        for group in groups
-    )
-    return _told(
-        (f"runs of more than one {name} ({', '.join(versions)}) are pooled", group, group.name)
-        for name, versions, group in found
-        if len(versions) > 1
-    )
-
-
-def _told(said: Iterable[tuple[str, Group, str]]) -> list[str]:
-    """A line for each that is said, of all rows of a task and an algorithm together."""
+    """Notes on runs of several versions, which are pooled."""
     rows: dict[tuple[str, str, str], list[str]] = defaultdict(list)
-    for sentence, group, name in said:
-        rows[group.first.task, group.first.algorithm, sentence].append(name)
+    for name in ("torch", "torchrl", "commit"):
+        for group in groups:
+            versions = sorted({str(getattr(r, name)) or "unknown" for r in group.records})
+            if len(versions) > 1:
+                note = f"runs of more than one {name} ({', '.join(versions)}) are pooled."
+                rows[group.first.task, group.first.algorithm, note].append(group.name)
     return [
-        f"{task}, {algorithm}, {'; '.join(names)}: {sentence}"
-        for (task, algorithm, sentence), names in rows.items()
+        f"{task}, {algorithm}, {'; '.join(names)}: {note}"
+        for (task, algorithm, note), names in rows.items()
     ]
 
 
@@ -220,20 +122,6 @@ def common_settings(groups: Sequence[Group]) -> dict[str, str]:
     """What differs from the defaults in all groups alike."""
     first, *rest = ({**group.first.other_settings} for group in groups)
     return {k: v for k, v in first.items() if all(other.get(k) == v for other in rest)}
-
-
-def _own(group: Group) -> Settings:
-    """The regularizer's settings."""
-    found = group.first.other_settings.items()
-    return tuple((k, v) for k, v in found if k.startswith("regularizer."))
-
-
-def _others(group: Group) -> dict[str, str]:
-    """All other settings, and the length."""
-    # A run of so many frames has a number of episodes, too, which says nothing.
-    known = group.first.settings_of_any_length.items()
-    others = {k: v for k, v in known if not k.startswith("regularizer.")}
-    return {**others, LENGTH: group.first.length}
 
 
 def _named(groups: list[Group]) -> list[Group]:

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from torchrl_l2c2.experiment.finished import FinishedRun
 from torchrl_l2c2.experiment.reports.groups import group_records
-from torchrl_l2c2.experiment.reports.runs import FinishedRun
 from torchrl_l2c2.experiment.reports.tables import Table, number_range, of_runs
 
 # As evaluation.json names them (experiment/evaluate.py): how they are told.

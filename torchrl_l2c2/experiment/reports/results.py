@@ -1,4 +1,4 @@
-"""What is said and drawn of runs when they end: one run's results, a sweep's table."""
+"""The results that a run and a sweep print and write when they end."""
 
 from __future__ import annotations
 
@@ -7,17 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchrl_l2c2.experiment.files import write_json
-from torchrl_l2c2.experiment.reports.choice import choice_table
-from torchrl_l2c2.experiment.reports.faster_targets import faster_targets_table
-from torchrl_l2c2.experiment.reports.field import field_table
+from torchrl_l2c2.experiment.finished import QUANTITIES, FinishedRun, Record
+from torchrl_l2c2.experiment.reports.comparison import comparison_table, known_tests
 from torchrl_l2c2.experiment.reports.figures import draw_learning_curves
-from torchrl_l2c2.experiment.reports.gain_targets import gain_targets_table
 from torchrl_l2c2.experiment.reports.groups import group_records
-from torchrl_l2c2.experiment.reports.pairwise import pairwise_tables
-from torchrl_l2c2.experiment.reports.paper_table import paper_table
-from torchrl_l2c2.experiment.reports.records import QUANTITIES, Record
-from torchrl_l2c2.experiment.reports.runs import FinishedRun, find_runs
-from torchrl_l2c2.experiment.reports.tables import Table, results_tables
+from torchrl_l2c2.experiment.reports.runs import find_runs
+from torchrl_l2c2.experiment.reports.tables import settings_notes
 from torchrl_l2c2.experiment.saved import read_back
 
 if TYPE_CHECKING:
@@ -48,8 +43,8 @@ def write_results(
     return FinishedRun.read(folder)
 
 
-def compare_with_paper(run: FinishedRun) -> str:
-    """The end of a run in lines: its results and, for the paper's tasks, the paper's.
+def result_lines(run: FinishedRun) -> str:
+    """The end of a run in lines: return and action variation of its test episodes.
 
     Raises:
         ValueError: its folder is damaged.
@@ -62,30 +57,22 @@ def compare_with_paper(run: FinishedRun) -> str:
             with read_back(run.folder):
                 total, variation = ((own[f"{q}_mean"], own[f"{q}_std"]) for q in QUANTITIES)
                 episodes = "episode" if own["episodes"] == 1 else "episodes"
-                what = f"{own['episodes']} test {episodes}, seed {run.seed}"
-                lines.append(_compared(name, total, variation, what))
-    paper = run.record.paper
-    if paper:
-        lines.append(_compared("the paper", paper[:2], paper[2:], "18 seeds"))
+                lines.append(
+                    f"{name:>20}  {total[0]:>9.1f} ({total[1]:>6.1f})  {variation[0]:>10.3f} "
+                    f"({variation[1]:.3f})   {own['episodes']} test {episodes}, seed {run.seed}"
+                )
     return "\n".join(lines)
 
 
-def printed_tables(records: Sequence[Record]) -> list[Table]:
-    """What is told of runs without a report: results, and beside them what was published."""
+def printed_table(records: Sequence[Record]) -> str:
+    """The table that is printed of runs: of the last policy with mean actions, if it was tested."""
     groups = group_records(records)
-    beside = (
-        paper_table(groups),
-        faster_targets_table(records),
-        gain_targets_table(records),
-        field_table(records),
-        choice_table(records),
-    )
-    told = [table for table in beside if table is not None]
-    return [*results_tables(groups), *told, *pairwise_tables(records)]
+    tables = [comparison_table(test, groups).markdown() for test in known_tests(groups)[:1]]
+    return "\n\n".join([*tables, *settings_notes(groups)])
 
 
 def sweep_summary(folders: Sequence[str | Path]) -> str:
-    """The end of a sweep: tables of all runs below its folders, and what did not finish.
+    """The end of a sweep: a table of all runs below its folders, and what did not finish.
 
     Args:
         folders (sequence of str or Path): of its runs, or that hold them.
@@ -94,13 +81,6 @@ def sweep_summary(folders: Sequence[str | Path]) -> str:
         str: Markdown; no error where nothing finished.
     """
     found = find_runs(folders)
-    tables = printed_tables([run.record for run in found.runs]) if found.runs else []
-    none = [] if found.runs else [f"No finished run below {', '.join(map(str, folders))}."]
-    return "\n\n".join([*(table.markdown() for table in tables), *none, *found.notes])
-
-
-def _compared(name: str, total: tuple[float, ...], variation: tuple[float, ...], what: str) -> str:
-    return (
-        f"{name:>20}  {total[0]:>9.1f} ({total[1]:>6.1f})  {variation[0]:>10.3f} "
-        f"({variation[1]:.3f})   {what}"
-    )
+    if not found.runs:
+        return "\n\n".join([f"No finished run below {', '.join(map(str, folders))}.", *found.notes])
+    return "\n\n".join([printed_table([run.record for run in found.runs]), *found.notes])

@@ -6,26 +6,17 @@ import html
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
+from torchrl_l2c2.experiment.finished import QUANTITIES, TESTS, Record
 from torchrl_l2c2.experiment.reports.groups import (
     Group,
     by_task,
     common_settings,
-    differing_lengths,
     differing_versions,
 )
 from torchrl_l2c2.experiment.reports.names import method_name
-from torchrl_l2c2.experiment.reports.records import QUANTITIES, TESTS, Record
-from torchrl_l2c2.experiment.reports.score import COMPARED, Reading
 from torchrl_l2c2.experiment.reports.statistics import mean_and_deviation
-
-LEGEND = (
-    "Means over seeds, standard deviations over seeds in brackets. "
-    "Late policies are those of the last tenth of training, or of its late_share: one test episode "
-    "of each with its mean actions, and the training's own episodes, with sampled ones. The action "
-    "variation is that of the policy's mean in either case; smaller is smoother."
-)
 
 
 @dataclass(frozen=True)
@@ -70,34 +61,8 @@ class Table:
         )
 
 
-def results_tables(groups: Sequence[Group]) -> list[Table]:
-    """Means over seeds, standard deviations in brackets: late policies, and the last policy."""
-    tables = [
-        _results("Late policies", ("late_mean", "late_sampled"), groups),
-        _results("Last policy", ("last_mean", "last_sampled"), groups),
-    ]
-    # Runs that were cut short by --length have no last policy.
-    known = [table for table in tables if table.rows] or tables[:1]
-    known[-1] = replace(known[-1], notes=[LEGEND, *settings_notes(groups)])
-    return known
-
-
-def _results(title: str, tests: Sequence[str], groups: Sequence[Group]) -> Table:
-    columns = ["task", "algorithm", "method", "seeds"]
-    columns += [f"{QUANTITIES[q]}, {TESTS[f].split(', ')[1]}" for q in QUANTITIES for f in tests]
-    rows = [
-        [
-            *(group.first.task, group.first.algorithm, group.name, number_range(group.seeds)),
-            *(pooled(group, test, quantity) for quantity in QUANTITIES for test in tests),
-        ]
-        for group in groups
-        if any(len(group.scores(test, "return")) for test in tests)
-    ]
-    return Table(title, columns, rows)
-
-
 def settings_notes(groups: Sequence[Group]) -> list[str]:
-    """What the runs' settings are beyond the defaults, and which lengths and versions they have."""
+    """Notes on settings that differ from the defaults in every row, and on pooled versions."""
     notes = []
     for together in by_task(groups):
         task, algorithm = together[0].first.task, together[0].first.algorithm
@@ -112,8 +77,7 @@ def settings_notes(groups: Sequence[Group]) -> list[str]:
             if own:
                 which = f"{task}, {algorithm}, {method_name(method)}, other than the defaults"
                 notes.append(_settings_note(which, own))
-    told = [*differing_lengths(groups), *differing_versions(groups)]
-    return notes + [f"{line}." for line in told]
+    return notes + differing_versions(groups)
 
 
 def _settings_note(which: str, settings: Mapping[str, str]) -> str:
@@ -135,37 +99,6 @@ def runs_table(records: Sequence[Record]) -> Table:
         for r in records
     ]
     return Table("Every run", columns, rows)
-
-
-def score_table(readings: Sequence[Reading]) -> Table:
-    """The score of every reading, by late policies with mean and with sampled actions."""
-    columns = ["task", "reading", "length", "seeds", "updates", "actions", "score"]
-    columns += [
-        f"{method_name(method)}: {name}" for method in COMPARED for name in QUANTITIES.values()
-    ]
-    rows = []
-    for reading in readings:
-        first = reading.vanilla.first
-        others = [f"{name}={value}" for name, value in first.settings_of_any_length.items()]
-        start = [first.task, " ".join(others) or "the defaults", first.length]
-        seeds = list(dict.fromkeys(number_range(g.seeds) for g in (reading.vanilla, reading.caps)))
-        for test in ("late_mean", "late_sampled"):
-            cells = reading.cells(test)
-            if all(map(math.isnan, cells.values())):
-                continue
-            rows.append(
-                [
-                    *(*start, "; ".join(seeds)),
-                    *(f"{reading.updates:.0f}", TESTS[test].split(", ")[1]),
-                    or_dash(reading.score(test), ".2f"),
-                    *(or_dash(cells[m, q], ".2f") for m in COMPARED for q in QUANTITIES),
-                ]
-            )
-    notes = [
-        "Cells: the distance of the mean over seeds from the paper's mean, in the paper's standard "
-        "deviations, at most 5; the score is their mean, smaller is nearer. Late policies."
-    ]
-    return Table("Score of the readings", columns, rows, notes)
 
 
 def number(value: float, quantity: str, beside: float | None = None) -> str:

@@ -1,33 +1,19 @@
-"""What no other setting beats in return and smoothness at once: the Pareto front."""
+"""The Pareto front of a search: settings that no other one beats in return and smoothness."""
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
 from collections.abc import Sequence
+from pathlib import Path
 
+from torchrl_l2c2.experiment.finished import QUANTITIES, TESTS
 from torchrl_l2c2.experiment.reports.comparison import SIGNS
+from torchrl_l2c2.experiment.reports.figures import finish, styles, subplots
 from torchrl_l2c2.experiment.reports.groups import Group
-from torchrl_l2c2.experiment.reports.records import QUANTITIES, TESTS
 from torchrl_l2c2.experiment.reports.tables import Table, number_range, pooled
 
-# Fewer settings of one method are a comparison, which tables of results show.
-LEAST = 4
 # What a front is of: the policy's mean is what is deployed, and many policies are steadier than the
 # last one, where they were tested.
 MEASURED = ("late_mean", "last_mean")
-
-
-def searched(groups: Sequence[Group]) -> list[list[Group]]:
-    """Groups of a task, an algorithm and a length, where a method was run with several settings."""
-    together: dict[tuple[str, ...], list[Group]] = defaultdict(list)
-    for group in groups:
-        together[group.first.task, group.first.algorithm, group.first.length].append(group)
-    return [
-        found
-        for found in together.values()
-        if max(Counter(group.first.method for group in found).values()) >= LEAST
-        and pareto_front(found, front_test(found))
-    ]
 
 
 def front_test(groups: Sequence[Group]) -> str:
@@ -84,3 +70,32 @@ def front_table(groups: Sequence[Group], test: str) -> Table:
     )
     title = f"{first.task}, {first.algorithm}: Pareto front, {TESTS[test]}"
     return Table(title, ["", "settings", "seeds", *QUANTITIES.values()], rows, [note])
+
+
+def draw_front(groups: Sequence[Group], test: str, path: str | Path) -> None:
+    """Draws every setting as a dot, and the Pareto front with its numbers and a line.
+
+    Along the line, whatever is gained in return is paid for in smoothness.
+
+    Args:
+        groups (sequence of Group): Groups of one task and algorithm.
+        test (str): One of ``TESTS``.
+        path (str or Path): The file, of the format of its ending, ``.png`` or ``.svg``.
+    """
+    picture, axes = subplots(1, 1, (5.4, 4.0))
+    looks = styles(groups)
+    front = pareto_front(groups, test)
+    for group in groups:
+        if place := means(group, test):
+            color = looks[group.name]["color"]
+            axes[0].plot(*place[::-1], "o", color=color, alpha=1.0 if group in front else 0.3)
+    steps = [means(group, test)[::-1] for group in front]
+    axes[0].step(*zip(*steps, strict=True), where="post", color="#444444", linewidth=1)
+    for number, step in enumerate(steps, 1):
+        offset = {"xytext": (4, -10), "textcoords": "offset points"}
+        axes[0].annotate(str(number), step, fontsize=9, **offset)
+    axes[0].set_xlabel("action variation")
+    axes[0].set_ylabel("return")
+    first = groups[0].first
+    title = f"{first.task}, {first.algorithm}: {len(groups)} settings, {TESTS[test]}"
+    finish(picture, axes, title, path)

@@ -1,19 +1,20 @@
-"""Runs on the tasks of the methods after the paper, beside what was published of them."""
+"""Published results on the tasks of later methods, and their table with the runs here."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
+from studies.paper import is_of_own_task
+from torchrl_l2c2.experiment.finished import Record
 from torchrl_l2c2.experiment.reports.comparison import (
-    READING,
+    COMPARED,
+    INTERVAL_NOTE,
     Estimate,
     estimate_cell,
-    improvement,
-    probability,
+    improvement_cell,
 )
 from torchrl_l2c2.experiment.reports.groups import Group, baseline_of, by_task, group_records
-from torchrl_l2c2.experiment.reports.records import Record
 from torchrl_l2c2.experiment.reports.statistics import mean
 from torchrl_l2c2.experiment.reports.tables import Table, number_range, of_runs
 from torchrl_l2c2.experiment.tasks import FIELD_TASKS
@@ -58,80 +59,71 @@ NAMES = {
     "asap": "ASAP",
     "lipsnet++": "LipsNet++",
 }
-FIELD_MEASURES = {"return": "return", "sm_asap": "Sm", "action_variation": "action variation"}
-# How probable a method's run is better by each than one of vanilla.
-BETTER = {"return": "P(returns more)", "sm_asap": "P(smaller Sm)"}
+TEST = "last_mean"
+# By what methods are compared, and the columns of the probabilities.
+BETTER = {quantity: COMPARED[quantity][1] for quantity in ("return", "sm_asap")}
 LEGEND = (
     "Means over seeds of the last policy's test episodes, with its mean actions; 95% intervals "
     "of the bootstrap over seeds in brackets. Sm as in the published table: `(2 / N) sum_i f_i "
     "|FFT_i|` at one action per unit of time, averaged over the action's dimensions; unlike the "
     "action variation it grows with the length N of an episode. P: the probability that a run is "
     "better than a run of vanilla with the same other settings (ties count half). "
-    f"{READING} Published: "
+    f"{INTERVAL_NOTE} Published: "
     "CATS (arXiv 2610.07910), ten seeds by ten episodes; its L2C2 is that of ASAP's code, which "
     "does not follow the paper's equations."
 )
 
 
-def field_table(records: Sequence[Record]) -> Table | None:
-    """A row for every group of runs on these tasks, then what else was published of them.
-
-    Args:
-        records (sequence of Record): of any tasks; others are passed over.
-
-    Returns:
-        Table: ``None`` where no run is of such a task with PPO or SAC.
-    """
+def field_table(records: Iterable[Record]) -> Table:
+    """A row for every group of runs on these tasks, then the other published rows."""
     groups = field_groups(records)
-    if not groups:
-        return None
     rows = []
     for together in by_task(groups):
         task, algorithm = together[0].first.task, together[0].first.algorithm
         rows += [_row(group, baseline_of(group, groups)) for group in together]
-        rows += _others(task, algorithm, {g.first.method for g in together})
-    columns = ["task", "algorithm", "method", "seeds", *FIELD_MEASURES.values()]
+        rows += [
+            [task, algorithm, name, *[""] * 6, *_published(PUBLISHED[task, algorithm, method])]
+            for method, name in NAMES.items()
+            if method not in {group.first.method for group in together}
+        ]
+    columns = ["task", "algorithm", "method", "seeds", *(name for name, _ in COMPARED.values())]
     columns += [*BETTER.values(), "published: return", "published: Sm"]
     return Table("Beside the published table", columns, rows, [LEGEND])
 
 
-def published_of(group: Group) -> PublishedCell | None:
-    """What was published of its method, with its authors' gains; ``None`` where nothing was.
+def field_groups(records: Iterable[Record]) -> list[Group]:
+    """Groups of the records on these tasks with PPO or SAC."""
+    return group_records(r for r in records if (r.task, r.algorithm, "none") in PUBLISHED)
 
-    Or not of this task: with more noise, or shorter episodes.
-    """
+
+def published_of(group: Group) -> PublishedCell | None:
+    """The published results of a group's task and method; ``None`` without any."""
     first = group.first
-    if not first.is_of_own_task:
+    if not is_of_own_task(first):
         return None
     return PUBLISHED.get((first.task, first.algorithm, first.method))
 
 
-def field_groups(records: Sequence[Record]) -> list[Group]:
-    """Groups of those records that are of these tasks, with PPO or SAC."""
-    return group_records(r for r in records if (r.task, r.algorithm, "none") in PUBLISHED)
+def point(group: Group) -> Sequence[float] | None:
+    """The published Sm and return of a group."""
+    cell = published_of(group)
+    return None if cell is None else (cell.sm, cell.total)
 
 
-def _row(group: Group, vanilla: Group | None) -> list[str]:
+def known_cell(group: Group, quantity: str, cell: str) -> str:
+    """A cell that names the number of its runs, if some lack the quantity."""
+    known = len(group.scores(TEST, quantity))
+    return cell + of_runs(known, len(group.records)) if known else cell
+
+
+def _row(group: Group, baseline: Group | None) -> list[str]:
     first = group.first
     cells = [first.task, first.algorithm, group.name, number_range(group.seeds)]
-    for quantity in FIELD_MEASURES:
-        scores = group.scores("last_mean", quantity)
-        cell = estimate_cell(Estimate.of(mean, scores), quantity)
-        cells.append(cell + of_runs(len(scores), len(group.records)) if len(scores) else cell)
-    if vanilla is None:
-        cells += [""] * len(BETTER)
-    else:
-        cells += [probability(improvement([group], [vanilla], "last_mean", q)) for q in BETTER]
+    for quantity in COMPARED:
+        estimate = Estimate.of(mean, group.scores(TEST, quantity))
+        cells.append(known_cell(group, quantity, estimate_cell(estimate, quantity)))
+    cells += [improvement_cell([group], [baseline], TEST, quantity) for quantity in BETTER]
     return [*cells, *_published(published_of(group))]
-
-
-def _others(task: str, algorithm: str, methods: set[str]) -> list[list[str]]:
-    """What was published, and what no run here is of."""
-    return [
-        [task, algorithm, name, *[""] * 6, *_published(PUBLISHED[task, algorithm, method])]
-        for method, name in NAMES.items()
-        if method not in methods
-    ]
 
 
 def _published(cell: PublishedCell | None) -> tuple[str, str]:

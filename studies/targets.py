@@ -1,12 +1,12 @@
-"""Gains that follow a target: the target, what came of it, and what it cost."""
+"""Gains that follow a target: the target, the action variation that came of it, and its cost."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable
 
+from torchrl_l2c2.experiment.finished import QUANTITIES, Record
 from torchrl_l2c2.experiment.reports.groups import Group, baseline_of, by_task, group_records
-from torchrl_l2c2.experiment.reports.records import QUANTITIES, Record
 from torchrl_l2c2.experiment.reports.tables import Table, number, number_range, or_dash, pooled
 
 # A target is followed in training's own episodes, and is to hold of a policy that is deployed.
@@ -20,23 +20,13 @@ LEGEND = (
 )
 
 
-def gain_targets_table(records: Sequence[Record]) -> Table | None:
-    """A row for every action variation that a gain was to keep, and one for vanilla beside them.
-
-    Args:
-        records (sequence of Record): of any tasks; of runs whose gain is set otherwise, or by
-            another measure (``regularizer.gain_of``), vanilla's alone are shown.
-
-    Returns:
-        Table: ``None`` where no gain followed an action variation.
-    """
+def gain_targets_table(records: Iterable[Record]) -> Table:
+    """A row for every target of the action variation, and for the baseline of the same settings."""
     groups = group_records(records)
     following = [group for group in groups if _asked(group.first) is not None]
-    beside = (baseline_of(group, groups) for group in following)
-    shown = dict.fromkeys(group for group in (*following, *beside) if group is not None)
-    if not shown:
-        return None
-    # Named anew, by what sets these apart from one another; vanilla's below the others.
+    baselines = (baseline_of(group, groups) for group in following)
+    shown = dict.fromkeys(group for group in (*following, *baselines) if group is not None)
+    # Named anew, by what sets these apart from one another; the baseline's below the others.
     named = group_records(record for group in shown for record in group.records)
     rows = [
         _row(group)

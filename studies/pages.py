@@ -1,0 +1,297 @@
+"""Writes the generated parts of the README and of the results' pages anew, and their pictures.
+
+``python -m studies.pages`` makes them from the records in ``results/*.csv``. A page has each part
+between ``<!-- NAME: start -->`` and ``<!-- NAME: end -->``. A picture is drawn again if it is not
+of the same records; to have one drawn in another way, delete it first.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from studies import field, paper
+from studies.field import BETTER, TEST, field_groups, field_table
+from studies.methods import against_table, choice_table, pairwise_tables
+from studies.paper import (
+    TAU,
+    deployed_table,
+    faster_targets_table,
+    is_as_usual,
+    paper_table,
+    shown_groups,
+    statistics_table,
+)
+from studies.targets import gain_targets_table
+from torchrl_l2c2.experiment.files import write_atomically
+from torchrl_l2c2.experiment.finished import Record
+from torchrl_l2c2.experiment.reports.comparison import COMPARED, improvement_cell
+from torchrl_l2c2.experiment.reports.figures import draw_plane
+from torchrl_l2c2.experiment.reports.groups import Group, group_records
+from torchrl_l2c2.experiment.reports.records import digest, merge, read_records
+from torchrl_l2c2.experiment.reports.tables import number_range, settings_notes
+
+ROOT = Path(__file__).parents[1]
+FIELD_PAGES = ("field", "hopper", "sac_lunarlander", "sac_pendulum", "walker2d")
+# PPO's one setting of L2C2, and the methods that one page compares it with.
+OURS = "L2C2, mse 1, ramp"
+RIVALS = ("vanilla", "CAPS", "CAPS, lambda_spatial=0.005", "CATS")
+TARGETS = ("targets", "runs", "sac_pendulum", "field", "walker2d", "hopper")
+HEADLINE = """\
+| | seeds | measure | vanilla | with L2C2 | change | P(smoother) | return: vanilla | with L2C2 | P(returns more) |
+| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |"""  # noqa: E501
+# Rows of the README's first table: whose records, of which method and length.
+HEADLINES = {
+    "SAC, Pendulum": ("sac_pendulum", "L2C2, means 10", "30000 frames"),
+    "PPO, LunarLander": ("field", OURS, "500000 frames"),
+    "PPO, Pendulum": ("field", OURS, "500000 frames"),
+    "PPO, Hopper": ("hopper", OURS, "1000000 frames"),
+    "PPO, Walker2d": ("walker2d", OURS, "1000000 frames"),
+    "PPO-RPE, Reacher, as in the paper": ("runs", "L2C2", "4500 episodes"),
+    "PPO-RPE, Swingup, as in the paper": ("runs", "L2C2", "350 episodes"),
+    "PPO-RPE, Swingup, with a target": ("runs", "L2C2, means, target 0.045", "350 episodes"),
+}
+# What the page of the setting's parts calls them, by their names in tables and in its order.
+PARTS = {
+    "vanilla": "vanilla",
+    f"{OURS}, beta=0, shared=true": "`regularizer=l2c2`",
+    "L2C2, mse 0.01, ramp, beta=0, shared=true": "with the paper's gain",
+    "L2C2, Hellinger 1, ramp, beta=0, shared=true": "with the Hellinger distance",
+    "L2C2, Hellinger 4, ramp, beta=0, shared=true": (
+        "with the Hellinger distance, as strong (`lambda_min=4`)"
+    ),
+    "L2C2, Hellinger 0.5, ramp, beta=0, shared=true": (
+        "with the Hellinger distance, as strong (`lambda_min=0.5`)"
+    ),
+    f"{OURS}, beta=0": "with neighbors in the box",
+    f"{OURS}, shared=true": "with the value term",
+    "L2C2, the paper's": "the paper's L2C2",
+    "L2C2, Hellinger 1": "the paper's, at a hundred times its gain",
+}
+
+
+class Page(NamedTuple):
+    """The generated parts of a page, and its picture.
+
+    Attributes:
+        parts (dict): Texts by the names of their marks.
+        shown (sequence of Group): The groups of the picture.
+        draw (callable): Draws the picture into a file; ``None`` if the page has none.
+    """
+
+    parts: dict[str, str]
+    shown: Sequence[Group] = ()
+    draw: Callable[[Path], None] | None = None
+
+
+def pages() -> dict[str, Page]:
+    """Every page with generated parts, by its path from the root."""
+    runs, one, caps = records("runs"), records("one_gain"), records("caps_gains")
+    mean = [r for r in runs if r.other_settings.get("algorithm.reduction") == "mean"]
+    summed = [r for r in runs if r not in mean]
+    short = [r for r in summed if (r.task, r.length) == ("reacher", "3000 episodes")]
+    caps += [r for r in one if r.method == "none" and r.task != "walker2d_v5"]
+    chosen = [choice_table(each).markdown() for each in (records("field_gains"), one, caps)]
+    targets = [
+        gain_targets_table(records(*names)).markdown()
+        for names in (TARGETS, ["swingup_targets"], ["hopper_targets"])
+    ]
+    # Only the first one has its title and legend.
+    targets[1:] = [text.split("\n\n")[1] for text in targets[1:]]
+    return {
+        "README.md": Page(
+            {"headline": headline(), "table3": paper_table(shown_groups(runs)).markdown()}
+        ),
+        "results/paper.md": _paper_page(runs),
+        **{f"results/{name}.md": _field_page(name, records(name)) for name in FIELD_PAGES},
+        "results/one_setting.md": _field_page("one_setting", one_setting()),
+        "results/batch_mean.md": Page({"results": paper_table(group_records(mean)).markdown()}),
+        "results/reacher_3000.md": Page({"results": paper_table(group_records(short)).markdown()}),
+        "results/parts.md": Page({"parts": parts()}),
+        "results/field_gains.md": Page(dict(zip(("rivals", "one", "caps"), chosen, strict=True))),
+        "results/targets.md": Page(dict(zip(("all", "swingup", "hopper"), targets, strict=True))),
+        "docs/protocol.md": Page({"reacher": reacher_by_seed(runs)}),
+    }
+
+
+def records(*names: str) -> list[Record]:
+    """The records of these files in ``results/``."""
+    found = (read_records(ROOT / "results" / f"{name}.csv") for name in names)
+    return merge([], [record for each in found for record in each])
+
+
+def one_setting() -> list[Record]:
+    """The records of PPO's one setting and of its rivals."""
+    groups = group_records(records("field", "walker2d", "hopper"))
+    return [r for group in groups if group.name in (OURS, *RIVALS) for r in group.records]
+
+
+def headline_groups(label: str) -> tuple[Group, Group]:
+    """L2C2 and the baseline on the same seeds, of a row of the README's first table."""
+    name, method, length = HEADLINES[label]
+    named = label.split(", ")[1].lower()
+    task = f"{named}_v5" if named in ("hopper", "walker2d") else named
+    found = [r for r in records(name) if (r.task, r.length) == (task, length) and is_usual_pace(r)]
+    (ours,) = (group for group in group_records(found) if group.name == method)
+    same = [r for r in found if r.method == "none" and r.seed in ours.seeds]
+    (baseline,) = group_records(same)
+    assert baseline.seeds == ours.seeds and baseline.setup == ours.setup
+    return ours, baseline
+
+
+def is_usual_pace(record: Record) -> bool:
+    """Tells if the target networks have the usual pace of the paper."""
+    return TAU not in record.other_settings
+
+
+def headline() -> str:
+    """The README's first table: means of the baseline and of L2C2, and the probabilities."""
+    return "\n".join([HEADLINE, *(row for label in HEADLINES for row in _headline_rows(label))])
+
+
+def parts() -> str:
+    """The table of PPO's setting with one part changed at a time, on common seeds."""
+    own = records("parts")
+    seeds = {record.seed for record in own}
+    others = [
+        r
+        for r in records("field")
+        if r.seed in seeds
+        and (r.method in ("none", "l2c2_paper") or r.commit.startswith("e01476b"))
+    ]
+    table = field_table([*own, *others])
+    kept = ["seeds", *(name for name, _ in COMPARED.values()), *BETTER.values()]
+    found = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
+    shown = {(row["task"], row["method"]): row for row in found if row["seeds"]}
+    columns = ["task", "setting", *kept]
+    rows = [columns, ["---"] * len(columns)]
+    for task in ("lunarlander", "pendulum"):
+        for method, setting in PARTS.items():
+            if row := shown.get((task, method)):
+                rows.append([task, setting, *(row[column] for column in kept)])
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def reacher_by_seed(runs: Sequence[Record]) -> str:
+    """Return and action variation of Reacher's late policies with sampled actions."""
+    groups = shown_groups([record for record in runs if record.task == "reacher"])
+    groups = [group for group in groups if group.first.method != "caps"]
+    rows = [["seed", *(group.name for group in groups)], ["---"] * (1 + len(groups))]
+    for together in zip(*(group.records for group in groups), strict=True):
+        cells = (
+            f"{r.late_sampled_return:.1f} / {r.late_sampled_action_variation:.3f}" for r in together
+        )
+        rows.append([str(together[0].seed), *cells])
+    return "\n".join(f"  | {' | '.join(row)} |" for row in rows)
+
+
+def draw_published(
+    point: Callable[[Group], Sequence[float] | None], note: str, axis: Any, group: Group, color: str
+) -> str | None:
+    """A hollow diamond for a group's published results, with their deviations, dotted, if known."""
+    found = point(group)
+    if found is None:
+        return None
+    x, y, *deviations = found
+    shape = {"fmt": "D", "markersize": 5, "markerfacecolor": "white", "alpha": 0.8}
+    bars = dict(zip(("xerr", "yerr"), deviations, strict=False))
+    shape |= {"elinewidth": 0.9} if bars else {}
+    for line in axis.errorbar([x], [y], color=color, **bars, **shape)[2]:
+        line.set_linestyle(":")
+    return note
+
+
+def _paper_page(runs: Sequence[Record]) -> Page:
+    groups = shown_groups(runs)
+    faster = faster_targets_table(record for record in runs if is_as_usual(record, TAU))
+    tables = [deployed_table(groups), statistics_table(groups), faster]
+    texts = [
+        "![Return against action variation of every method](paper.svg)",
+        paper_table(groups).markdown(),
+        *settings_notes(groups),
+        *(table.markdown() for table in tables),
+    ]
+    more = partial(draw_published, paper.point, "hollow: the paper")
+    draw = partial(draw_plane, groups, "late_sampled", more=more)
+    return Page({"results": "\n\n".join(texts)}, groups, draw)
+
+
+def _field_page(name: str, shown: Sequence[Record]) -> Page:
+    first = [against_table(shown, OURS)] if name in ("hopper", "one_setting") else []
+    tables = [field_table(shown), choice_table(shown), *pairwise_tables(shown)]
+    texts = [
+        *(table.markdown() for table in first),
+        f"![Return against Sm of every method, beside what was published]({name}.svg)",
+        *(table.markdown() for table in tables),
+    ]
+    groups = field_groups(shown)
+    more = partial(draw_published, field.point, "hollow: published")
+    draw = partial(draw_plane, groups, TEST, measure="sm_asap", more=more)
+    return Page({"results": "\n\n".join(texts)}, groups, draw)
+
+
+def _headline_rows(label: str) -> list[str]:
+    ours, baseline = headline_groups(label)
+
+    def compared(quantity: str, digits: int, *, changes: bool = False) -> list[str]:
+        means = [side.scores(TEST, quantity).mean() for side in (baseline, ours)]
+        cells = [f"{value:.{digits if abs(value) >= 100 or digits else 1}f}" for value in means]
+        cells += [f"{means[1] / means[0] - 1:+.0%}"] if changes else []
+        return [*cells, improvement_cell([ours], [baseline], TEST, quantity)]
+
+    start, of_return, rows = [label, number_range(ours.seeds)], compared("return", 0), []
+    # The paper measures only the action variation.
+    of_paper = HEADLINES[label][0] == "runs"
+    for measure in ("action_variation",) if of_paper else ("sm_asap", "action_variation"):
+        cells = [*start, COMPARED[measure][0], *compared(measure, 3, changes=True), *of_return]
+        rows.append(f"| {' | '.join(cells)} |")
+        start, of_return = ["", ""], ["", "", ""]
+    return rows
+
+
+def fill(text: str, name: str, part: str) -> str:
+    """A page's text with this part between its marks, the last of which keeps their indent.
+
+    Raises:
+        ValueError: The marks are not there, once each and in order.
+
+    Examples:
+        >>> print(fill("<!-- a: start -->\\nold\\n<!-- a: end -->", "a", "new"))
+        <!-- a: start -->
+        new
+        <!-- a: end -->
+    """
+    start, end = f"<!-- {name}: start -->", f"<!-- {name}: end -->"
+    pattern = re.compile(f"( *){start}\n.*?{end}", re.S)
+    if (text.count(start), text.count(end), len(pattern.findall(text))) != (1, 1, 1):
+        raise ValueError(f"Expected {start} and after it {end}, once each.")
+    return pattern.sub(lambda found: f"{found[1]}{start}\n{part}\n{found[1]}{end}", text)
+
+
+def is_drawn(path: Path, shown: Sequence[Group]) -> bool:
+    """Tells if a picture shows the records of these groups, by its description."""
+    drawn_of = digest(record for group in shown for record in group.records)
+    return path.exists() and f"records {drawn_of}<" in path.read_text()
+
+
+def main() -> None:
+    """Writes the pages and pictures that are not as their records have them, and names them."""
+    for name, page in pages().items():
+        path = ROOT / name
+        before = text = path.read_text()
+        for mark, part in page.parts.items():
+            text = fill(text, mark, part)
+        if text != before:
+            write_atomically(path, text.encode())
+            print(f"written: {name}")
+        picture = path.with_suffix(".svg")
+        if page.draw is not None and not is_drawn(picture, page.shown):
+            page.draw(picture)
+            print(f"drawn: {picture.relative_to(ROOT)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,185 @@
+"""Scores of readings of the paper: their distance from its table, by docs/protocol.md.
+
+``python -m studies.protocol FOLDER... --length 200 300`` prints the scores of the runs below
+folders, as if their training had ended after 200 and after 300 episodes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import statistics
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from studies.paper import is_of_paper, paper_of, paper_table
+from torchrl_l2c2.experiment.config import ExperimentConfig
+from torchrl_l2c2.experiment.errors import told_in_a_line
+from torchrl_l2c2.experiment.finished import QUANTITIES, TESTS, FinishedRun, Record
+from torchrl_l2c2.experiment.identity import of_length
+from torchrl_l2c2.experiment.reports.groups import Group, group_records
+from torchrl_l2c2.experiment.reports.names import method_name
+from torchrl_l2c2.experiment.reports.records import merge, read_records, write_records
+from torchrl_l2c2.experiment.reports.runs import find_runs
+from torchrl_l2c2.experiment.reports.tables import Table, number_range, or_dash
+
+METHODS = ("none", "caps")  # L2C2 is not looked at until a reading is taken.
+CAP = 5.0
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One choice of what the paper leaves open, on one task: its runs of vanilla and of CAPS."""
+
+    vanilla: Group
+    caps: Group
+
+    def cells(self, test: str) -> dict[tuple[str, str], float]:
+        """By method and quantity, how many of the paper's standard deviations lie between.
+
+        Args:
+            test (str): one of ``TESTS``.
+
+        Returns:
+            dict: ``|mean over seeds - the paper's mean| / the paper's standard deviation``, at
+            most 5; NaN where the runs do not have the test.
+        """
+        cells = {}
+        for group in (self.vanilla, self.caps):
+            for quantity in QUANTITIES:
+                published = paper_of(group.first)
+                assert published is not None
+                center, deviation = published.cell(quantity)
+                values = group.scores(test, quantity)
+                distance = abs(values.mean() - center) / deviation if len(values) else math.nan
+                # A NaN first stays one.
+                cells[group.first.method, quantity] = float(min(distance, CAP))
+        return cells
+
+    def score(self, test: str) -> float:
+        """Mean of the four cells, from 0 to 5; smaller is nearer to the paper."""
+        return statistics.fmean(self.cells(test).values())
+
+    @property
+    def updates(self) -> float:
+        """Mean over its runs: of two readings that are as near, the one with fewer is taken."""
+        return statistics.fmean(r.updates for r in (*self.vanilla.records, *self.caps.records))
+
+
+def readings(groups: Sequence[Group]) -> list[Reading]:
+    """Pairs vanilla and CAPS of the paper's tasks where their other settings are the same."""
+    found: dict[tuple[Any, ...], dict[str, list[Group]]] = {}
+    for group in groups:
+        if group.first.method in METHODS and paper_of(group.first) is not None:
+            alike = found.setdefault(group.setup, {method: [] for method in METHODS})
+            alike[group.first.method].append(group)
+    # Several of one, of other defaults, are readings of their own.
+    return [
+        Reading(*pair)
+        for alike in found.values()
+        for pair in product(*(alike[method] for method in METHODS))
+    ]
+
+
+def score_table(found: Sequence[Reading]) -> Table:
+    """The score of every reading, by late policies with mean and with sampled actions."""
+    columns = ["task", "reading", "length", "seeds", "updates", "actions", "score"]
+    columns += [
+        f"{method_name(method)}: {name}" for method in METHODS for name in QUANTITIES.values()
+    ]
+    rows = []
+    for reading in found:
+        first = reading.vanilla.first
+        others = [f"{name}={value}" for name, value in first.settings_of_any_length.items()]
+        start = [first.task, " ".join(others) or "the defaults", first.length]
+        seeds = list(dict.fromkeys(number_range(g.seeds) for g in (reading.vanilla, reading.caps)))
+        for test in ("late_mean", "late_sampled"):
+            cells = reading.cells(test)
+            if all(map(math.isnan, cells.values())):
+                continue
+            rows.append(
+                [
+                    *(*start, "; ".join(seeds)),
+                    *(f"{reading.updates:.0f}", TESTS[test].split(", ")[1]),
+                    or_dash(reading.score(test), ".2f"),
+                    *(or_dash(cells[m, q], ".2f") for m in METHODS for q in QUANTITIES),
+                ]
+            )
+    notes = [
+        "Cells: the distance of the mean over seeds from the paper's mean, in the paper's standard "
+        "deviations, at most 5; the score is their mean, smaller is nearer. Late policies."
+    ]
+    return Table("Score of the readings", columns, rows, notes)
+
+
+def until(run: FinishedRun, length: int) -> FinishedRun | None:
+    """The run as if its training had ended earlier; ``None`` if it was shorter than that.
+
+    Of a longer run only the training's own episodes, with sampled actions, are known.
+
+    Args:
+        run (FinishedRun): The run, returned unchanged if it ended just then.
+        length (int): The length in episodes, or in frames if the run's own length is in frames.
+    """
+    unit = "episodes" if run.config["task"].get("frames") is None else "frames"
+    if run.record.length == f"{length} {unit}":
+        return run
+    column = run.column("episode" if unit == "episodes" else "frames")
+    if not column or not 0 < length <= column[-1]:
+        return None
+    # Training ends with the episode that reaches its length.
+    kept = [
+        {name: cell for name, cell in row.items() if not name.startswith("test_")}
+        for row, before in zip(run.metrics, [0.0, *column[:-1]], strict=True)
+        if before < length
+    ]
+    config = {**run.config, "task": {**run.config["task"], unit: length}}
+    return replace(run, config=config, evaluation={}, metrics=kept)
+
+
+def main(arguments: Iterable[str] | None = None) -> None:
+    """The command line: prints scores and the paper's table with these runs."""
+    parser = argparse.ArgumentParser(prog="python -m studies.protocol", description=__doc__)
+    add = parser.add_argument
+    add("paths", nargs="+", metavar="PATH", help="folders of runs, or files of records (CSV)")
+    add("--length", nargs="+", type=int, metavar="N", help="episodes, or frames, of training")
+    add("--csv", metavar="CSV", help="file that gets a line for every run, or its newer line")
+    chosen = parser.parse_args(arguments)
+    with told_in_a_line():
+        records, notes = _read(chosen.paths, chosen.length)
+        if chosen.csv:
+            write_records(chosen.csv, merge(read_records(chosen.csv), records))
+        groups = group_records(records)
+        tables = [paper_table([group for group in groups if is_of_paper(group.first)])]
+        if found := readings(groups):
+            tables.insert(0, score_table(found))
+        print("\n\n".join([*(table.markdown() for table in tables), *notes]))
+
+
+def _read(paths: Sequence[str], lengths: Sequence[int] | None) -> tuple[list[Record], list[str]]:
+    files = [path for path in paths if Path(path).is_file()]
+    found = find_runs(path for path in paths if path not in files)
+    if lengths is None:
+        known = [record for file in files for record in read_records(file)]
+        return merge([], [*known, *(run.record for run in found.runs)]), found.notes
+    if files:
+        raise ValueError(f"--length needs the folders of runs, got the file {files[0]!r}.")
+    cut = [each for run in found.runs for n in lengths if (each := until(run, n)) is not None]
+    if not cut:
+        raise ValueError(f"no run is as long as {min(lengths)} episodes or frames.")
+    shorter = [ExperimentConfig.from_dict(run.config) for run in cut if not run.evaluation]
+    settings = Counter(setting for config in shorter for setting in of_length(config))
+    notes = [
+        f"{many} runs, cut to a length, have {setting} as in their own, longer training: a "
+        "training of this length would give other numbers"
+        for setting, many in settings.items()
+    ]
+    return merge([], [run.record for run in cut]), [*found.notes, *notes]
+
+
+if __name__ == "__main__":
+    main()

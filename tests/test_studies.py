@@ -1,0 +1,557 @@
+"""The lab's tables by hand, and every generated part of its pages as its records have it."""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from studies import pages
+from studies.field import BETTER, field_groups, field_table
+from studies.methods import against_table, choice_table, pairwise_tables
+from studies.pages import HEADLINES, OURS, ROOT, fill, headline_groups, is_drawn, one_setting
+from studies.paper import (
+    deployed_table,
+    faster_targets_table,
+    is_as_usual,
+    paper_of,
+    paper_table,
+    shown_groups,
+)
+from studies.protocol import main as score
+from studies.protocol import readings, until
+from studies.targets import gain_targets_table
+from tests.test_reports import cells, make_config, make_run
+from torchrl_l2c2.experiment import CATSConfig, L2C2Config, PPOConfig, PPORPEConfig, SACConfig
+from torchrl_l2c2.experiment.optimizers import AdamConfig
+from torchrl_l2c2.experiment.reports import group_records, read_records, read_runs
+from torchrl_l2c2.experiment.reports.comparison import improvement
+from torchrl_l2c2.experiment.reports.records import merge
+from torchrl_l2c2.experiment.tasks import TASKS
+
+
+def read(folder):
+    return [run.record for run in read_runs(folder)]
+
+
+def change_summary(folder, **values):
+    path = folder / "evaluation.json"
+    content = json.loads(path.read_text())
+    content["summary"] |= values
+    path.write_text(json.dumps(content))
+
+
+class TestPaper:
+    def test_its_probabilities_are_of_all_pairs_with_the_baseline(self, tmp_path):
+        """Of returns 15 and 25 beside 10 and 20 three of four are larger; a tie is a half."""
+        runs = {"none": ((10.0, 0.1), (20.0, 0.1)), "l2c2": ((15.0, 0.1), (25.0, 0.05))}
+        for method, results in runs.items():
+            for seed, result in enumerate(results):
+                config = make_config(regularizer=method, seed=seed)
+                make_run(tmp_path / method / str(seed), config, *result)
+        make_run(tmp_path / "sac", make_config(algorithm=SACConfig()), 99.0, 0.1)
+        table = paper_table(shown_groups(read(tmp_path)))
+        assert [row[:2] for row in table.rows] == [["swingup", "vanilla"], ["swingup", "L2C2"]]
+        row = dict(zip(table.columns, table.rows[1], strict=True))
+        assert row["P(returns more)"].split()[0] == "0.75"
+        assert row["P(smoother)"].split()[0] == "0.75"
+        assert table.rows[1][3:6] == ["20.00 (7.07)†", "693.8 (123.8)", "50.00 (7.07)"]
+        assert table.rows[0][6] == table.rows[0][-2] == ""
+        assert (table.columns[-1], table.rows[0][-1]) == ("policy scale", "0.500 (0.000)")
+
+    @pytest.mark.parametrize(("total", "marks"), [(693.0 + 123.0, 0), (693.0 - 126.0, 1)])
+    def test_a_cell_beyond_the_papers_deviation_is_marked(self, tmp_path, total, marks):
+        """The paper's L2C2 on Swingup: 693.77 (123.78) at .075 (.012); .08 lies within."""
+        make_run(tmp_path / "run", make_config(regularizer="l2c2"), total, 0.08)
+        (row,) = paper_table(group_records(read(tmp_path))).rows
+        assert "".join(row).count("†") == marks
+
+    def test_as_deployed_they_are_compared_by_their_mean_actions(self, tmp_path):
+        """Other numbers than those of sampled actions, and other probabilities."""
+        make_run(tmp_path / "run", make_config(), 10.0, 0.1)
+        (record,) = read(tmp_path)
+        figures = ("late_mean_return", "late_mean_action_variation")
+        records = [
+            replace(record, method=method, seed=seed, **dict(zip(figures, values, strict=True)))
+            for method, runs in {
+                "none": ((10.0, 0.5), (20.0, 0.5)),
+                "l2c2": ((15.0, 0.4), (25.0, 0.6)),
+            }.items()
+            for seed, values in enumerate(runs)
+        ]
+        plain, smooth = deployed_table(group_records(records)).rows
+        assert plain[3:] == ["15.00 (7.07)", plain[4], "", "0.500 (0.000)", plain[7], ""]
+        assert (smooth[3], smooth[6]) == ("20.00 (7.07)", "0.500 (0.141)")
+        assert (smooth[5].split()[0], smooth[8].split()[0]) == ("0.75", "0.50")
+
+    def test_the_last_rows_are_the_means_over_tasks(self, tmp_path):
+        """Of 1 on Swingup, and of a half on Reacher, where returns are the baseline's own."""
+        for task, ahead in (("swingup", 5.0), ("reacher", 0.0)):
+            for method, total in (("none", 10.0), ("caps", 10.0 + ahead)):
+                config = make_config(task=task, regularizer=method)
+                make_run(tmp_path / task / method, config, total, 0.1 - total / 1000)
+        groups = group_records(read(tmp_path))
+        for make, returned in ((paper_table, 6), (deployed_table, 5)):
+            row = make(groups).rows[-1]
+            assert row[:3] == ["2 tasks", "CAPS", ""] and row[returned] == "0.75"
+            assert sum(bool(cell) for cell in row) == 4
+
+    def test_faster_targets_are_beside_the_papers_returns(self, tmp_path):
+        """376 and 284 at tau .5, Table III's at .1; other methods and other paces have none."""
+        for tau in (0.1, 0.5, 0.3):
+            for method, total in (("l2c2", 300.0), ("l2c2_policy", 200.0), ("caps", 100.0)):
+                for seed in range(2):
+                    settings = {"algorithm": PPORPEConfig(tau=tau), "seed": seed, "episodes": 350}
+                    config = make_config(regularizer=method, **settings)
+                    folder = tmp_path / f"{tau}" / method / str(seed)
+                    make_run(folder, config, total + 10 * seed - 100 * tau, 0.1)
+        records = read(tmp_path)
+        of_rows = {
+            row[1]: (row[3].split()[0], *row[5:]) for row in faster_targets_table(records).rows
+        }
+        assert of_rows == {
+            "L2C2": ("295.0", "693.8", "1.00 [1.00, 1.00]"),
+            "L2C2, beta=0": ("195.0", "707.4", ""),
+            "L2C2, tau=0.3": ("275.0", "", "1.00 [1.00, 1.00]"),
+            "L2C2, beta=0, tau=0.3": ("175.0", "", ""),
+            "L2C2, tau=0.5": ("255.0", "376.0", "1.00 [1.00, 1.00]"),
+            "L2C2, beta=0, tau=0.5": ("155.0", "284.0", ""),
+        }
+        # And Table III is not of them.
+        published = {row[1]: row[4] for row in paper_table(group_records(records)).rows}
+        assert published["L2C2"] == "693.8 (123.8)" and published["L2C2, tau=0.5"] == ""
+
+    def test_its_numbers_are_those_of_its_own_task_and_algorithm(self, tmp_path):
+        """Not of SAC, another task under its name, or L2C2 with another gain."""
+        other = replace(TASKS["swingup"], env_id="Pendulum-v1", episodes=20)
+        for name, config in {
+            "paper": make_config(),
+            "sac": make_config(algorithm=SACConfig(), seed=1),
+            "other": replace(make_config(seed=2), task=other),
+            "gain": make_config(regularizer=L2C2Config(beta=0.5)),
+        }.items():
+            make_run(tmp_path / name, config, 1.0, 0.1)
+        found = {run.folder.name: paper_of(run.record) for run in read_runs(tmp_path)}
+        assert found["paper"].return_mean == 649.57
+        assert all(found[name] is None for name in ("sac", "other", "gain"))
+
+    def test_runs_of_the_default_length_stand_for_their_task(self, tmp_path):
+        """Where it has some; else the others do."""
+        make_run(tmp_path / "run", make_config(), 1.0, 0.1)
+        (short,) = read(tmp_path)
+        usual = replace(short, length=f"{TASKS['swingup'].episodes} episodes", seed=7)
+        assert is_as_usual(usual) and not is_as_usual(short)
+        assert [group.seeds for group in shown_groups([short])] == [[0]]
+        assert [group.seeds for group in shown_groups([short, usual])] == [[7]]
+
+
+@pytest.fixture
+def pendulum(tmp_path):
+    """Records of three methods on Pendulum: return, action variation and Sm of seeds 0 and 1."""
+    for method, seeds in {
+        "none": ((10.0, 0.1, 0.4), (20.0, 0.2, 0.1)),
+        "l2c2": ((15.0, 0.1, 0.2), (25.0, 0.2, 0.2)),
+        "cats": ((25.0, 0.3, 0.3), (25.0, 0.3, 0.3)),
+    }.items():
+        for seed, (total, varied, sm) in enumerate(seeds):
+            chosen = CATSConfig() if method == "cats" else method
+            settings = {"algorithm": PPOConfig(), "regularizer": chosen, "seed": seed}
+            folder = tmp_path / method / str(seed)
+            make_run(folder, make_config(task="pendulum", **settings), 0.0, varied)
+            figures = {"return_mean": total, "action_variation_mean": varied, "sm_asap_mean": sm}
+            change_summary(folder, **figures)
+    other = make_config(task="pendulum", algorithm=PPOConfig(gamma=0.5), regularizer="none")
+    make_run(tmp_path / "other", other, 99.0, 0.0)
+    return read(tmp_path)
+
+
+class TestField:
+    def test_published_rows_are_beside_the_means_over_seeds(self, tmp_path):
+        """Of those tasks with PPO and SAC alone; an interval from two runs on; ties are halves."""
+        preset = {"task": "hopper_v5", "algorithm": PPOConfig()}
+        for method, seeds in (("none", 1), ("caps", 2), ("l2c2_ramp", 1)):
+            for seed in range(seeds):
+                folder = tmp_path / method / str(seed)
+                make_run(folder, make_config(regularizer=method, seed=seed, **preset), 100.0, 0.1)
+                change_summary(folder, sm_asap_mean=0.4 + 0.2 * seed)
+        make_run(tmp_path / "paper", make_config(), 10.0, 0.1)
+        table = field_table(read(tmp_path))
+        assert cells(table, "hopper_v5", "ppo", "CAPS") == [
+            "0, 1",
+            "120.0 [120.0, 120.0]",
+            "0.500 [0.400, 0.600]",
+            "0.120 [0.120, 0.120]",
+            "0.50",  # The baseline has a single run, which says nothing of how runs vary.
+            "0.25",
+            "2440",
+            "0.471",
+        ]
+        alone = ["0", "120.0", "0.400", "0.120", "0.50", "0.50", "", ""]
+        assert cells(table, "hopper_v5", "ppo", "L2C2, means, ramp") == alone
+        assert cells(table, "hopper_v5", "ppo", "LipsNet++") == [*[""] * 6, "1878", "0.543"]
+        assert len(table.rows) == 8  # CAPS and vanilla once, as they were run
+        assert {row[0] for row in table.rows} == {"hopper_v5"}
+        # With noise, or shorter episodes, it is another task.
+        other = [replace(r, differences="task.max_steps=60") for r in read(tmp_path)]
+        assert all(row[-2:] == ["", ""] for row in field_table(other).rows if row[3])
+
+    def test_a_mean_says_of_how_many_runs_it_is(self, pendulum):
+        """Those that were cut to a length have no last policy."""
+        lacking = [replace(r, last_mean_return=math.nan) if r.seed else r for r in pendulum]
+        row = cells(field_table(lacking), "pendulum", "ppo", "CATS")
+        assert row[1] == "25.00, of 1 runs" and row[2] == "0.300 [0.300, 0.300]"
+
+    def test_settings_are_in_order_over_tasks(self, tmp_path):
+        """By hand: returns by 10 and by -25 of 100, Sm half and twice; another at .8 and .8."""
+        shares = {s: L2C2Config(gain="gradient", gain_target=s) for s in (0.1, 0.3)}
+        cases = {
+            "pendulum": {"none": (-100.0, 0.4), 0.1: (-90.0, 0.2), 0.3: (-100.0, 0.32)},
+            "lunarlander": {"none": (100.0, 0.4), 0.1: (75.0, 0.8), 0.3: (110.0, 0.32)},
+        }
+        for task, methods in cases.items():
+            for method, (total, sm) in methods.items():
+                # The baseline has a seed of its own, which does not count.
+                for seed in range(3 if method == "none" else 2):
+                    chosen = {"regularizer": shares.get(method, method), "seed": seed}
+                    config = make_config(task=task, algorithm=PPOConfig(), **chosen)
+                    folder = tmp_path / task / str(method) / str(seed)
+                    make_run(folder, config, total, 0.1)
+                    off = 10.0 * seed - 5.0 if seed < 2 else 1000.0
+                    change_summary(folder, return_mean=total + off, sm_asap_mean=sm)
+        records = read(tmp_path)
+        table = choice_table(records)
+        # Of all pairs of these seeds: returns of .1 win 3.5 of 4 and none, of .3 2 and 3.5 of 4.
+        assert [[*row[:-2], *(cell.split()[0] for cell in row[-2:])] for row in table.rows] == [
+            ["ppo", f"L2C2, gain_target={share}", "pendulum, lunarlander", "0, 1", *row]
+            for share, row in {
+                0.3: ["+5%", "+0% pendulum", "0.80", "0.80 pendulum", "0.69", "1.00"],
+                0.1: ["-8%", "-25% lunarlander", "1.00", "2.00 lunarlander", "0.44", "0.50"],
+            }.items()
+        ]
+        # .3 beside .1: a half of 4 pairs of Pendulum and all of LunarLander's; Sm of these alone.
+        pairwise = pairwise_tables(records)
+        assert [each.title.split(",")[0] for each in pairwise] == [*BETTER.values()]
+        first, last = (f"L2C2, gain_target={share}" for share in (0.1, 0.3))
+        for each, better in zip(pairwise, (0.56, 0.50), strict=True):
+            assert [*each.columns] == ["method", "vanilla", first, last]
+            found = by_methods(each)
+            assert found[last][first].split()[0] == f"{better:.2f}"
+            assert found[first][last].split()[0] == f"{1 - better:.2f}"
+            assert [found[name][name] for name in found] == ["", "", ""]
+
+    def test_beside_nothing_there_are_no_parts(self, pendulum, recwarn):
+        """A baseline that returned 0, or did not move: a dash."""
+        still = [
+            replace(r, last_mean_return=0.0, last_mean_sm_asap=0.0) if r.method == "none" else r
+            for r in pendulum
+        ]
+        row = cells(choice_table(still), "ppo", "CATS")
+        assert row[2:6] == ["-", "- pendulum", "-", "- pendulum"] and not recwarn.list
+
+    def test_runs_of_another_length_are_not_compared(self, pendulum):
+        """Each against each: of CATS trained ten times as long nothing is left beside two."""
+        longer = [
+            replace(r, length="200 episodes", settings="x") if r.method == "cats" else r
+            for r in pendulum
+        ]
+        usual = [r for r in pendulum if "gamma" not in r.differences]
+        assert not pairwise_tables(longer) and len(pairwise_tables(usual)) == 2
+
+    def test_one_method_against_each_other_one(self, pendulum):
+        """Of four pairs three return more, a half is smoother by Sm; a tie counts half."""
+        table = against_table(pendulum, "L2C2")
+        # The run with another discount is no row.
+        assert [row[:4] for row in table.rows] == [
+            ["pendulum", "ppo", name, "0, 1"] for name in ("vanilla", "CATS")
+        ]
+        baseline, cats = ([cell.split()[0] for cell in row[4:]] for row in table.rows)
+        assert baseline == [
+            *("20.00", "15.00", "0.75", "0.200", "0.250", "0.50", "0.150", "0.150", "0.50")
+        ]
+        assert cats == [
+            *("20.00", "25.00", "0.25", "0.200", "0.300", "1.00", "0.150", "0.300", "1.00")
+        ]
+
+    def test_seeds_without_a_measure_are_told(self, pendulum):
+        """They are in no mean and in no pair."""
+        lacking = [
+            replace(r, last_mean_sm_asap=math.nan) if (r.method, r.seed) == ("l2c2", 1) else r
+            for r in pendulum
+            if "gamma" not in r.differences
+        ]
+        row = against_table(lacking, "L2C2").rows[0]
+        assert row[4] == "20.00" and row[7].endswith(", of 1 runs")
+        notes = [table.notes for table in pairwise_tables(lacking)]
+        assert [len(each) for each in notes] == [1, 2]
+        assert notes[1][1] == "Not all runs have it: pendulum, L2C2, of 1 runs."
+
+
+def test_targets_have_what_came_of_them_and_what_they_cost(tmp_path):
+    """Late policies with samples: .045 of .05 is a tenth less; the last one's mean is 20 more."""
+
+    def asked(target, **settings):
+        return L2C2Config(gain="target", gain_target=target, **settings)
+
+    for name, regularizer, seed, varied in (
+        ("one", asked(0.05), 0, 0.04),
+        ("two", asked(0.05), 1, 0.05),
+        ("low", asked(0.02), 0, 0.02),
+        ("none", "none", 0, 0.1),
+        ("constant", "l2c2", 0, 0.08),
+        ("other measure", asked(0.3, gain_of="policy_scale"), 0, 0.07),
+    ):
+        config = make_config(regularizer=regularizer, seed=seed)
+        make_run(tmp_path / name, config, 100.0 * (seed + 1), varied)
+    table = gain_targets_table(read(tmp_path))
+    assert table.columns[4:7] == ["target", "followed", "off by"]
+    assert [row[2:7] for row in table.rows] == [
+        ["L2C2, gain_target=0.02", "0", "0.020", "0.020", "+0%"],
+        ["L2C2, gain_target=0.05", "0, 1", "0.050", "0.045 (0.007)", "-10%"],
+        ["vanilla", "0", "", "0.100", ""],
+    ]
+    assert [row[7:] for row in table.rows] == [
+        ["100.0", "0.500", "0.040", "120.0"],
+        ["150.0 (70.7)", "0.500 (0.000)", "0.065 (0.007)", "170.0 (70.7)"],
+        ["100.0", "0.500", "0.120", "120.0"],
+    ]
+
+
+class TestProtocol:
+    def test_the_score_is_the_protocols_by_hand(self, tmp_path):
+        """Distances in the paper's deviations, at most 5, of the baseline and CAPS alone."""
+        # The mean over seeds lies 77.96 above the paper's: one deviation. Smoother by 2 of .011.
+        for seed, more in enumerate((67.96, 87.96)):
+            make_run(tmp_path / f"none{seed}", make_config(seed=seed), 649.57 + more, 0.084 - 0.022)
+        # 3 deviations of 26.56 below, and 100 of .002 too rough, which count as 5.
+        make_run(tmp_path / "caps", make_config(regularizer="caps"), 239.57 - 79.68, 0.226)
+        make_run(tmp_path / "l2c2", make_config(regularizer="l2c2"), -1e9, 9.0)
+        records = read(tmp_path)
+        (reading,) = readings(group_records(records))
+        assert reading.score("late_sampled") == pytest.approx((1 + 2 + 3 + 5) / 4)
+        # With mean actions, returns are 12 higher and variations .012.
+        distances = (1 + 12 / 77.96, 2 - 0.012 / 0.011, 3 - 12 / 26.56, 5)
+        assert reading.score("late_mean") == pytest.approx(sum(distances) / 4, abs=1e-5)
+        # Vanilla of other defaults, when it was run, is another reading.
+        then = [replace(r, settings="then") for r in records if r.method == "none"]
+        assert len(readings(group_records([*records, *then]))) == 2
+        # Nor are CAPS's of other settings beside it.
+        other = [replace(r, differences="algorithm.replay_ratio=5") for r in records]
+        caps = [r for r in other if r.method == "caps"]
+        assert not readings(group_records([*then, *caps]))
+
+    def test_a_run_can_be_read_as_if_it_had_ended_earlier(self, tmp_path):
+        """Its own episodes up to there; what only its end was tested for is unknown."""
+        make_run(tmp_path / "run", make_config(), 1.0, 0.1)
+        (run,) = read_runs(tmp_path)
+        for row, total in zip(run.metrics, range(20), strict=True):
+            row["return"] = str(total)
+        record = until(run, 19).record
+        # The last tenth of 19 episodes are two, the 18th and the 19th.
+        assert (record.late_sampled_return, record.episodes, record.updates) == (17.5, 19, 190)
+        assert (record.length, record.settings) == ("19 episodes", run.record.settings)
+        assert math.isnan(record.late_mean_return) and math.isnan(record.last_sampled_return)
+        assert until(run, 20) is run and until(run, 21) is None and until(run, 0) is None
+
+    def test_late_policies_of_a_cut_training_are_its_own_share(self, tmp_path):
+        """As of the uncut one, and not the last tenth whatever was asked for."""
+        make_run(tmp_path / "0", make_config(late_share=0.2), 100.0, 0.1)
+        (run,) = read_runs(tmp_path)
+        # Two of five episodes are late: of returns of 100 and a million less.
+        shorter, last = (until(run, length).record.late_sampled_return for length in (10, 19))
+        assert shorter == -1e6
+        assert last == pytest.approx((3 * -1e6 + 99.0) / 4)
+
+    def test_a_run_of_frames_is_cut_by_them(self, tmp_path):
+        """Its episodes are as long as they like, and the last one ends beyond what was asked."""
+        config = make_config()
+        make_run(tmp_path / "run", replace(config, task=replace(config.task, frames=2000)), 1, 0.1)
+        (run,) = read_runs(tmp_path)
+        cut = until(run, 1550).record
+        assert (cut.length, cut.episodes) == ("1550 frames", 16)
+
+    def test_lengths_are_rows_and_a_tested_run_stands_for_its_seed(self, tmp_path, capsys):
+        """One that ended just then was tested, and comes before a longer one that was cut."""
+        for episodes in (20, 10):
+            for method in ("none", "caps"):
+                config = make_config(episodes=episodes, regularizer=method)
+                make_run(tmp_path / "runs" / method / str(episodes), config, float(episodes), 0.1)
+        file = tmp_path / "records.csv"
+        score([str(tmp_path / "runs"), "--length", "10", "15", "--csv", str(file)])
+        rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines()]
+        assert [(row[2], row[5]) for row in rows if len(row) == 11 and "defaults" in row[1]] == [
+            ("10 episodes", "mean actions"),
+            ("10 episodes", "sampled actions"),
+            ("15 episodes", "sampled actions"),
+        ]
+        kept = {(r.method, r.length): r.last_mean_return for r in read_records(file)}
+        assert kept["caps", "10 episodes"] == 30.0 and math.isnan(kept["caps", "15 episodes"])
+        score([str(file)])
+        assert "| swingup | the defaults | 15 episodes | 0 |" in capsys.readouterr().out
+        for wrong, told in (
+            ((str(file), "--length", "10"), "--length needs the folders"),
+            ((str(tmp_path / "runs"), "--length", "30"), "no run is as long as 30"),
+        ):
+            with pytest.raises(SystemExit, match=f"error: {told}"):
+                score(wrong)
+
+    def test_what_goes_by_the_length_is_told_of_runs_that_were_cut(self, tmp_path, capsys):
+        """They are not what a shorter training would have been; whole ones are."""
+        ramped = make_config(regularizer="l2c2_ramp", optimizer=AdamConfig(linear=True))
+        make_run(tmp_path / "run", ramped, 1.0, 0.1)
+        score([str(tmp_path), "--length", "10"])
+        printed = capsys.readouterr().out
+        for setting in ("optimizer.linear=true", "regularizer.gain=ramp"):
+            assert f"1 runs, cut to a length, have {setting} as in their own, longer" in printed
+        score([str(tmp_path), "--length", "20"])
+        assert "as in their own" not in capsys.readouterr().out
+
+
+def by_methods(table):
+    """The cells of a table of methods by methods."""
+    return {row[0]: dict(zip(table.columns, row, strict=True)) for row in table.rows}
+
+
+def records(name):
+    return read_records(ROOT / "results" / f"{name}.csv")
+
+
+class TestPages:
+    def test_every_generated_part_is_that_of_its_records(self):
+        """``python -m studies.pages`` would change nothing."""
+        made = pages.pages()
+        assert sum(len(page.parts) for page in made.values()) == 19
+        for name, page in made.items():
+            text = (ROOT / name).read_text()
+            assert text.count(": start -->") == len(page.parts)
+            for mark, part in page.parts.items():
+                assert fill(text, mark, part) == text, (name, mark)
+            assert page.draw is None or is_drawn((ROOT / name).with_suffix(".svg"), page.shown)
+
+    def test_the_command_writes_what_is_not_as_it_should_be(self, tmp_path, monkeypatch, capsys):
+        """Text around the marks stays; a picture of the same records does, too."""
+        monkeypatch.setattr(pages, "ROOT", tmp_path)
+        page, picture = tmp_path / "page.md", tmp_path / "page.svg"
+        page.write_text("before\n  <!-- a: start -->\n  old\n  <!-- a: end -->\nafter\n")
+        shown = field_groups(records("walker2d"))
+        made = {"page.md": pages.Page({"a": "  new"}, shown, lambda path: path.write_text("drawn"))}
+        monkeypatch.setattr(pages, "pages", lambda: made)
+        pages.main()
+        assert capsys.readouterr().out == "written: page.md\ndrawn: page.svg\n"
+        assert page.read_text() == (
+            "before\n  <!-- a: start -->\n  new\n  <!-- a: end -->\nafter\n"
+        )
+        picture.write_bytes((pages.Path(__file__).parents[1] / "results/walker2d.svg").read_bytes())
+        pages.main()
+        assert capsys.readouterr().out == ""
+
+    def test_a_text_without_the_marks_is_refused(self):
+        """Rather than changed somewhere."""
+        with pytest.raises(ValueError, match="once each"):
+            fill("<!-- a: end -->\n<!-- a: start -->\n", "a", "results")
+
+
+class TestProse:
+    """Numbers within sentences, and tables that were written by hand."""
+
+    def test_returns_seed_by_seed(self):
+        """How often L2C2's is the lower one, which pairs of all seeds tell less of."""
+        named = {"PPO's Pendulum": "PPO, Pendulum", "SAC": "SAC, Pendulum"}
+        named |= {task: f"PPO, {task}" for task in ("LunarLander", "Hopper", "Walker2d")}
+        readme = (ROOT / "README.md").read_text()
+        assert set(named.values()) < set(HEADLINES)
+        for name, label in named.items():
+            ours, plain = (
+                {r.seed: r.last_mean_return for r in group.records}
+                for group in headline_groups(label)
+            )
+            lower = sum(ours[seed] < plain[seed] for seed in ours)
+            assert f"{lower} of {len(ours)} ({name})" in readme
+
+    def test_rivals_over_four_tasks(self):
+        """How probable a smoother run is, and one that returns more."""
+        more, smoother = map(by_methods, pairwise_tables(one_setting()))
+        weak = "CAPS, lambda_spatial=0.005"
+        for page in ((ROOT / name).read_text() for name in ("README.md", "results/one_setting.md")):
+            said = " ".join(page.partition("a run with L2C2 has a smaller Sm")[2].split())
+            start = said.partition(". ")[0]
+            for table in (more, smoother):
+                assert table[OURS]["CATS"] in start and table[OURS]["CAPS"] in start
+            assert smoother[OURS][weak] in said and more[weak][OURS] in said
+
+    def test_both_lengths_of_sac(self):
+        """Seed by seed, and in the mean."""
+        page = (ROOT / "results" / "sac_pendulum.md").read_text()
+        for frames, name in (("30,000", "sac_pendulum"), ("100,000", "sac_pendulum_100000")):
+            runs = {r.seed: r for r in records(name) if r.method == "none" and r.seed < 5}
+            pairs = [(runs[s].last_mean_return, runs[s].last_mean_sm_asap) for s in range(5)]
+            row = [f"{total:.0f} / {sm:.3f}" for total, sm in pairs]
+            mean = "{:.1f} / {:.3f}".format(*np.mean(pairs, 0))
+            assert f"| {' | '.join([frames, *row, mean])} |" in page
+
+    def test_cats_as_strong_as_l2c2(self):
+        """Both at the same strength, on two tasks: means, and how probable a better run is."""
+        page = (ROOT / "results" / "one_setting.md").read_text().partition("## CATS, as strong")[2]
+        groups = group_records(records("field"))
+        for task, gain in (("pendulum", 0.5), ("lunarlander", 0.25)):
+            named = {group.name: group for group in groups if group.first.task == task}
+            ours, cats = named[OURS], named[f"CATS, lambda_temporal={gain}"]
+            for group in (ours, cats):
+                total, sm, variation = (
+                    group.scores("last_mean", quantity).mean().item()
+                    for quantity in ("return", "sm_asap", "action_variation")
+                )
+                row = f"0-9 | {total:.1f} | {sm:.3f} | {variation:.3f} |"
+                assert f"| {task} | {group.name} | {row}" in page
+            for quantity in ("return", "sm_asap"):
+                better = improvement([ours], [cats], "last_mean", quantity).text("{:.2f}".format)
+                assert better.replace("0.", ".") in page
+
+    @pytest.mark.parametrize(
+        "name", ["field", "walker2d", "hopper", "sac_pendulum", "sac_pendulum_100000"]
+    )
+    def test_the_harness(self, name):
+        """The baseline's and the rivals' rows beside the published ones."""
+        table = field_table(records(name))
+        rows = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
+        shown = [row for row in rows if row["seeds"] and not row["method"].startswith("L2C2")]
+        columns = (*table.columns[:5], "published: return", "Sm", "published: Sm")
+        page = (ROOT / "docs" / "field.md").read_text()
+        gains = Counter((row["task"], row["method"].partition(",")[0]) for row in shown)
+        for row in shown:
+            method, _, gain = row["method"].partition(",")
+            method += f",{gain}" if gain and gains[row["task"], method] > 1 else ""
+            method += ", 100000 frames" if name.endswith("100000") else ""
+            found = [row[column] for column in columns]
+            assert f"| {' | '.join([*found[:2], method, *found[3:]])} |" in page
+
+    def test_the_gains_of_sac(self):
+        """Every run of the seeds that gains are chosen on is a cell; else the means are."""
+        page = (ROOT / "results" / "field_gains.md").read_text()
+
+        def cell(*runs):
+            means = (
+                statistics.fmean(getattr(r, f"last_mean_{name}") for r in runs)
+                for name in ("return", "sm_asap")
+            )
+            return "{:.1f} / {:.3f}".format(*means).replace("/ 0.", "/ .")
+
+        gains = records("sac_gains")
+        assert all(cell(record) in page for record in gains if record.seed >= 100)
+        shown = [r for r in gains if r.seed < 100 and r.differences.count("lambda_") > 1]
+        for group in group_records([*shown, *records("sac_pendulum")]):
+            assert cell(*group.records[:4]) in page, group.name
+
+    def test_walkings_gains(self):
+        """Every run of the seeds that its gains are chosen on is a cell."""
+        page = (ROOT / "results" / "field_gains.md").read_text()
+        one = [r for r in records("one_gain") if r.task == "walker2d_v5"]
+        shown = merge(records("walker2d_gains"), one)
+        for record in shown:
+            cell = f"{record.last_mean_return:.0f} / {record.last_mean_sm_asap:.3f}"
+            assert f"| {cell.replace('/ 0.', '/ .')} |" in page
+        assert len(shown) >= 24
