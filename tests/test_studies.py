@@ -208,7 +208,7 @@ class TestField:
 
     def test_settings_are_in_order_over_tasks(self, tmp_path):
         """By hand: returns by 10 and by -25 of 100, Sm half and twice; another at .8 and .8."""
-        shares = {s: L2C2Config(gain="gradient", gain_target=s) for s in (0.1, 0.3)}
+        shares = {s: L2C2Config(gain="target", gain_target=s) for s in (0.1, 0.3)}
         cases = {
             "pendulum": {"none": (-100.0, 0.4), 0.1: (-90.0, 0.2), 0.3: (-100.0, 0.32)},
             "lunarlander": {"none": (100.0, 0.4), 0.1: (75.0, 0.8), 0.3: (110.0, 0.32)},

@@ -59,7 +59,7 @@ def name_with_settings(method: str, settings: Mapping[str, str | None]) -> tuple
     distance = DISTANCES[own.get("policy_distance", usual.policy_distance)]
     gain, edge = own.get("gain", usual.gain), own.get("lambda_min", f"{usual.lambda_min:g}")
     told = {"policy_distance", "gain"}
-    if gain in ("target", "gradient"):
+    if gain == "target":
         told, name = told | {"gain_target"}, f"{distance}, {gain} {own.get('gain_target')}"
     else:
         told, name = told | {"lambda_min"}, f"{distance} {edge}{', ramp' if gain == 'ramp' else ''}"
