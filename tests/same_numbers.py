@@ -44,6 +44,7 @@ PAPERS = [
     "regularizer.lambda_min=0.01",
     "regularizer.lambda_max=1.0",
     "regularizer.beta=0.1",
+    "regularizer.shared=true",
 ]
 RUNS = {
     "ppo_rpe": [*SWINGUP, "regularizer=none"],

@@ -1,0 +1,186 @@
+"""Trains SAC, TD3 and PPO in plain TorchRL loops, with and without ``smooth(loss)``.
+
+``python -m studies.front_door results/front_door.csv`` makes 10 seeds of each on Pendulum, and adds a
+line to the file after each run; runs that the file has are skipped. The loops know nothing of the
+regularizer: they sum the losses by name, as TorchRL's own scripts do.
+"""
+
+from __future__ import annotations
+
+import csv
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import torch
+from tensordict.nn import TensorDictSequential
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
+from torchrl.envs import ExplorationType, GymEnv, set_exploration_type
+from torchrl.modules import MLP, Actor, AdditiveGaussianModule, TanhModule, ValueOperator
+from torchrl.objectives import ClipPPOLoss, LossModule, SACLoss, SoftUpdate, TD3Loss
+from torchrl.objectives.value import GAE
+
+from torchrl_l2c2 import action_variation, make_actor, make_critic, smooth
+
+SEEDS = range(10)
+TEST_EPISODES = 10
+COLUMNS = ["algorithm", "method", "seed", "return", "action_variation", "seconds", "commit"]
+
+
+def train_sac(seed: int, smoothed: bool, frames: int = 5_000) -> torch.nn.Module:
+    """SAC, an update every other frame, on losses that are summed by name."""
+    env = pendulum(seed)
+    actor, qvalue = make_actor(3, env.action_spec, hidden=(64, 64)), make_qvalue()
+    loss: LossModule = SACLoss(actor, qvalue, action_spec=env.action_spec)
+    loss.make_value_estimator(gamma=0.95)
+    if smoothed:
+        loss = smooth(loss)
+    updater = SoftUpdate(loss, tau=0.01)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
+    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(frames), batch_size=64)
+    collector = Collector(
+        env, actor, frames_per_batch=50, total_frames=frames, init_random_frames=500
+    )
+    for collected in collector:
+        replay.extend(collected)
+        for _ in range(25 if len(replay) >= 500 else 0):
+            terms = loss(replay.sample())
+            (terms["loss_actor"] + terms["loss_qvalue"] + terms["loss_alpha"]).backward()
+            optimizer.step()
+            optimizer.zero_grad()
+            updater.step()
+    collector.shutdown()
+    return actor
+
+
+def train_td3(seed: int, smoothed: bool, frames: int = 5_000) -> torch.nn.Module:
+    """TD3, which calls the parts of the loss by themselves."""
+    env = pendulum(seed)
+    network = MLP(in_features=3, out_features=1, num_cells=[64, 64])
+    squash = TanhModule(in_keys=["action"], out_keys=["action"], spec=env.action_spec)
+    actor = TensorDictSequential(Actor(network, out_keys=["action"]), squash)
+    noise = AdditiveGaussianModule(env.action_spec, sigma_init=0.2, sigma_end=0.2)
+    loss: LossModule = TD3Loss(actor, make_qvalue(), action_spec=env.action_spec)
+    loss.make_value_estimator(gamma=0.95)
+    if smoothed:
+        loss = smooth(loss)
+    updater = SoftUpdate(loss, tau=0.01)
+    actor_optimizer = torch.optim.Adam(loss.actor_network_params.flatten_keys().values(), lr=1e-3)
+    critic_optimizer = torch.optim.Adam(loss.qvalue_network_params.flatten_keys().values(), lr=1e-3)
+    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(frames), batch_size=64)
+    collector = Collector(
+        env,
+        TensorDictSequential(actor, noise),
+        frames_per_batch=50,
+        total_frames=frames,
+        init_random_frames=500,
+    )
+    for collected in collector:
+        replay.extend(collected)
+        for update in range(26 if len(replay) >= 500 else 0):
+            batch = replay.sample()
+            value_loss, _ = loss.value_loss(batch)
+            critic_optimizer.zero_grad()
+            value_loss.backward()
+            critic_optimizer.step()
+            if update % 2 == 0:
+                actor_loss, _ = loss.actor_loss(batch)
+                actor_optimizer.zero_grad()
+                actor_loss.backward()
+                actor_optimizer.step()
+                updater.step()
+    collector.shutdown()
+    return actor
+
+
+def train_ppo(seed: int, smoothed: bool, frames: int = 40_960) -> torch.nn.Module:
+    """PPO on rollouts of 2,048 frames, with the progress of training after each."""
+    env = pendulum(seed)
+    actor, critic = make_actor(3, env.action_spec, hidden=(64, 64)), make_critic(3, hidden=(64, 64))
+    loss: LossModule = ClipPPOLoss(actor, critic, normalize_advantage=True, entropy_coeff=0.0)
+    advantage = GAE(gamma=0.9, lmbda=0.95, value_network=critic)
+    if smoothed:
+        loss = smooth(loss)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
+    replay = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(2_048), sampler=SamplerWithoutReplacement(), batch_size=128
+    )
+    collector = Collector(env, actor, frames_per_batch=2_048, total_frames=frames)
+    for number, rollout in enumerate(collector):
+        if smoothed:
+            loss.set_progress(number * 2_048 / frames)
+        for _ in range(10):
+            with torch.no_grad():
+                advantage(rollout)
+            replay.extend(rollout.reshape(-1))
+            for batch in replay:
+                terms = loss(batch)
+                (terms["loss_objective"] + terms["loss_critic"] + terms["loss_entropy"]).backward()
+                torch.nn.utils.clip_grad_norm_(loss.parameters(), 0.5)
+                optimizer.step()
+                optimizer.zero_grad()
+    collector.shutdown()
+    return actor
+
+
+ALGORITHMS = {"TD3": train_td3, "SAC": train_sac, "PPO": train_ppo}
+
+
+def pendulum(seed: int) -> GymEnv:
+    """Pendulum-v1 with a seed, also for torch's generators."""
+    torch.manual_seed(seed)
+    env = GymEnv("Pendulum-v1")
+    env.set_seed(seed)
+    return env
+
+
+def make_qvalue() -> ValueOperator:
+    """An action value of 64 and 64 units."""
+    network = MLP(in_features=4, out_features=1, num_cells=[64, 64])
+    return ValueOperator(network, in_keys=["observation", "action"])
+
+
+def evaluate(actor: torch.nn.Module) -> tuple[float, float]:
+    """The mean return and the mean action variation of episodes with mean actions."""
+    env = GymEnv("Pendulum-v1")
+    env.set_seed(10_000)
+    returns, variations = [], []
+    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+        for _ in range(TEST_EPISODES):
+            episode = env.rollout(200, actor)
+            returns.append(episode["next", "reward"].sum())
+            variations.append(action_variation(episode["action"]))
+    return torch.stack(returns).mean().item(), torch.stack(variations).mean().item()
+
+
+def main(path: Path) -> None:
+    """Makes the runs that the file lacks."""
+    torch.set_num_threads(1)
+    describe = ["git", "rev-parse", "--short=12", "HEAD"]
+    commit = subprocess.run(describe, capture_output=True, text=True, check=True).stdout.strip()
+    done = set()
+    if path.exists():
+        with path.open() as file:
+            done = {(r["algorithm"], r["method"], r["seed"]) for r in csv.DictReader(file)}
+    else:
+        with path.open("w", newline="") as file:
+            csv.writer(file).writerow(COLUMNS)
+    for seed in SEEDS:
+        for algorithm, train in ALGORITHMS.items():
+            for method in ("baseline", "smooth"):
+                if (algorithm, method, str(seed)) in done:
+                    continue
+                started = time.monotonic()
+                actor = train(seed, method == "smooth")
+                total, variation = evaluate(actor)
+                seconds = round(time.monotonic() - started)
+                row = [algorithm, method, seed, f"{total:.3f}", f"{variation:.5f}", seconds, commit]
+                with path.open("a", newline="") as file:
+                    csv.writer(file).writerow(row)
+                print(*row, flush=True)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
