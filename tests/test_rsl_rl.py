@@ -51,7 +51,8 @@ def make(
     small: dict[str, Any] = {"hidden_dims": [8], "activation": "tanh"}
     if model is MLPModel:
         small["obs_normalization"] = True
-    actor = model(obs, GROUPS, "actor", ACTIONS, distribution_cfg=normal, **small)
+    # A copy: rsl_rl 5.4 takes the class's name out of the dictionary.
+    actor = model(obs, GROUPS, "actor", ACTIONS, distribution_cfg=copy.copy(normal), **small)
     critic = MLPModel(obs, GROUPS, "critic", 1, **small | {"obs_normalization": True})
     storage = RolloutStorage("rl", ENVS, STEPS, obs, [ACTIONS])
     settings = {"num_learning_epochs": 1, "num_mini_batches": 1} | settings
@@ -497,7 +498,8 @@ def test_the_runner_builds_it_by_its_name(monkeypatch: pytest.MonkeyPatch, tmp_p
         "num_steps_per_env": 4,
         "save_interval": 1,
     }
-    runner = OnPolicyRunner(NoisyPoints(8), config, log_dir=str(tmp_path))
+    # rsl_rl 5.4 takes the names of classes out of what it is given.
+    runner = OnPolicyRunner(NoisyPoints(8), copy.deepcopy(config), log_dir=str(tmp_path))
     loss = runner.alg.regularization.loss
     assert isinstance(runner.alg, rsl.L2C2PPO)
     assert (loss.l2c2_neighborhood, loss.l2c2_beta) == (Neighborhood(0.5, lambda_max=3.0), 0.25)
