@@ -28,6 +28,7 @@ from torchrl_l2c2.experiment import (
 )
 from torchrl_l2c2.experiment.compilation import compiler_available
 from torchrl_l2c2.experiment.replay import load_replay_state, replay_state
+from torchrl_l2c2.experiment.settings import SettingError
 from torchrl_l2c2.experiment.update import ReplayUpdate, make_update
 
 logging.getLogger("torchrl").setLevel(logging.ERROR)
@@ -282,3 +283,12 @@ def scale_rates(optimizer, factor):
             group["lr"].mul_(factor)
         else:
             group["lr"] *= factor
+
+
+def test_priorities_need_a_torch_with_which_torchrls_trees_load(monkeypatch):
+    """The error names the versions and the setting that works without them."""
+    monkeypatch.setattr("torchrl.data.replay_buffers.samplers.SumSegmentTreeFp32", None)
+    needed = r"'prioritized' needs .* torch 2\.14 or newer, got torch \S+\. Set replay=uniform"
+    with pytest.raises(SettingError, match=needed):
+        PAPER.make_replay()
+    assert len(replace(PAPER, replay=UniformReplayConfig()).make_replay()) == 0

@@ -40,10 +40,22 @@ class PrioritizedReplayConfig:
         _check_fits(self.capacity, self.batch_size)
 
     def make(self, seed: int, longest_rollout: int, device: str = "cpu") -> TensorDictReplayBuffer:
-        """The buffer; how long a rollout may be does not matter to it."""
+        """The buffer; how long a rollout may be does not matter to it.
+
+        Raises:
+            SettingError: torchrl's compiled trees are not loaded with this version of torch.
+        """
         import torch
         from torchrl.data import LazyTensorStorage, TensorDictPrioritizedReplayBuffer
+        from torchrl.data.replay_buffers.samplers import SumSegmentTreeFp32
 
+        if SumSegmentTreeFp32 is None:
+            raise SettingError(
+                "replay",
+                f"{self.name!r} needs torchrl's compiled trees, which torchrl 0.14.1 loads with "
+                f"torch 2.14 or newer, got torch {torch.__version__}. Set replay=uniform or "
+                'install "torch>=2.14".',
+            )
         return TensorDictPrioritizedReplayBuffer(
             alpha=self.alpha,
             beta=self.beta,
