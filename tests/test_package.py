@@ -68,6 +68,30 @@ def test_importing_the_components_needs_nothing_of_the_experiment(imported):
     assert imported["components"] == []
 
 
+# As where none of them is installed.
+WITHOUT = """
+import sys
+for name in ("gymnasium", "hydra", "matplotlib", "omegaconf", "pybullet", "pydantic", "tqdm"):
+    sys.modules[name] = None
+import torch
+import torchrl_l2c2
+from torchrl.envs import PendulumEnv, TransformedEnv
+for name in torchrl_l2c2.__all__:
+    getattr(torchrl_l2c2, name)
+import torchrl_l2c2.rsl_rl
+noise = torchrl_l2c2.ObservationNoise(0.5, ["th"], torch.Generator().manual_seed(0))
+rollout = TransformedEnv(PendulumEnv(), noise).rollout(3)
+print(torch.equal(rollout["next", "th"][:-1], rollout["th"][1:]))
+"""
+
+
+def test_the_components_work_without_the_experiments_packages():
+    """Every public name can be imported, and an environment of TorchRL's own gets its noise."""
+    command = [sys.executable, "-c", WITHOUT]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.stdout == "True\n", done.stderr
+
+
 def test_hydra_is_optional_and_registration_explicit(imported):
     """Importing the package imports no Hydra; importing the configurations stores none of them."""
     assert imported["at first"] == []
