@@ -16,6 +16,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
+TRAIN = ROOT / "train.py"
 IMPORTED = multiprocessing.get_context("forkserver")
 IMPORTED.set_forkserver_preload(
     [
@@ -60,6 +61,7 @@ def start_train(
     errors: Path | None = None,
     cwd: Path | None = None,
     session: bool = False,
+    script: Path = TRAIN,
 ) -> Started:
     """Begins ``python train.py`` with what it says going to files; a pipe might be full.
 
@@ -71,20 +73,23 @@ def start_train(
         errors (Path, optional): likewise. Default: the same file.
         cwd (Path, optional): where it is begun. Default: here.
         session (bool): whether it has a session of its own, as a terminal has one.
+        script (Path): what is run instead of ``train.py``.
     """
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     files = [str(output), str(errors or output)]
-    arguments = (overrides, files, str(cwd or Path.cwd()), environment, session)
+    arguments = (overrides, files, str(cwd or Path.cwd()), environment, session, str(script))
     process = IMPORTED.Process(target=_train, args=arguments)
     process.start()
     return Started(process)
 
 
-def run_train(*overrides: str, cwd: Path, check: bool = True) -> subprocess.CompletedProcess[str]:
+def run_train(
+    *overrides: str, cwd: Path, check: bool = True, script: Path = TRAIN
+) -> subprocess.CompletedProcess[str]:
     """Runs ``python train.py`` to its end, as ``subprocess.run`` does with ``capture_output``."""
     with tempfile.TemporaryDirectory() as folder:
         output, errors = (Path(folder) / name for name in ("output", "errors"))
-        process = start_train(*overrides, output=output, errors=errors, cwd=cwd)
+        process = start_train(*overrides, output=output, errors=errors, cwd=cwd, script=script)
         code = process.wait()
         done = subprocess.CompletedProcess(overrides, code, output.read_text(), errors.read_text())
     if check:
@@ -98,6 +103,7 @@ def _train(
     cwd: str,
     environment: Mapping[str, str],
     session: bool,
+    script: str,
 ) -> None:
     if session:
         os.setsid()
@@ -108,7 +114,6 @@ def _train(
     os.environ.clear()
     os.environ.update(environment)
     os.chdir(cwd)
-    script = str(ROOT / "train.py")
     sys.argv = [script, *overrides]
     paths = environment.get("PYTHONPATH", "").split(os.pathsep)
     sys.path[:0] = [str(ROOT), *filter(None, paths)]

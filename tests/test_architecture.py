@@ -35,7 +35,8 @@ rsl_rl.regularization
 rsl_rl.ppo
 rsl_rl.__init__
 trainers __init__
-experiment.errors experiment.settings experiment.compilation experiment.spaces experiment.guard
+experiment.errors
+experiment.settings experiment.compilation experiment.spaces experiment.guard
 experiment.tracing experiment.priorities experiment.frames experiment.row_writer
 experiment.loggers experiment.acting experiment.files experiment.versions
 experiment.checkpoints experiment.metrics_log

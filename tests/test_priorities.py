@@ -78,5 +78,5 @@ def test_priorities_that_are_not_positive_are_refused():
     """A weight would be a division by nothing."""
     buffer = filled(40)
     buffer.sampler._min_tree[3] = 0.0
-    with pytest.raises(RuntimeError, match="positive"):
+    with pytest.raises(FloatingPointError, match="positive"):
         draw_by_priority(buffer.sampler, 40, 16)

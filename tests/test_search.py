@@ -137,7 +137,7 @@ def test_a_trial_without_late_tests_is_scored_by_its_last_policies(tmp_path):
         pytest.approx(values) for values in ([24.0, 0.062], [32.0, 0.07])
     ]
     (tmp_path / "trial_0002").mkdir()
-    with pytest.raises(RuntimeError, match=r"trial_0002 has no results; .* test_episodes of"):
+    with pytest.raises(ValueError, match=r"trial_0002 has no results; .* test_episodes of"):
         search.tell(2)
 
 

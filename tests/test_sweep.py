@@ -15,6 +15,7 @@ from processes import start_train
 
 from torchrl_l2c2.experiment.checkpoints import list_checkpoints, load_checkpoint
 from torchrl_l2c2.experiment.command import check_launcher, check_sweep
+from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.settings import SettingError
 from torchrl_l2c2.experiment.sweep import ShareSweep, Sweep, begin_sweep
 
@@ -278,7 +279,7 @@ def test_a_machine_without_the_outputs_is_named(tmp_path):
     with begin_sweep() as begun:
         begun.share(tmp_path / "outputs")
         (tmp_path / "outputs").rename(tmp_path / "moved")
-        with pytest.raises(RuntimeError, match=r"outputs' is not on .* all machines share"):
+        with pytest.raises(UserError, match=r"outputs' is not on .* all machines share"):
             Sweep.of_this_job()
 
 

@@ -17,6 +17,7 @@ from small import own_nodes
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig
 from torchrl_l2c2.experiment.composition import CONF, composing, folder_named, register
 from torchrl_l2c2.experiment.config import GROUPS
+from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.settings import SettingError, describe
 
 
@@ -273,7 +274,7 @@ def test_what_is_taken_begins_to_learn_or_is_refused_by_its_component(data):
     chosen = SMALL | {group: {**few, "name": choice, name: value}}
     try:
         experiment = Experiment(ExperimentConfig.from_dict(chosen))
-    except ValueError as refused:
+    except UserError as refused:
         assert "\n" not in str(refused)
         return
     try:

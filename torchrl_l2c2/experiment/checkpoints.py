@@ -21,6 +21,7 @@ from typing import Any
 
 import torch
 
+from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.files import write_atomically
 
 MAGIC = b"torchrl_l2c2\n"
@@ -29,7 +30,7 @@ HEADER = struct.Struct(f"<{len(MAGIC)}sI32s")
 PATTERN = "checkpoint_*.pt"
 
 
-class CheckpointError(RuntimeError):
+class CheckpointError(UserError):
     """A checkpoint that cannot be used, and why."""
 
 
@@ -69,11 +70,10 @@ def load_checkpoint(path: str | Path) -> dict[str, Any]:
         CheckpointError: missing, empty, cut short, changed, or of another format version.
     """
     path = Path(path)
+    payload = _payload(path)
     try:
-        return torch.load(io.BytesIO(_payload(path)), "cpu", weights_only=True)
+        return torch.load(io.BytesIO(payload), "cpu", weights_only=True)
     except (RuntimeError, EOFError, pickle.UnpicklingError) as error:
-        if isinstance(error, CheckpointError):
-            raise
         raise CheckpointError(f"{path}: its content cannot be read ({error}).") from error
 
 

@@ -33,7 +33,14 @@ from torchrl_l2c2.experiment.composition import (
     tell_sweep,
 )
 from torchrl_l2c2.experiment.config import ExperimentConfig
-from torchrl_l2c2.experiment.errors import EXPECTED, show_cause, warnings_told
+from torchrl_l2c2.experiment.errors import (
+    UserError,
+    is_lack_of_memory,
+    is_told_in_a_line,
+    show_cause,
+    warnings_told,
+)
+from torchrl_l2c2.experiment.files import make_folder
 from torchrl_l2c2.experiment.progress import log, say
 from torchrl_l2c2.experiment.settings import SettingError
 from torchrl_l2c2.experiment.signals import (
@@ -137,7 +144,7 @@ def _main(values: DictConfig) -> None:
     except KeyboardInterrupt as interruption:  # Not while training, or a second one.
         print("interrupted; the same command continues.", file=sys.stderr)
         sys.exit(128 + (signal.SIGTERM if isinstance(interruption, Terminated) else signal.SIGINT))
-    except EXPECTED as error:
+    except Exception as error:
         _tell(error)
         sys.exit(1)
 
@@ -164,8 +171,6 @@ def _run_job(values: dict[str, Any], sweep: Sweep) -> None:
             sys.exit(128 + stopped_by)
         sweep.stop(stopped_by)
     except Exception as error:
-        if not isinstance(error, EXPECTED):
-            traceback.print_exc()
         sweep.add_failure(number, job, _tell(error).splitlines()[0])
 
 
@@ -175,12 +180,15 @@ def _standing(sweep: Sweep) -> str:
 
 
 def _tell(error: Exception) -> str:
-    """Says what went wrong: of a user's own environment with where it did."""
+    """Prints an error: one line, with the lines of a simulator that failed; a bug's traceback."""
+    if not is_told_in_a_line(error):
+        traceback.print_exception(error)
+        return "".join(traceback.format_exception_only(error)).strip()
     show_cause(error)
     told = str(error) or type(error).__name__
     if isinstance(error, SettingError):
         told += " --help lists every setting."
-    elif isinstance(error, MemoryError) or "alloc" in told:
+    elif is_lack_of_memory(error):
         told = f"{told.rstrip('.')}. There is no memory for it: choose smaller {OF_MEMORY}."
     print(f"error: {told}", file=sys.stderr)
     return told
@@ -221,16 +229,17 @@ def run(
         print(told, flush=True)
     wait_for_folder(folder, patience)
     check_elsewhere(values["resume"])
-    finished = finished_run(folder, config.to_dict())
-    if finished is None:
-        finished = _train(config, folder, values, standing)
-    else:
-        with warnings_told(partial(say, folder)):
-            tell_past(finished.config, config.to_dict())
-    if records:
-        record_video(folder, video)
-    if finished is not None:
-        _show(finished)
+    with _end_logged(folder):
+        finished = finished_run(folder, config.to_dict())
+        if finished is None:
+            finished = _train(config, folder, values, standing)
+        else:
+            with warnings_told(partial(say, folder)):
+                tell_past(finished.config, config.to_dict())
+        if records:
+            record_video(folder, video)
+        if finished is not None:
+            _show(finished)
     if video.exists():
         print(f"video: {video}", flush=True)
     return finished
@@ -257,7 +266,6 @@ def _train(
     with (
         warnings_told(partial(say, folder)),
         closing(Experiment(config, folder, **going_on)) as experiment,
-        _end_logged(folder),
     ):
         if (told := preset_used(config)) is not None:
             log(folder, told)
@@ -286,12 +294,19 @@ def _show(finished: FinishedRun) -> None:
 
 @contextmanager
 def _end_logged(folder: Path) -> Iterator[None]:
-    """What ends a run early is in its ``train.log`` too."""
+    """Writes the error that ends a run early into its ``train.log``.
+
+    A mistake of the user is only shown: it changes nothing in the folder, and makes none.
+    """
     try:
         yield
+    except UserError:
+        raise
     except (KeyboardInterrupt, Exception) as error:
         stopped = isinstance(error, KeyboardInterrupt | Interrupted)
         told = [str(error) or "interrupted"] if stopped else traceback.format_exception(error)
         with suppress(OSError):  # The error itself may be that there is no room.
+            if not stopped and not is_told_in_a_line(error):
+                make_folder(folder)
             log(folder, "".join(told))
         raise

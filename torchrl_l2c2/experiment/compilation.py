@@ -26,8 +26,10 @@ from torch.fx.experimental.symbolic_shapes import ShapeEnv
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 from torch.utils._pytree import tree_flatten, tree_map_only, tree_unflatten
 
+from torchrl_l2c2.experiment.errors import ChildFailedError
 
-class CompilerError(RuntimeError):
+
+class CompilerError(ChildFailedError):
     """The compiler failed: of its hundreds of lines the one that says why."""
 
 

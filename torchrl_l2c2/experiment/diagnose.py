@@ -17,7 +17,7 @@ from torchrl_l2c2.experiment.diagnosis import (
 )
 from torchrl_l2c2.experiment.differences import differences
 from torchrl_l2c2.experiment.environments import TEST_SEED
-from torchrl_l2c2.experiment.errors import told_in_a_line
+from torchrl_l2c2.experiment.errors import UserError, told_in_a_line
 from torchrl_l2c2.experiment.files import make_folder_of, write_atomically
 from torchrl_l2c2.experiment.reports.names import method_name, name_with_settings
 from torchrl_l2c2.experiment.saved import read_config
@@ -100,7 +100,7 @@ def _names(folders: Sequence[str]) -> list[str]:
     """
     paths = [Path(folder).resolve().parts for folder in folders]
     if len(set(paths)) < len(paths):
-        raise ValueError("a run is named twice; its page would show the same thing twice.")
+        raise UserError("a run is named twice; its page would show the same thing twice.")
     paths = [tuple(map(method_name, path)) for path in paths]
     told = [each for each in map(_by_settings, map(Path, folders)) if each is not None]
     # Settings that no method's name tells are in the folders' own.

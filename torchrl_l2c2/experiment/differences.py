@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from torchrl_l2c2.experiment.config import GROUPS, ExperimentConfig, is_free, is_neutral
+from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.identity import BUDGETS, by_name
 from torchrl_l2c2.experiment.tasks import TASKS
 
@@ -76,11 +77,11 @@ def read_differences(line: str) -> dict[str, str]:
     """Reads :func:`write_differences` back.
 
     Raises:
-        ValueError: a word that is no setting with its value.
+        UserError: a word that is no setting with its value.
     """
     pairs = [word.partition("=") for word in line.split()]
     if cut := [name for name, equals, _ in pairs if not equals]:
-        raise ValueError(f"differences must be words such as a=1, got {cut[0]!r}")
+        raise UserError(f"differences must be words such as a=1, got {cut[0]!r}")
     return {name: value for name, _, value in pairs}
 
 

@@ -16,7 +16,7 @@ from gymnasium.wrappers import RenderCollection
 from torchrl.envs import EnvBase, GymWrapper, TransformedEnv
 
 from torchrl_l2c2.experiment.compilation import CompilerError
-from torchrl_l2c2.experiment.errors import SimulatorError
+from torchrl_l2c2.experiment.errors import SimulatorError, UserError
 from torchrl_l2c2.experiment.spaces import Env, observing_image, observing_vector, taking_vector
 from torchrl_l2c2.transforms import ObservationNoise
 
@@ -107,7 +107,7 @@ def time_limit(task: TaskConfig) -> int:
             importlib.import_module(module)
         registered = gymnasium.spec(name).max_episode_steps
     if registered is None:
-        raise ValueError(
+        raise UserError(
             f"task.env_id={task.env_id!r} is registered without a limit of its episodes: set "
             "task.max_steps, for example to 1000."
         )
@@ -158,8 +158,8 @@ def _make(task: TaskConfig, render: bool) -> Env:
     return env
 
 
-def _draws_nothing(task: TaskConfig) -> ValueError:
-    return ValueError(f"{task.env_id} draws no pictures: it has no render_mode 'rgb_array'.")
+def _draws_nothing(task: TaskConfig) -> UserError:
+    return UserError(f"{task.env_id} draws no pictures: it has no render_mode 'rgb_array'.")
 
 
 @contextlib.contextmanager
@@ -171,7 +171,7 @@ def _explained(task: TaskConfig) -> Iterator[None]:
         cause = error.__cause__
         if not isinstance(cause, gymnasium.error.Error | ImportError):
             raise
-        raise ValueError(
+        raise UserError(
             f"task.env_id={task.env_id!r} is not a task that Gymnasium can make here ({cause}). "
             "Use one of this package's (train.py --help names them), or task=gymnasium with a "
             "registered id; `module:id` imports the module that registers it."

@@ -23,7 +23,7 @@ from tqdm import tqdm
 
 from torchrl_l2c2.experiment.collection import EpisodeCollector, play_episodes
 from torchrl_l2c2.experiment.environments import TEST_SEED, make_env, simulating
-from torchrl_l2c2.experiment.errors import told_in_a_line
+from torchrl_l2c2.experiment.errors import UserError, told_in_a_line
 from torchrl_l2c2.experiment.files import make_folder_of, to_json, write_json
 from torchrl_l2c2.experiment.frames import check_finite
 from torchrl_l2c2.experiment.process import ProcessState
@@ -132,7 +132,7 @@ def evaluate_policy(
         [5, 5]
     """
     if episodes < 1:
-        raise ValueError(f"episodes must be at least 1, got {episodes}.")
+        raise UserError(f"episodes must be at least 1, got {episodes}.")
     returns: list[float] = []
     variations: list[float] = []
     lengths: list[int] = []

@@ -32,7 +32,7 @@ from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 from torchrl_l2c2.experiment.algorithms.networks import action_bounds
 from torchrl_l2c2.experiment.collection import play_episodes
 from torchrl_l2c2.experiment.environments import control_rate, untransformed
-from torchrl_l2c2.experiment.errors import told_in_a_line
+from torchrl_l2c2.experiment.errors import MissingPackageError, UserError, told_in_a_line
 from torchrl_l2c2.experiment.files import make_folder, write_atomically, write_json
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.saved import read_config, read_evaluation
@@ -109,11 +109,11 @@ def export_policy(
         ImportError: a package of the ``export`` extra is missing.
         FileNotFoundError: the folder holds no run, or no policy yet.
         OSError: the files' folder cannot be written to; no episode is played.
-        RuntimeError: the exported policy differs from PyTorch's; no file is written.
+        UserError: the exported policy differs from PyTorch's; no file is written.
     """
     missing = [name for name in NEEDED if find_spec(name) is None]
     if missing:
-        raise ImportError(
+        raise MissingPackageError(
             f'{", ".join(missing)} is missing: pip install "torchrl-l2c2[export]" brings it.'
         )
     policy, env, max_steps = load_policy(run, best=best)
@@ -182,7 +182,7 @@ def _compare(
     difference = float(np.abs(act(observations.numpy()) - expected).max())
     largest = float(np.abs(expected).max())
     if not difference <= TOLERANCE * max(1.0, largest):
-        raise RuntimeError(
+        raise UserError(
             f"the ONNX policy differs from PyTorch's by {difference:.3g} on {len(observations)} "
             f"recorded observations, where actions go up to {largest:.3g}: it was not written."
         )

@@ -17,6 +17,7 @@ from torchrl_l2c2.experiment.differences import (
     read_differences,
     write_differences,
 )
+from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.identity import BUDGETS, is_tested
 from torchrl_l2c2.experiment.saved import (
     REMEDY,
@@ -148,7 +149,7 @@ class FinishedRun:
         least = max(1, (evaluation.get("training") or {}).get("episodes", 1))
         _check_numbers(folder / "metrics.csv", metrics)
         if len(metrics) < least:
-            raise ValueError(
+            raise UserError(
                 f"{folder / 'metrics.csv'} has {len(metrics)} episodes, fewer than the {least} "
                 f"that were tested after: {REMEDY}"
             )
@@ -270,7 +271,7 @@ def finished_run(folder: str | Path, settings: dict[str, Any]) -> FinishedRun | 
     ``None`` where there is none; any number of episodes is enough for settings that want none.
 
     Raises:
-        ValueError: it is damaged.
+        UserError: it is damaged.
     """
     if not is_tested(folder, settings):
         return None
@@ -286,6 +287,6 @@ def _check_numbers(path: Path, metrics: Sequence[dict[str, str]]) -> None:
             try:
                 float(cell or "nan")
             except ValueError:
-                raise ValueError(
+                raise UserError(
                     f"{path}, line {line}: {name} is no number, but {cell!r:.40}: {REMEDY}"
                 ) from None

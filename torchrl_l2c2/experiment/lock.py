@@ -13,8 +13,10 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
+from torchrl_l2c2.experiment.errors import UserError
 
-class FolderInUseError(RuntimeError):
+
+class FolderInUseError(UserError):
     """Another process writes this folder."""
 
 

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from torchrl_l2c2.experiment.errors import OtherRunError
+from torchrl_l2c2.experiment.errors import OtherRunError, UserError
 from torchrl_l2c2.experiment.files import append_line, write_atomically
 from torchrl_l2c2.experiment.loggers import close_logger, make_logger
 
@@ -88,7 +88,7 @@ class MetricsLog:
         # Programs for tables write the lines' ends, or the numbers, in a way of their own.
         whole = written.startswith(_line(self.columns).encode()) and written.endswith(b"\n")
         if len(written) < state["size"] or not whole:
-            raise ValueError(
+            raise UserError(
                 f"{self.path} has {len(content)} bytes and is not what the checkpoint was taken "
                 f"with, of {state['size']}: it was changed since. Restore it, or choose another "
                 "folder."

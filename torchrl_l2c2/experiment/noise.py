@@ -20,7 +20,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from tqdm import tqdm
 
 from torchrl_l2c2.experiment.collection import play_episodes
-from torchrl_l2c2.experiment.errors import told_in_a_line
+from torchrl_l2c2.experiment.errors import UserError, told_in_a_line
 from torchrl_l2c2.experiment.evaluate import evaluate_policy
 from torchrl_l2c2.experiment.files import make_folder, write_atomically, write_json
 from torchrl_l2c2.experiment.finished import FinishedRun
@@ -102,9 +102,9 @@ def play_with_noise(
         FileNotFoundError: a run's policy is not there.
     """
     if bad := [level for level in levels if not 0 <= level < math.inf]:
-        raise ValueError(f"levels must be finite and at least 0, got {bad[0]}.")
+        raise UserError(f"levels must be finite and at least 0, got {bad[0]}.")
     if episodes < 1:
-        raise ValueError(f"episodes must be at least 1, got {episodes}.")
+        raise UserError(f"episodes must be at least 1, got {episodes}.")
     bar = partial(tqdm, unit="run", disable=None if progress else True, leave=False)
     scales = {}
     for task in dict.fromkeys(map(_observed, runs)):
@@ -212,7 +212,7 @@ def _visited_scale(runs: Iterable[FinishedRun], episodes: int) -> Tensor:
         env.close()
     visited = torch.cat(states)
     if len(visited) < 2:
-        raise ValueError(
+        raise UserError(
             "noise is in standard deviations of the states that are visited, of which there was "
             f"one in {episodes} episodes: play more."
         )

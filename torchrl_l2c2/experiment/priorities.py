@@ -24,12 +24,12 @@ def draw_by_priority(
         tuple: rows and their importance weights, each ``[batch_size]``.
 
     Raises:
-        RuntimeError: the priorities do not allow to draw.
+        FloatingPointError: the priorities do not allow to draw.
     """
     tree = sampler._sum_tree
     total, least = tree.query(0, stored), sampler._min_tree.query(0, stored)
     if total <= 0 or least <= 0:
-        raise RuntimeError(
+        raise FloatingPointError(
             f"priorities must be positive, got a sum of {total}, a least of {least}: a smaller "
             f"replay.alpha than {sampler._alpha} keeps small errors apart from 0."
         )

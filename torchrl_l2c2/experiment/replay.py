@@ -25,7 +25,7 @@ class PrioritizedReplayConfig:
     """Prioritized experience replay."""
 
     name: str = "prioritized"
-    capacity: int = Field(default=10_000, ge=1, description="transitions kept [paper]")
+    capacity: int = Field(default=10_000, ge=1, le=10**12, description="transitions kept [paper]")
     batch_size: int = Field(default=32, ge=1, description="transitions per update [paper]")
     alpha: float = Field(
         default=1.0, ge=0, description="exponent of the priorities; 0 is uniform [paper]"
@@ -73,7 +73,7 @@ class UniformReplayConfig:
     """Uniform experience replay."""
 
     name: str = "uniform"
-    capacity: int = Field(default=100_000, ge=1, description="transitions kept")
+    capacity: int = Field(default=100_000, ge=1, le=10**12, description="transitions kept")
     batch_size: int = Field(default=256, ge=1, description="transitions per update")
 
     def __post_init__(self) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_l2c2.experiment.config import GROUPS, NEUTRAL_SETTINGS
+from torchrl_l2c2.experiment.errors import UserError
 
 REMEDY = "it was changed or cut since it was written; restore it."
 ANEW = " Or delete it: the command that made the run tests its policy again."
@@ -26,9 +27,11 @@ def read_back(run: str | Path) -> Iterator[None]:
     """
     try:
         yield
-    except (LookupError, TypeError, AttributeError, ArithmeticError) as error:
+    except UserError:
+        raise
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         found = f"{type(error).__name__}: {error}"
-        raise ValueError(f"the run in {str(run)!r} is damaged ({found}): {REMEDY}") from error
+        raise UserError(f"the run in {str(run)!r} is damaged ({found}): {REMEDY}") from error
 
 
 def read_json(path: str | Path) -> dict[str, Any]:
@@ -41,11 +44,11 @@ def read_json(path: str | Path) -> dict[str, Any]:
         value = json.loads(_read_text(path))
     except json.JSONDecodeError as error:
         again = ANEW if Path(path).name == "evaluation.json" else ""
-        raise ValueError(f"{path} is no JSON ({error}): {REMEDY}{again}") from None
+        raise UserError(f"{path} is no JSON ({error}): {REMEDY}{again}") from None
     except RecursionError:
-        raise ValueError(f"{path} has brackets within brackets without end: {REMEDY}") from None
+        raise UserError(f"{path} has brackets within brackets without end: {REMEDY}") from None
     if not isinstance(value, dict):
-        raise ValueError(f"{path} must hold an object, {{...}}, got {value!r:.40}: {REMEDY}")
+        raise UserError(f"{path} must hold an object, {{...}}, got {value!r:.40}: {REMEDY}")
     return value
 
 
@@ -62,10 +65,10 @@ def read_rows(path: str | Path) -> tuple[list[str], list[dict[str, str]]]:
         for cells in filter(None, lines):
             if len(cells) != len(header):
                 many = f"{len(cells)} cells, where the header has {len(header)}"
-                raise ValueError(f"{path}, line {lines.line_num}: {many}: {REMEDY}")
+                raise UserError(f"{path}, line {lines.line_num}: {many}: {REMEDY}")
             rows.append(dict(zip(header, cells, strict=True)))
     except csv.Error as error:
-        raise ValueError(f"{path}, line {lines.line_num}: {error}: {REMEDY}") from None
+        raise UserError(f"{path}, line {lines.line_num}: {error}: {REMEDY}") from None
     return header, rows
 
 
@@ -80,7 +83,7 @@ def read_config(run: str | Path) -> dict[str, Any]:
     for group in ("task", "algorithm", "regularizer"):
         chosen = config.get(group)
         if not isinstance(chosen, dict) or "name" not in chosen:
-            raise ValueError(f"{path} does not name its {group}: {REMEDY}")
+            raise UserError(f"{path} does not name its {group}: {REMEDY}")
     return as_it_was(config)
 
 
@@ -116,9 +119,9 @@ def read_evaluation(run: str | Path) -> dict[str, Any]:
             value is None or isinstance(value, int | float) for value in summary.values()
         )
         if not numbers:
-            raise ValueError(f"{path} has no numbers where it must, but {test!r:.40}: {REMEDY}")
+            raise UserError(f"{path} has no numbers where it must, but {test!r:.40}: {REMEDY}")
     if not isinstance(evaluation.get("training", {}), dict):
-        raise ValueError(f"{path} must say of training what is known: {REMEDY}")
+        raise UserError(f"{path} must say of training what is known: {REMEDY}")
     return evaluation
 
 
@@ -135,4 +138,4 @@ def _read_text(path: str | Path) -> str:
             f"{path} is not there, which a run's folder has: restore it."
         ) from None
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path} is no text in UTF-8 ({error.reason}): {REMEDY}") from None
+        raise UserError(f"{path} is no text in UTF-8 ({error.reason}): {REMEDY}") from None

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from filelock import FileLock
 
-from torchrl_l2c2.experiment.errors import told_in_a_line
+from torchrl_l2c2.experiment.errors import MissingPackageError, UserError, told_in_a_line
 from torchrl_l2c2.experiment.files import make_folder
 from torchrl_l2c2.experiment.front import draw_front, front_table, front_test
 from torchrl_l2c2.experiment.lock import FolderInUseError, lock_folder
@@ -78,12 +78,14 @@ class Search:
 
     def __init__(self, folder: Path, overrides: Sequence[str], *, seed: int = 0) -> None:
         if find_spec("optuna") is None:
-            raise ImportError("Optuna is missing: pip install 'torchrl-l2c2[search]' brings it.")
+            raise MissingPackageError(
+                "Optuna is missing: pip install 'torchrl-l2c2[search]' brings it."
+            )
         self.space, self.fixed = read_space(overrides)
         if not self.space:
-            raise ValueError("nothing is searched; give a setting interval(a,b) or choice(a,b).")
+            raise UserError("nothing is searched; give a setting interval(a,b) or choice(a,b).")
         if "test_episodes=0" in self.fixed:
-            raise ValueError(f"{UNTESTED}, got 0.")
+            raise UserError(f"{UNTESTED}, got 0.")
         check_settings(overrides)
         self.folder, self._seed = make_folder(folder), seed
         self.study = self._open()
@@ -91,7 +93,7 @@ class Search:
         settings += [f"{name}={kind}" for name, kind in self.space.items()]
         begun = self.study.user_attrs.get("settings", sorted(settings))
         if begun != sorted(settings):
-            raise ValueError(
+            raise UserError(
                 f"{str(folder)!r} holds a search with {' '.join(begun)}: choose another folder."
             )
         self.study.set_user_attr("settings", begun)
@@ -123,11 +125,11 @@ class Search:
         """Gives Optuna what a trial's runs came to, and returns it: means over them.
 
         Raises:
-            RuntimeError: its runs left no results.
+            UserError: its runs left no results.
         """
         records = [run.record for run in find_runs([self._of(number)]).runs]
         if not records:
-            raise RuntimeError(f"{self.name(number)} has no results; {UNTESTED}.")
+            raise UserError(f"{self.name(number)} has no results; {UNTESTED}.")
         test = front_test(group_records(records))
         scores = {q: [record.value(test, q) for record in records] for q in SIGNS}
         values = {quantity: statistics.fmean(each) for quantity, each in scores.items()}
@@ -173,7 +175,7 @@ class Search:
                 load_if_exists=True,
             )
         except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(
+            raise UserError(
                 f"{path} is no journal of a search ({type(error).__name__}: {error}): restore it, "
                 "or choose another folder."
             ) from error
@@ -259,7 +261,7 @@ def _report(search: Search) -> None:
     folder, found = search.folder, find_runs(search.ended("COMPLETE"))
     records = [run.record for run in found.runs]
     if not records:
-        raise RuntimeError(
+        raise UserError(
             "no trial has finished: above it is said why, and in the train.log of those runs below "
             f"{str(folder)!r} that began."
         )

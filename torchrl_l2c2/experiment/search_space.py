@@ -14,6 +14,7 @@ from omegaconf import OmegaConf
 
 from torchrl_l2c2.experiment.composition import CONF, refusal, register
 from torchrl_l2c2.experiment.config import ExperimentConfig
+from torchrl_l2c2.experiment.errors import UserError
 
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
@@ -59,7 +60,7 @@ def check_settings(overrides: Sequence[str]) -> None:
     tryable = [each for each in _parsed(overrides) if not isinstance(each.value(), Glob)]
     own = [each.get_key_element() for each in tryable]
     if given := sorted({"outputs", "resume"}.intersection(own)):
-        raise ValueError(f"{given[0]} is the trials' own, below --output: leave it out.")
+        raise UserError(f"{given[0]} is the trials' own, below --output: leave it out.")
     parsed = [each for each in tryable if not each.is_hydra_override()]
     choices = [len(_tried(override)) for override in parsed]
     with initialize_config_dir(str(CONF), version_base="1.3"):
@@ -68,7 +69,7 @@ def check_settings(overrides: Sequence[str]) -> None:
             try:
                 values: Any = OmegaConf.to_container(compose("config", tried), resolve=True)
             except HydraException as error:
-                raise ValueError(refusal(error)) from error
+                raise UserError(refusal(error)) from error
             ExperimentConfig.from_dict(values)
 
 
@@ -89,7 +90,7 @@ def _parsed(overrides: Sequence[str]) -> list[Override]:
     try:
         return OverridesParser.create().parse_overrides([*overrides])
     except OverrideParseException as error:
-        raise ValueError(
+        raise UserError(
             f"{error.override!r} cannot be read: settings are NAME=VALUE in Hydra's grammar, such "
             "as regularizer.beta=interval(0,1)."
         ) from error
@@ -101,12 +102,12 @@ def _interval(override: Override) -> BaseDistribution:
     sweep: Any = override.value()
     start, end, log = sweep.start, sweep.end, "log" in sweep.tags
     if not (start <= end and math.isfinite(start) and math.isfinite(end)):
-        raise ValueError(
+        raise UserError(
             f"{override.input_line!r}: an interval goes from a finite number to one that is not "
             f"smaller, got {start:g} to {end:g}."
         )
     if log and start <= 0:
-        raise ValueError(
+        raise UserError(
             f"{override.input_line!r}: a logarithmic scale begins above 0, got {start:g}."
         )
     kind = IntDistribution if isinstance(start, int) else FloatDistribution

@@ -13,10 +13,12 @@ from typing import Annotated, Any, TypeVar, dataclass_transform, get_type_hints
 import pydantic.dataclasses
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
+from torchrl_l2c2.experiment.errors import UserError
+
 Group = TypeVar("Group")
 
 
-class SettingError(ValueError):
+class SettingError(UserError):
     """A setting that cannot be.
 
     Attributes:

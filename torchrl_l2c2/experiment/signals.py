@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NoReturn
 
+from torchrl_l2c2.experiment.errors import ChildFailedError, SimulatorError
+
 # Terminals and launchers send one signal to a process several times: to it, and to its group.
 SAME_SIGNAL_SECONDS = 1.0
 # What ended, or was to end, what went before a training: libraries swallow exceptions in places.
@@ -44,11 +46,11 @@ def terminate(number: int, frame: Any) -> NoReturn:
 def stop_on_signals() -> Iterator[list[int]]:
     """Collects SIGTERM and SIGINT in a list instead of dying; a second one acts as usual.
 
-    A signal to all processes of a job ends compilers and workers too, and what is being done then
-    fails: that is not its fault, but the signal's.
+    A signal to all processes of a job also ends compilers and workers. What fails because of that
+    was ended by the signal.
 
     Raises:
-        KeyboardInterrupt: a ``RuntimeError`` after a signal.
+        KeyboardInterrupt: a compiler or a worker failed after a signal.
     """
     received = list(_heard)
     if threading.current_thread() is not threading.main_thread():
@@ -76,8 +78,9 @@ def stop_on_signals() -> Iterator[list[int]]:
         signal.signal(number, receive)
     try:
         yield received
-    except RuntimeError as error:
-        if not received:
+    except (ChildFailedError, SimulatorError) as error:
+        child_failed = isinstance(error, ChildFailedError)
+        if not received or not (child_failed or isinstance(error.__cause__, ChildFailedError)):
             raise
         raise Terminated if received[0] == signal.SIGTERM else KeyboardInterrupt from error
     finally:

@@ -14,6 +14,8 @@ from gymnasium.wrappers import (
     TransformObservation,
 )
 
+from torchrl_l2c2.experiment.errors import UserError
+
 Env = gymnasium.Env[Any, Any]
 
 
@@ -39,7 +41,7 @@ def observing_vector(env: Env, *, flatten: bool) -> Env:
         (500,)
         >>> observing_vector(env, flatten=False)
         Traceback (most recent call last):
-        ValueError: the task observes a Discrete, not a vector of numbers: task.flatten=true makes one of it.
+        torchrl_l2c2.experiment.errors.UserError: the task observes a Discrete, not a vector of numbers: task.flatten=true makes one of it.
     """  # noqa: E501
     space: Any = env.observation_space
     entries = list(space.spaces.values()) if isinstance(space, spaces.Dict) else [space]
@@ -75,14 +77,14 @@ def observing_image(env: Env) -> Env:
     """
     space: Any = env.observation_space
     if not isinstance(space, spaces.Box) or len(space.shape) not in (2, 3):
-        raise ValueError(
+        raise UserError(
             f"task.images=true: the task observes a {_kind(space)}, not an image of shape "
             "[height, width, channels], [channels, height, width] or [height, width]: leave "
             "task.images at false for numbers."
         )
     low, high = float(space.low.min()), float(space.high.max())
     if not (np.isfinite(low) and np.isfinite(high) and low < high):
-        raise ValueError(
+        raise UserError(
             f"task.images=true: the image's values lie from {low:g} to {high:g}; they need bounds: "
             "give its space some, in a gymnasium.ObservationWrapper."
         )
@@ -109,7 +111,7 @@ def taking_vector(env: Env) -> Env:
         return CountedFromZero(env) if space.start else env
     vector = isinstance(space, spaces.Box) and len(space.shape) == 1
     if not vector or not np.issubdtype(space.dtype, np.floating):
-        raise ValueError(
+        raise UserError(
             f"the task takes a {_kind(space)}; actions must be one vector of floats or one "
             "Discrete number: wrap the task in a gymnasium.ActionWrapper, and register that."
         )
@@ -155,7 +157,7 @@ def _check_entry(space: Any, *, flatten: bool) -> None:
         todo = "task.flatten=true makes one of it."
     else:
         todo = "make one of it in a gymnasium.ObservationWrapper, and register that."
-    raise ValueError(f"the task observes a {_kind(space)}, not a vector of numbers: {todo}")
+    raise UserError(f"the task observes a {_kind(space)}, not a vector of numbers: {todo}")
 
 
 def _kind(space: Any) -> str:

@@ -33,7 +33,7 @@ from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
-from torchrl_l2c2.experiment.errors import told_in_a_line
+from torchrl_l2c2.experiment.errors import UserError, told_in_a_line
 from torchrl_l2c2.experiment.files import make_folder
 from torchrl_l2c2.experiment.settings import SettingError
 from torchrl_l2c2.experiment.signals import FINISHING, SAME_SIGNAL_SECONDS, terminate
@@ -67,13 +67,13 @@ class Sweep:
         """The sweep that this job belongs to.
 
         Raises:
-            RuntimeError: the launcher told the job nothing of it, or its folder is nowhere here.
+            UserError: the launcher told the job nothing of it, or its folder is nowhere here.
         """
         if VARIABLE not in os.environ:
-            raise RuntimeError(f"the launcher passes no {VARIABLE} on to the jobs' environment.")
+            raise UserError(f"the launcher passes no {VARIABLE} on to the jobs' environment.")
         folder, (host, process), overrides, _ = json.loads(os.environ[VARIABLE])
         if not Path(folder).parent.is_dir():
-            raise RuntimeError(
+            raise UserError(
                 f"{str(Path(folder).parent)!r} is not on {socket.gethostname()}: choose an outputs "
                 "folder on a file system that all machines share."
             )

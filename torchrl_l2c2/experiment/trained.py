@@ -16,6 +16,7 @@ from torchrl.envs import EnvBase
 from torchrl_l2c2.experiment.checkpoints import CheckpointError, load_newest
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.environments import TEST_SEED, make_env
+from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.files import write_atomically
 from torchrl_l2c2.experiment.saved import REMEDY, read_config
 from torchrl_l2c2.experiment.settings import SettingError
@@ -129,7 +130,7 @@ def _check_origin(env_id: str, folder: Path) -> None:
     run = folder.resolve()
     for place in [Path(place).resolve() for place in places or ()]:
         if place in (run, *run.parents) or run in place.parents:
-            raise ValueError(
+            raise UserError(
                 f"{folder / 'config.json'}: task.env_id={env_id!r} would execute {place}, which is "
                 "no module of yours but comes with the run. Put it beside your own code if you "
                 "trust it, or install it."

@@ -18,7 +18,7 @@ from tensordict import TensorDictBase
 
 from torchrl_l2c2.experiment.collection import play_episodes
 from torchrl_l2c2.experiment.environments import control_rate, make_env, untransformed
-from torchrl_l2c2.experiment.errors import told_in_a_line
+from torchrl_l2c2.experiment.errors import MissingPackageError, UserError, told_in_a_line
 from torchrl_l2c2.experiment.files import make_folder_of
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.tasks import TaskConfig
@@ -41,11 +41,13 @@ def check_video(path: str | Path | None = None) -> None:
         OSError: its folder cannot be written to.
     """
     if find_spec("imageio_ffmpeg") is None:
-        raise ImportError('imageio-ffmpeg is missing: pip install "torchrl-l2c2[video]" brings it.')
+        raise MissingPackageError(
+            'imageio-ffmpeg is missing: pip install "torchrl-l2c2[video]" brings it.'
+        )
     if path is None:
         return
     if Path(path).suffix.lower() not in ENDINGS:
-        raise ValueError(f"a video's file ends in {', '.join(ENDINGS)}, got {str(path)!r}.")
+        raise UserError(f"a video's file ends in {', '.join(ENDINGS)}, got {str(path)!r}.")
     make_folder_of(path)
 
 
@@ -95,7 +97,7 @@ def record_video(
     """
     check_video(path)
     if episodes < 1:
-        raise ValueError(f"episodes must be at least 1, got {episodes}.")
+        raise UserError(f"episodes must be at least 1, got {episodes}.")
     path = Path(path or Path(run) / "video.mp4")
     played = play_pictures(run, episodes, seed=seed, noise_scale=noise_scale, best=best)
     rate = played[0][2]

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import atexit
+import json
 import os
 import signal
 import tempfile
+import traceback
 import weakref
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -27,6 +29,7 @@ from torchrl_l2c2.experiment.algorithms.agent import Agent
 from torchrl_l2c2.experiment.collection import EpisodeCollector
 from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.environments import make_env
+from torchrl_l2c2.experiment.errors import ChildFailedError
 from torchrl_l2c2.experiment.rollouts import RolloutCollector
 from torchrl_l2c2.experiment.settings import SettingError
 
@@ -117,7 +120,8 @@ class MultiEpisodeCollector(_Rounds, MultiSyncCollector):
         keep_previous (bool): as for :class:`EpisodeCollector`. Default ``False``.
 
     Raises:
-        RuntimeError: an environment or a policy failed in a process, or the process died.
+        RuntimeError: an environment or a policy failed in a process.
+        ChildFailedError: a process died.
 
     Examples:
         >>> from functools import partial
@@ -190,9 +194,12 @@ class MultiEpisodeCollector(_Rounds, MultiSyncCollector):
             episodes = next(self._rounds).unbind(0)
         except (OSError, EOFError, ValueError, RuntimeError) as error:
             # Pipes and process handles of one that died fail in their own ways.
-            left = [path.read_text() for path in Path(self._failures.name).iterdir()]
-            told = left[0] if left else f"{type(error).__name__}: {error}"
-            raise RuntimeError(f"a worker process died ({told}).") from error
+            for path in Path(self._failures.name).iterdir():
+                told, lines = json.loads(path.read_text())
+                cause = RuntimeError(f"in the worker:\n{lines}")
+                raise RuntimeError(f"a worker process died ({told}).") from cause
+            told = f"{type(error).__name__}: {error}"
+            raise ChildFailedError(f"a worker process died ({told}).") from error
         self._rounds_played += 1
         return [episode.exclude("collector") for episode in episodes]
 
@@ -299,7 +306,8 @@ class _EpisodeWorker(EpisodeCollector):
         except Exception as error:
             if self._failures is not None:
                 left = Path(self._failures, str(os.getpid()))
-                left.write_text(f"{type(error).__name__}: {error}")
+                told = f"{type(error).__name__}: {error}"
+                left.write_text(json.dumps([told, traceback.format_exc()]))
             raise
         # The parent counts frames by this entry.
         return episode.set(("collector", "traj_ids"), torch.zeros(len(episode), dtype=torch.int64))

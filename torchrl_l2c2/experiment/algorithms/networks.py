@@ -24,6 +24,7 @@ from torchrl.modules import (
     ValueOperator,
 )
 
+from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.modules import EncodedNetwork
 
 
@@ -42,21 +43,21 @@ def check_actions(
             have no bounds to be squashed into, or none to draw between.
     """
     if env.action_spec.dtype.is_floating_point != continuous:
-        raise ValueError(
+        raise UserError(
             f"algorithm={algorithm} needs {'continuous' if continuous else 'discrete'} actions, "
             f"this task's are {type(env.action_spec).__name__} of shape "
             f"{tuple(env.action_spec.shape)}: use algorithm="
             f"{'dqn' if continuous else 'ppo_rpe'}, or another one that takes them."
         )
     if squashed and not _bounded(env.action_spec):
-        raise ValueError(
+        raise UserError(
             f"algorithm={algorithm} squashes actions into their bounds, and this task's have none: "
             "use algorithm=ppo_rpe with algorithm.squash=none, or register the task with a "
             "gymnasium.ActionWrapper that has bounds."
         )
     bounds = action_bounds(env) if squashed and drawn else ()
     if bounds and (still := (bounds[0] >= bounds[1]).nonzero().flatten().tolist()):
-        raise ValueError(
+        raise UserError(
             f"algorithm={algorithm} squashes actions into their bounds, and entries {still} of "
             "this task's can take one value alone: register the task with a "
             "gymnasium.ActionWrapper that leaves them out."

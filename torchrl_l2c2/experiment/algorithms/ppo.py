@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 from pydantic import Field
 
 from torchrl_l2c2.experiment.algorithms.base import AlgorithmConfig, Layers
+from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.settings import SettingError, settings
 
 if TYPE_CHECKING:
@@ -161,7 +162,7 @@ class PPOConfig(AlgorithmConfig):
             return None
         shape = env.observation_spec["observation"].shape
         if len(shape) != 1:
-            raise ValueError(
+            raise UserError(
                 "algorithm.normalize_observations and normalize_rewards are of tasks that show one "
                 f"vector, this one shows an image of shape {tuple(shape)}: set both to false."
             )

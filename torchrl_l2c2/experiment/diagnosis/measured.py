@@ -17,6 +17,7 @@ from torchrl.envs import EnvBase, ExplorationType, GymWrapper, set_exploration_t
 
 from torchrl_l2c2._checks import check_positive_int, check_real
 from torchrl_l2c2.experiment.environments import control_rate, untransformed
+from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.evaluate import LEAST_STEPS, measure
 from torchrl_l2c2.experiment.frames import check_finite
 from torchrl_l2c2.metrics import action_variation, local_lipschitz, noise_sensitivity
@@ -193,7 +194,7 @@ def diagnose(
         played = [env.rollout(max_steps, policy).detach() for _ in range(episodes)]
     lengths = [len(episode) for episode in played]
     if min(lengths) < LEAST_STEPS:
-        raise ValueError(
+        raise UserError(
             f"an episode of {min(lengths)} steps is too short to be diagnosed: it needs "
             f"{LEAST_STEPS}. Give a larger max_steps, or a policy that lasts longer."
         )
@@ -244,8 +245,7 @@ def _observed(policy: TensorDictModule, env: EnvBase) -> NestedKey:
             f"one environment is diagnosed, got a batch of {tuple(env.batch_size)}: give the one "
             "that it is made of."
         )
-    keys = list(policy.in_keys)
-    if len(keys) != 1:
+    if len(keys := list(policy.in_keys)) != 1:
         raise ValueError(
             f"the policy must read one observation, this one reads {keys}: join them with "
             "torchrl.envs.CatTensors."

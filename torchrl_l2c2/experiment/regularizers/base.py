@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
 
+from torchrl_l2c2.experiment.errors import raised_by_component
 from torchrl_l2c2.experiment.settings import SettingError, settings
 
 if TYPE_CHECKING:
@@ -66,6 +67,8 @@ class RegularizerConfig:
         try:
             return self.wrap(loss)
         except TypeError as error:
+            if not raised_by_component(error):
+                raise
             raise SettingError("", f"regularizer={self.name}: {error}") from error
 
     def neighbors(self, generator: torch.Generator) -> NeighborTransform | None:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from itertools import chain
 from pathlib import Path
 
-from torchrl_l2c2.experiment.errors import told_in_a_line
+from torchrl_l2c2.experiment.errors import UserError, told_in_a_line
 from torchrl_l2c2.experiment.finished import FinishedRun, Record
 from torchrl_l2c2.experiment.reports.records import merge, read_records, write_records
 from torchrl_l2c2.experiment.reports.report import write_report
@@ -89,7 +89,7 @@ def _read(
     records = merge([], chain.from_iterable(map(read_records, chosen.records)))
     if not records:
         named = ", ".join(map(repr, chosen.records))
-        raise ValueError(f"no record of a run in {named}; make them with --csv.")
+        raise UserError(f"no record of a run in {named}; make them with --csv.")
     return records, [], []
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_l2c2.experiment.differences import read_differences
+from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.files import make_folder, write_atomically
 from torchrl_l2c2.experiment.finished import Record
 from torchrl_l2c2.experiment.reports.names import method_order
@@ -39,14 +40,14 @@ def read_records(path: str | Path) -> list[Record]:
     """Reads what :func:`write_records` wrote; an empty or absent file has none.
 
     Raises:
-        ValueError: the file has other columns, a line that is cut, or a cell that is no number
+        UserError: the file has other columns, a line that is cut, or a cell that is no number
             where one must be.
     """
     path = Path(path)
     columns, lines = read_rows(path) if path.exists() else ([], [])
     names = [field.name for field in fields(Record)]
     if columns and columns != names:
-        raise ValueError(f"{path} has the columns {columns}; they must be {names}.")
+        raise UserError(f"{path} has the columns {columns}; they must be {names}.")
     return merge([], (_parse(path, number, line) for number, line in enumerate(lines, start=2)))
 
 
@@ -104,4 +105,4 @@ def _parse(path: Path, number: int, line: dict[str, str]) -> Record:
             raise ValueError(f"length must be '<N> episodes' or frames, got {line['length']!r}")
         return Record(**{f.name: readers[str(f.type)](line[f.name]) for f in fields(Record)})
     except ValueError as error:
-        raise ValueError(f"{path}, line {number}: {error}.") from None
+        raise UserError(f"{path}, line {number}: {error}.") from None

@@ -1,0 +1,161 @@
+"""Which errors a command shows in one line, and which with a traceback."""
+
+import pytest
+import torch
+from processes import run_train
+
+from torchrl_l2c2.experiment.checkpoints import CheckpointError
+from torchrl_l2c2.experiment.command import _tell
+from torchrl_l2c2.experiment.errors import (
+    MissingPackageError,
+    SimulatorError,
+    UserError,
+    told_in_a_line,
+)
+from torchrl_l2c2.experiment.lock import FolderInUseError
+from torchrl_l2c2.experiment.settings import SettingError
+
+TOLD = [
+    UserError("a mistake"),
+    SettingError("seed", "must be at least 0, got -1."),
+    CheckpointError("cut short"),
+    FolderInUseError("in use"),
+    MissingPackageError("onnx is missing"),
+    OSError("no space left"),
+    FloatingPointError("reward is not finite"),
+    SimulatorError("failed beyond frame 3"),
+]
+BUGS = [
+    ValueError("unknown mode"),
+    TypeError("not callable"),
+    RuntimeError("cannot reallocate the plan"),
+    NotImplementedError("soon"),
+    ImportError("cannot import name 'smooth'"),
+    KeyError("observation"),
+]
+
+
+@pytest.mark.parametrize("error", TOLD, ids=lambda error: type(error).__name__)
+def test_what_a_user_can_mend_is_one_line(error, capsys):
+    """In the command that trains, and in all others."""
+    assert str(error) in _tell(error)
+    assert capsys.readouterr().err.startswith(f"error: {error}")
+    with pytest.raises(SystemExit) as ended, told_in_a_line():
+        raise error
+    assert ended.value.code == f"error: {error}"
+
+
+@pytest.mark.parametrize("error", BUGS, ids=lambda error: type(error).__name__)
+def test_a_bug_is_a_traceback(error, capsys):
+    """Only its first line is kept for a sweep's end."""
+    with pytest.raises(type(error)), told_in_a_line():
+        raise error
+    assert _tell(error) == f"{type(error).__name__}: {error}"
+    told = capsys.readouterr().err
+    assert told.startswith("Traceback (most recent call last):") and "error: " not in told
+
+
+def test_an_error_without_a_text_has_its_name():
+    """For a sweep's end."""
+    assert _tell(AssertionError()) == "AssertionError"
+
+
+def too_large(size):
+    with pytest.raises((RuntimeError, MemoryError)) as refused:
+        torch.empty(size)
+    return refused.value
+
+
+@pytest.mark.parametrize(
+    "error",
+    [MemoryError("std::bad_alloc"), torch.OutOfMemoryError("CUDA"), 10**15, 2**61],
+    ids=["C++", "GPU", "CPU", "any machine"],
+)
+def test_too_little_memory_is_told_with_the_settings_that_need_it(error):
+    """PyTorch's own errors on the CPU are plain RuntimeErrors."""
+    error = too_large(error) if isinstance(error, int) else error
+    told = _tell(error)
+    assert "There is no memory for it: choose smaller algorithm.hidden, replay.capacity" in told
+
+
+# A regularizer and an algorithm of a user's own, which a line each makes known to the command.
+OWN = """
+import sys
+from torchrl_l2c2.experiment.algorithms import ALGORITHMS, PPORPEConfig
+from torchrl_l2c2.experiment.command import main
+from torchrl_l2c2.experiment.regularizers import REGULARIZERS
+from torchrl_l2c2.experiment.regularizers.base import RegularizerConfig
+from torchrl_l2c2.experiment.settings import settings
+
+BUG = sys.argv.pop()
+
+@settings
+class OwnRegularizer(RegularizerConfig):
+    'A regularizer.'
+    name: str = "own"
+
+    def wrap(self, loss):
+        from torchrl_l2c2 import RegularizedLoss
+
+        class OwnLoss(RegularizedLoss):
+            def __init__(self, base_loss):
+                self.declare_networks(["actor_network"])
+                self.declare_terms(policy=["loss_own"])
+                if BUG == "constructor":
+                    raise ValueError("not the mode of 1999")
+                if BUG == "call":
+                    len(5)
+
+            def policy_regularizer(self, tensordict):
+                if BUG == "term":
+                    raise RuntimeError("cannot reallocate the plan")
+                terms = super().policy_regularizer(tensordict)
+                states = tensordict.select("observation")[None]
+                _, mean = self.policies_at(tensordict, states)
+                return terms.set("loss_own", mean.loc.square().mean())
+
+        return OwnLoss(loss)
+
+@settings
+class OwnAlgorithm(PPORPEConfig):
+    'An algorithm.'
+    name: str = "own"
+
+    def make_agent(self, env, regularizer, optimizer):
+        agent = super().make_agent(env, regularizer, optimizer)
+        agent.policy.register_forward_pre_hook(limp)
+        return agent
+
+def limp(policy, inputs):
+    if BUG == "policy":
+        raise IndexError("no joint 9")
+
+REGULARIZERS["own"], ALGORITHMS["own"] = OwnRegularizer(), OwnAlgorithm()
+if __name__ == "__main__":
+    main()
+"""
+
+
+@pytest.mark.parametrize(
+    ("bug", "line", "told"),
+    [
+        ("constructor", "in __init__", "ValueError: not the mode of 1999"),
+        ("call", "len(5)", "TypeError: object of type 'int' has no len()"),
+        ("term", "in policy_regularizer", "RuntimeError: cannot reallocate the plan"),
+        ("policy", "in limp", "IndexError: no joint 9"),
+    ],
+)
+def test_a_bug_in_a_users_own_code_shows_its_traceback_and_logs_it(tmp_path, bug, line, told):
+    """Wherever it is: in a constructor, in a term of the loss, in the policy."""
+    script, run = tmp_path / "own.py", tmp_path / "run"
+    script.write_text(OWN)
+    settings = (
+        "task=gymnasium", "task.env_id=Pendulum-v1", "task.episodes=2", "task.max_steps=40",
+        "algorithm=own", "regularizer=own", "replay=prioritized", "optimizer=adam",
+        "compile=false", "test_episodes=1", f"hydra.run.dir={run}",
+    )  # fmt: skip
+    done = run_train(*settings, bug, cwd=tmp_path, check=False, script=script)
+    assert done.returncode == 1
+    for text in (done.stderr, (run / "train.log").read_text()):
+        assert "Traceback (most recent call last):" in text
+        assert str(script) in text and line in text and told in text
