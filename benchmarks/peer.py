@@ -80,7 +80,7 @@ def _train_here(
 
     keep_freed_memory()  # As train.py does.
     task = TaskConfig(
-        env_id=settings["env_id"], max_steps=settings["frames"], episodes=1, noise_scale=0.0
+        "peer", settings["env_id"], max_steps=settings["frames"], episodes=1, noise_scale=0.0
     )
     experiment = Experiment(
         ExperimentConfig(

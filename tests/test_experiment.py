@@ -435,9 +435,7 @@ ALGORITHMS = {
 def test_every_algorithm_learns_from_its_batches(name, regularizer):
     """Updates happen, every parameter group moves, and the regularizer's terms are there."""
     discrete = name == "dqn"
-    task = replace(
-        PENDULUM, env_id="CartPole-v1" if discrete else "Pendulum-v1", episodes=8 if discrete else 2
-    )
+    task = TaskConfig("cartpole", "CartPole-v1", 0.01, 8, 40) if discrete else PENDULUM
     batches = (
         RolloutReplayConfig(batch_size=32) if name == "ppo" else UniformReplayConfig(batch_size=32)
     )

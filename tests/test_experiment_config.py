@@ -5,6 +5,7 @@ import inspect
 import subprocess
 import sys
 from contextlib import nullcontext
+from dataclasses import replace
 from functools import partial
 from itertools import zip_longest
 from pathlib import Path
@@ -30,7 +31,6 @@ from torchrl_l2c2.experiment.composition import (
     check_budget,
     check_folders,
     check_preset,
-    check_simulator,
     preset_used,
 )
 from torchrl_l2c2.experiment.config import GROUPS
@@ -41,7 +41,7 @@ from torchrl_l2c2.experiment.regularizers import (
     preset_settings,
 )
 from torchrl_l2c2.experiment.settings import SettingError, describe
-from torchrl_l2c2.experiment.tasks import FIELD_TASKS, PAPER_TASKS
+from torchrl_l2c2.experiment.tasks import FIELD_TASKS, PAPER_TASKS, TASKS
 from torchrl_l2c2.presets import KINDS, preset
 
 ROOT = Path(__file__).parent.parent
@@ -262,12 +262,40 @@ def test_episodes_beside_a_presets_frames_are_refused():
 
 def test_another_simulator_is_no_named_task():
     """It would have the task's length, noise and place in tables."""
-    config = ExperimentConfig.from_dict(composed("task=reacher", "task.env_id=Pendulum-v1"))
-    with pytest.raises(SettingError, match=r"of task=reacher is .*: task=gymnasium task.env_id="):
-        check_simulator(config)
-    check_simulator(ExperimentConfig.from_dict(composed("task=reacher")))
-    own = composed("task=gymnasium", "task.env_id=Pendulum-v1")
-    check_simulator(ExperimentConfig.from_dict(own))
+    told = r"^task.env_id must be .*Reacher.* with name='reacher', .*task.env_id=Pend"
+    with pytest.raises(SettingError, match=told):
+        ExperimentConfig.from_dict(composed("task=reacher", "task.env_id=Pendulum-v1"))
+    assert ExperimentConfig.from_dict(composed("task=reacher")).task == TASKS["reacher"]
+    own = ExperimentConfig.from_dict(composed("task=gymnasium", "task.env_id=Pendulum-v1"))
+    assert (own.task.name, own.task.env_id) == ("Pendulum-v1", "Pendulum-v1")
+
+
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [
+        (
+            lambda: TaskConfig("pendulum"),
+            r"with name='pendulum': write TASKS\['pendulum'\]\.$",
+        ),
+        (lambda: TaskConfig(name="ant", episodes=3), r"name='ant': write TASKS\['ant'\]\.$"),
+        (lambda: TaskConfig("my_robot"), r"'my_robot': write TaskConfig\('my_robot', ENV_ID\)\.$"),
+        (
+            lambda: TaskConfig("hopper", "Hopper-v5"),
+            "HopperBullet.* name='hopper', got Hopper",
+        ),
+        (lambda: TaskConfig(env_id="Pendulum-v1"), "Swingup.* with name='swingup', got Pendulum"),
+        (lambda: replace(TASKS["ant"], name="reacher"), "Reacher.* name='reacher', got pybullet"),
+    ],
+)
+def test_a_task_in_python_has_the_simulator_of_its_name(make, told):
+    """It was Swingup, whatever the name was."""
+    with pytest.raises(SettingError, match=rf"^TaskConfig.env_id must be .*{told}"):
+        make()
+
+
+def test_swingup_may_have_another_name():
+    """If it is said that it is meant."""
+    assert TaskConfig("quiet", TaskConfig().env_id, 0.0).env_id == TaskConfig("swingup").env_id
 
 
 @pytest.mark.parametrize("name", ["hydra.sweep.dir", "hydra.run.dir"])

@@ -152,7 +152,7 @@ def test_the_policy_is_updated_at_every_so_many_updates(delay):
 def test_epsilon_falls_with_the_frames_of_an_episode():
     """And not by one step for each."""
     algorithm = DQNConfig(hidden=(8,), schedule="episode", epsilon_end=0.0, epsilon_frames=1000)
-    task = replace(PENDULUM, env_id="CartPole-v1")
+    task = replace(PENDULUM, name="cartpole", env_id="CartPole-v1")
     others = {"replay": UniformReplayConfig(), "optimizer": AdamConfig()}
     none = NoRegularizerConfig()
     run = Experiment(small(task=task, algorithm=algorithm, regularizer=none, **others))

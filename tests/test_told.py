@@ -32,7 +32,7 @@ PENDULUM = TaskConfig("pendulum", "Pendulum-v1", episodes=2, max_steps=40)
 
 def make(name, folder=None, **settings):
     values = {
-        "task": replace(PENDULUM, env_id=env_id_of(name)),
+        "task": replace(PENDULUM, name="task", env_id=env_id_of(name)),
         "algorithm": ALGORITHMS[name],
         "replay": replay_of(name),
         "optimizer": AdamConfig(),

@@ -24,7 +24,6 @@ from torchrl_l2c2.experiment.manual import manual
 from torchrl_l2c2.experiment.naming import run_name
 from torchrl_l2c2.experiment.regularizers import BEGIN_WITH_PRESET, preset_settings
 from torchrl_l2c2.experiment.settings import SettingError, describe
-from torchrl_l2c2.experiment.tasks import TASKS
 from torchrl_l2c2.presets import KINDS, preset
 
 PACKAGE = Path(__file__).parents[1]
@@ -83,7 +82,6 @@ def read(values: dict[str, Any]) -> tuple[ExperimentConfig, Path]:
         values[name] = folder_named(name, values[name])
     config = ExperimentConfig.from_dict(values)
     check_budget(config, chosen.overrides.task)
-    check_simulator(config)
     multirun = chosen.mode == RunMode.MULTIRUN
     if multirun:
         check_folders(chosen, values["outputs"])
@@ -126,21 +124,6 @@ def check_budget(config: ExperimentConfig, given: Sequence[str]) -> None:
             "task.episodes",
             f"is not read where there is task.frames, here {config.task.frames}: give "
             "task.frames=... instead, or task.frames=null beside it.",
-        )
-
-
-def check_simulator(config: ExperimentConfig) -> None:
-    """Refuses another simulator under the name of a task, whose settings are of its own.
-
-    Raises:
-        SettingError: with what to give instead.
-    """
-    task = config.task
-    if task.name in TASKS and task.env_id != (own := TASKS[task.name].env_id):
-        raise SettingError(
-            "task.env_id",
-            f"of task={task.name} is {own}, got {task.env_id}: task=gymnasium "
-            f"task.env_id={task.env_id} is a task by itself.",
         )
 
 

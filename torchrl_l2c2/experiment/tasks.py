@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
+from pydantic_core import ArgsKwargs
 
 from torchrl_l2c2.experiment.settings import SettingError, settings
 
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
     from torchrl.envs import EnvBase
 
 SWINGUP = "pybullet_envs_gymnasium:InvertedPendulumSwingupBulletEnv-v0"
+TASKS: dict[str, TaskConfig] = {}  # by their names; filled below
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,24 @@ class TaskConfig:
         "values from 0 to 1; the replay buffer keeps two of them for every transition, as floats",
     )
 
+    @model_validator(mode="before")
+    @classmethod
+    def _check_env_id_given(cls, given: ArgsKwargs) -> ArgsKwargs:
+        """Refuses a name without a simulator, which would be Swingup's."""
+        values = given.kwargs or {}
+        name = given.args[0] if given.args else values.get("name", "swingup")
+        if len(given.args) < 2 and "env_id" not in values and name != "swingup":
+            instead = f"TASKS[{name!r}]" if name in TASKS else f"TaskConfig({name!r}, ENV_ID)"
+            raise SettingError("env_id", f"must be given with name={name!r}: write {instead}.")
+        return given
+
     def __post_init__(self) -> None:
+        if self.name in TASKS and self.env_id != (own := TASKS[self.name].env_id):
+            raise SettingError(
+                "env_id",
+                f"must be {own} with name={self.name!r}, got {self.env_id}: give another name (in "
+                f"a shell, task=gymnasium task.env_id={self.env_id}).",
+            )
         if self.images and self.flatten:
             raise SettingError("images", "and flatten exclude each other: leave one at false.")
         if self.noise_scale is None:
@@ -134,4 +153,4 @@ FIELD_TASKS: dict[str, TaskConfig] = {
     "hopper_v5": TaskConfig("hopper_v5", "Hopper-v5"),
     "walker2d_v5": TaskConfig("walker2d_v5", "Walker2d-v5"),
 }
-TASKS: dict[str, TaskConfig] = {**PAPER_TASKS, **FIELD_TASKS}
+TASKS.update(PAPER_TASKS | FIELD_TASKS)
