@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictPrioritizedReplayBuffer
 
-from torchrl_l2c2.experiment.priorities import draw_by_priority, set_priorities
+from torchrl_l2c2.experiment.priorities import draw_by_priority, leave_out, set_priorities
 from torchrl_l2c2.experiment.replay import replay_state
 
 logging.getLogger("torchrl").setLevel(logging.ERROR)
@@ -80,3 +80,31 @@ def test_priorities_that_are_not_positive_are_refused():
     buffer.sampler._min_tree[3] = 0.0
     with pytest.raises(FloatingPointError, match="positive"):
         draw_by_priority(buffer.sampler, 40, 16)
+
+
+def test_a_row_that_is_left_out_is_drawn_no_more_and_weighs_on_no_other():
+    """As if it were not there; until something else is stored in its place."""
+    buffer = filled(40)
+    least = int(torch.from_numpy(buffer.sampler._sum_tree[torch.arange(40).numpy()]).argmin())
+    leave_out(buffer.sampler, torch.tensor([least, 7]))
+    drawn, weights = zip(
+        *(draw_by_priority(buffer.sampler, 40, 16) for _ in range(500)), strict=True
+    )
+    rows = torch.cat(drawn)
+    assert not {least, 7} & {*rows.tolist()}
+    others = torch.tensor([row for row in range(40) if row not in (least, 7)])
+    known = torch.from_numpy(buffer.sampler._sum_tree[others.numpy()])
+    expected = (torch.from_numpy(buffer.sampler._sum_tree[rows.numpy()]) / known.min()) ** -0.5
+    assert torch.allclose(torch.cat(weights), expected)
+    buffer.extend(TensorDict({"row": torch.arange(50)}, [50]))  # the capacity
+    assert draw_by_priority(buffer.sampler, 50, 16) and buffer.sampler._sum_tree[7] > 0
+    assert buffer.sampler._min_tree[7] == buffer.sampler._sum_tree[7]
+
+
+def test_the_first_row_may_be_left_out():
+    """Where a draw of exactly 0 leads to it, there is none before."""
+    buffer = filled(40)
+    leave_out(buffer.sampler, torch.arange(3))
+    buffer.sampler._sum_tree = Misled(buffer.sampler._sum_tree, 1)
+    rows, _ = draw_by_priority(buffer.sampler, 40, 16)
+    assert (rows == 3).all()

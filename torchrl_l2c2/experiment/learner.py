@@ -23,6 +23,8 @@ from torchrl_l2c2.gains import gradient_shares, is_loss
 # a policy that begins flat, as PPO's with orthogonal weights, grows while the policy forms.
 MEASURED_AFTER = 100
 TOLD_BELOW = 1e-4
+# Skipped updates in a row after which a run stops.
+MOST_SKIPPED = 100
 
 
 def untrained(frames: int, updates: int, random_frames: int) -> str | None:
@@ -78,6 +80,7 @@ class Learner:
         self.replay = replay
         self.updates = 0
         self.skipped_updates = 0
+        self._skipped_in_a_row = 0
         self.first_update_seconds: float | None = None
         self.tells_faint_regularizer = True
         self.at_full_gain: Callable[[], AbstractContextManager[None]] = nullcontext
@@ -124,10 +127,13 @@ class Learner:
 
     def learn_rollout(self, epochs: int) -> None:
         """Goes so many times through all that is remembered, and forgets it."""
+        skipped = self._skipped_in_a_row
         for _ in range(epochs):
             self.replay.sampler.ran_out = False
             while not self.replay.sampler.ran_out:
                 self._update()
+        if skipped < MOST_SKIPPED // 2:  # A rollout is forgotten: a single one stops no run.
+            self._skipped_in_a_row = min(self._skipped_in_a_row, MOST_SKIPPED // 2)
         self._learned_from = self.update.example()
         self.replay.empty()
         self.agent.refresh_policy()
@@ -144,7 +150,9 @@ class Learner:
             self.first_update_seconds = time.monotonic() - started
         if result is None:
             self.skipped_updates += 1
+            self._skipped_in_a_row += 1
             return
+        self._skipped_in_a_row = 0
         self.updates += 1
         self.unreported.append(result[0])
         if self.updates == MEASURED_AFTER and self.tells_faint_regularizer:
@@ -181,8 +189,9 @@ class Learner:
 
         Raises:
             FloatingPointError: an entry was NaN or infinite, or a parameter is now; names it, the
-                update and the frame.
+                update and the frame. Or too many updates in a row were skipped.
         """
+        self._check_skipped(last_frame)
         keys, terms = self.agent.loss.out_keys, self.unreported
         self.unreported = []
         if terms:
@@ -199,6 +208,17 @@ class Learner:
             k.replace("loss", "share"): v / total if total else 0.0 for k, v in losses.items()
         }
         return {**means, **shares}
+
+    def _check_skipped(self, last_frame: int) -> None:
+        if self._skipped_in_a_row < MOST_SKIPPED:
+            return
+        row, reward = self.update.culprit
+        raise FloatingPointError(
+            f"{self._skipped_in_a_row} updates in a row were skipped after update {self.updates} "
+            f"(frame {last_frame}), as a loss or gradient was not finite. Row {row} of the replay "
+            f"buffer has the reward {reward / self._reward_factor:g}: give smaller rewards, or "
+            "lower algorithm.reward_scale."
+        )
 
     def check_parameters(self) -> None:
         """Stops at a parameter that is not finite.

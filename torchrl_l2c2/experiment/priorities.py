@@ -38,8 +38,9 @@ def draw_by_priority(
     priorities = tree[rows.numpy()]
     while not priorities.all():  # Rounding has led to one that cannot be drawn.
         rows = rows - torch.from_numpy(priorities == 0).long()
-        if int(rows.min()) < 0:
-            raise RuntimeError("no row with a positive priority was found")
+        if int(rows.min()) < 0:  # The first rows have none.
+            known = torch.from_numpy(tree[torch.arange(stored).numpy()])
+            rows = torch.where(rows < 0, known.nonzero()[0], rows)
         priorities = tree[rows.numpy()]
     return rows, torch.pow(torch.from_numpy(priorities) / least, -sampler._beta)
 
@@ -59,3 +60,12 @@ def set_priorities(sampler: PrioritizedSampler, rows: Tensor, priority: Tensor) 
     transformed = torch.pow(priority + sampler._eps, sampler._alpha).numpy()
     for tree in (sampler._sum_tree, sampler._min_tree):
         tree[rows.numpy()] = transformed
+
+
+def leave_out(sampler: PrioritizedSampler, rows: Tensor) -> None:
+    """Has rows drawn no more, until something else is stored in their place.
+
+    They count for no other row's importance weight, either.
+    """
+    sampler._sum_tree[rows.numpy()] = torch.zeros(len(rows)).numpy()
+    sampler._min_tree[rows.numpy()] = torch.full((len(rows),), torch.inf).numpy()

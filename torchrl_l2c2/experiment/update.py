@@ -18,13 +18,13 @@ from torchrl.objectives import LossModule
 
 from torchrl_l2c2.experiment.algorithms.agent import Agent
 from torchrl_l2c2.experiment.compilation import compiled
-from torchrl_l2c2.experiment.priorities import draw_by_priority, set_priorities
+from torchrl_l2c2.experiment.priorities import draw_by_priority, leave_out, set_priorities
 from torchrl_l2c2.experiment.tracing import traceable_step, traceable_targets
 from torchrl_l2c2.gains import is_loss
 from torchrl_l2c2.transforms import NeighborTransform
 
-Step = Callable[..., tuple[Tensor, Tensor | None] | None]
-"""A gradient step: the means of the loss's entries and new priorities, or ``None`` if skipped."""
+Step = Callable[..., tuple[Tensor | None, Tensor | None]]
+"""A gradient step: the means of the loss's entries, ``None`` if skipped, and new priorities."""
 
 
 def make_update(
@@ -43,7 +43,7 @@ def make_update(
         compile (bool): whether to compile. The whole step is one graph where the optimizer's and
             the target networks' steps are :mod:`~.tracing`'s; with others, loss and gradients are.
         skip_nonfinite (bool): whether a batch with a loss or gradient that is NaN or infinite
-            changes nothing and gives ``None``. The step is two graphs then.
+            changes nothing and gives no means. The step is two graphs then.
         read (Callable, optional): makes the batch of other things, as the first part of the graph.
 
     Returns:
@@ -106,14 +106,14 @@ def make_update(
     # What a loss itself keeps of the batches it has seen, such as PPO-RPE's threshold.
     kept = list(agent.loss.buffers())
 
-    def checked_update(with_policy: bool, *drawn: Any) -> tuple[Tensor, Tensor | None] | None:
+    def checked_update(with_policy: bool, *drawn: Any) -> tuple[Tensor | None, Tensor | None]:
         before = [buffer.clone() for buffer in kept]
         values, priority, gradients = differentiate(with_policy, *drawn)
         tensors = (values, *(g for g in gradients if g is not None))
         if not all(bool(tensor.isfinite().all()) for tensor in tensors):
             for buffer, was in zip(kept, before, strict=True):
                 buffer.copy_(was)
-            return None
+            return None, priority
         apply(with_policy, gradients)
         return values, priority
 
@@ -160,7 +160,12 @@ class ReplayUpdate:
     Keyword Args:
         compile (bool): as for :func:`make_update`.
         skip_nonfinite (bool): as for :func:`make_update`.
+
+    Attributes:
+        culprit: the row that probably had the last batch skipped, and its reward as stored.
     """
+
+    culprit: tuple[int, float]
 
     def __init__(
         self,
@@ -188,18 +193,23 @@ class ReplayUpdate:
     def __call__(self, with_policy: bool) -> tuple[Tensor, Tensor | None] | None:
         """One update, which sets the batch's priorities as well.
 
+        If it is skipped, a row that probably made it so is not drawn again by priority.
+
         Args:
             with_policy (bool): whether the policy is updated too, and the target networks with it.
 
         Returns:
-            tuple: as the function that :func:`make_update` returns.
+            tuple: as the function that :func:`make_update` returns; ``None`` if it is skipped.
         """
         draw = self.draw()
         smaller = len(draw.rows) < self._batch_size
-        result = (self._smaller_update if smaller else self.update)(with_policy, *draw)
-        if result is not None:
-            self.prioritize(draw.rows, result[1])
-        return result
+        update = self._smaller_update if smaller else self.update
+        values, priority = update(with_policy, *draw)
+        if values is None:
+            self._leave_out(draw.rows, priority)
+            return None
+        self.prioritize(draw.rows, priority)
+        return values, priority
 
     def draw(self) -> Draw:
         """Draws the rows of a batch, and the random numbers for their neighbors."""
@@ -240,6 +250,18 @@ class ReplayUpdate:
         """Sets the priorities of rows, where the buffer has any."""
         if self._prioritized and priority is not None:
             set_priorities(self._sampler, index.to("cpu"), priority.to("cpu"))
+
+    def _leave_out(self, rows: Tensor, priority: Tensor | None) -> None:
+        """Finds the rows that made a batch not finite, and has them drawn no more."""
+        assert self._source is not None
+        rewards = self._source.get(("next", "reward"))[rows].flatten()
+        sizes = (rewards.abs() if priority is None else priority.flatten()).nan_to_num(torch.inf)
+        largest = sizes.argmax()
+        self.culprit = int(rows[largest]), float(rewards[largest])
+        if self._prioritized and priority is not None:
+            bad = sizes.isinf()
+            alone = not bad.any() or bad.all()  # All of them are not to blame.
+            leave_out(self._sampler, (rows[largest : largest + 1] if alone else rows[bad]).cpu())
 
     def read(
         self,
