@@ -186,6 +186,15 @@ def test_a_launcher_says_what_it_needs(name, monkeypatch):
     ("sweep", "told"),
     [
         ("seed=range(3,0)", "error: a sweep of no job: one of -m seed=range"),
+        (
+            "experiment=cartpole,pendulum",
+            "error: experiment=cartpole,pendulum: each ",
+        ),
+        (
+            "+experiment=glob(table3*)",
+            "error: +experiment=glob(table3*): each ",
+        ),
+        ("experiment=[cartpole,pendulum]", "error: experiment=[cartpole,pendulum]: each "),
         ("optimizer.lr=interval(0,1)", "error: an interval is nothing to sweep over: python -m"),
     ],
 )
@@ -193,7 +202,7 @@ def test_a_sweep_of_nothing_says_so(sweep, told):
     """It ended as if all were done; what a glob is, Hydra alone knows."""
     with pytest.raises(SystemExit, match=re.escape(told)):
         check_sweep(["-m", sweep])
-    check_sweep(["-m", "regularizer=glob(l2c2*)", "seed=0,1"])
+    check_sweep(["-m", "regularizer=glob(l2c2*)", "seed=0,1", "experiment=cartpole"])
     with begin_sweep(["-m", "regularizer=glob(l2c2*)"]) as begun:
         assert begun.standing(2, {}) == "run 2"
 

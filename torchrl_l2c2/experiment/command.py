@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
@@ -74,8 +75,17 @@ def check_launcher(arguments: Sequence[str]) -> None:
 
 
 def check_sweep(arguments: Sequence[str]) -> None:
-    """Ends where a sweep would have no job, or an interval stands for no number of them."""
+    """Ends where a sweep has no job, several comparisons or an interval."""
     try:
+        for comparison in OverridesParser.create().parse_overrides(
+            [each for each in arguments if each.lstrip("+").startswith("experiment=")]
+        ):
+            if comparison.is_sweep_override() or isinstance(comparison.value(), list):
+                sys.exit(
+                    f"error: {comparison.input_line}: each comparison has its own seeds and "
+                    "launcher, which a sweep over comparisons would leave out. Run a command for "
+                    "each of them."
+                )
         empty = not list_jobs(arguments, {})
     except HydraException as error:  # Of which Hydra itself says more, or finds what a glob is.
         if "INTERVAL" in str(error):
