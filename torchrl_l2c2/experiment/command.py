@@ -244,6 +244,7 @@ def run(
         if finished is None:
             finished = _train(config, folder, values, standing)
         else:
+            print("finished before: its results follow; another seed= or outputs= begins anew.")
             with warnings_told(partial(say, folder)):
                 tell_past(finished.config, config.to_dict())
         if records:
