@@ -1,7 +1,7 @@
 """Trains SAC, TD3 and PPO in plain TorchRL loops, with and without ``smooth(loss)``.
 
-``python -m studies.front_door results/front_door.csv`` makes 10 seeds of each on Pendulum, and adds a
-line to the file after each run; runs that the file has are skipped. The loops know nothing of the
+``python -m studies.front_door FILE.csv`` makes 10 seeds of each on Pendulum, and adds
+a line to the file after each run; runs that the file has are skipped. The loops know nothing of the
 regularizer: they sum the losses by name, as TorchRL's own scripts do.
 """
 

@@ -18,7 +18,7 @@ from typing import Any
 
 from studies.paper import is_of_paper, paper_of, paper_table
 from torchrl_l2c2.experiment.config import ExperimentConfig
-from torchrl_l2c2.experiment.errors import told_in_a_line
+from torchrl_l2c2.experiment.errors import UserError, told_in_a_line
 from torchrl_l2c2.experiment.finished import QUANTITIES, TESTS, FinishedRun, Record
 from torchrl_l2c2.experiment.identity import of_length
 from torchrl_l2c2.experiment.reports.groups import Group, group_records
@@ -167,10 +167,10 @@ def _read(paths: Sequence[str], lengths: Sequence[int] | None) -> tuple[list[Rec
         known = [record for file in files for record in read_records(file)]
         return merge([], [*known, *(run.record for run in found.runs)]), found.notes
     if files:
-        raise ValueError(f"--length needs the folders of runs, got the file {files[0]!r}.")
+        raise UserError(f"--length needs the folders of runs, got the file {files[0]!r}.")
     cut = [each for run in found.runs for n in lengths if (each := until(run, n)) is not None]
     if not cut:
-        raise ValueError(f"no run is as long as {min(lengths)} episodes or frames.")
+        raise UserError(f"no run is as long as {min(lengths)} episodes or frames.")
     shorter = [ExperimentConfig.from_dict(run.config) for run in cut if not run.evaluation]
     settings = Counter(setting for config in shorter for setting in of_length(config))
     notes = [

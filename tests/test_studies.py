@@ -128,7 +128,7 @@ class TestPaper:
 
     def test_its_numbers_are_those_of_its_own_task_and_algorithm(self, tmp_path):
         """Not of SAC, another task under its name, or L2C2 with another gain."""
-        other = replace(TASKS["swingup"], env_id="Pendulum-v1", episodes=20)
+        other = replace(TASKS["swingup"], name="other", env_id="Pendulum-v1", episodes=20)
         for name, config in {
             "paper": make_config(),
             "sac": make_config(algorithm=SACConfig(), seed=1),

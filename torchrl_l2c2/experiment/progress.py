@@ -101,8 +101,8 @@ class Progress:
         lately = rows[-10:]
         means = [statistics.fmean(r[key] for r in lately) for key in ("return", "action_variation")]
         state = (
-            f"mean of the last {len(lately)} episodes: return {means[0]:.1f}, action variation {means[1]:.3f}, "
-            f"{rows[-1]['frames_per_second']:.0f} frames/s"
+            f"mean of the last {len(lately)} episodes: return {means[0]:.1f}, "
+            f"action variation {means[1]:.3f}, {rows[-1]['frames_per_second']:.0f} frames/s"
         )
         self._bar.set_postfix_str(state)
         # A last rollout may go on far beyond the end.
