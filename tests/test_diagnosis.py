@@ -29,7 +29,7 @@ from torchrl_l2c2.experiment import (
     load_policy,
     make_env,
 )
-from torchrl_l2c2.experiment.diagnose import _names, main
+from torchrl_l2c2.experiment.diagnose import _names, _runs, main
 from torchrl_l2c2.experiment.diagnosis import (
     THRESHOLDS,
     Diagnosis,
@@ -608,5 +608,15 @@ class TestCommand:
             assert message in capsys.readouterr().err
         with pytest.raises(SystemExit, match=r"^error: '.*' is not the folder of a run"):
             main([str(tmp_path)])
+        for name in ("a", "b/seed_1", "b/seed_0"):
+            (tmp_path / "above" / name).mkdir(parents=True)
+            (tmp_path / "above" / name / "config.json").touch()
+        assert _runs([str(tmp_path / "above"), str(run)]) == [
+            *(str(tmp_path / "above" / name) for name in ("a", "b/seed_0", "b/seed_1")),
+            str(run),
+        ]
+        with pytest.raises(SystemExit):
+            main([str(tmp_path / "above"), "--names", "one"])
+        assert "--names: one for each of the 3 runs" in capsys.readouterr().err
         with pytest.raises(SystemExit, match=r"^error: a run is named twice"):
             main([str(run), str(run)])

@@ -27,6 +27,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
     """Does what the command line says; an error is one line."""
     parser = _parser()
     chosen = parser.parse_args(arguments)
+    above, chosen.folders = chosen.folders[0], _runs(chosen.folders)
     if chosen.episodes < 1:
         parser.error(f"--episodes must be at least 1, got {chosen.episodes}")
     if chosen.names and len(chosen.names) != len(chosen.folders):
@@ -52,7 +53,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
             )
             for folder, name in zip(chosen.folders, names, strict=True)
         ]
-        path = Path(chosen.output or Path(chosen.folders[0]) / "diagnosis.html")
+        path = Path(chosen.output or Path(above) / "diagnosis.html")
         write_page(path, diagnoses)
         if chosen.actions:
             write_atomically(chosen.actions, draw_together(diagnoses))
@@ -67,7 +68,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Writes one page that shows why the policies of runs shake, and says it.",
     )
     add = parser.add_argument
-    add("folders", nargs="+", metavar="RUN", help="a run's folder, finished or not")
+    add("folders", nargs="+", metavar="FOLDER", help="of runs, finished or not, at any depth")
     add("--names", nargs="+", help="what the runs are called (default: what tells them apart)")
     add("--output", help="the page (default: diagnosis.html in the first folder)")
     add("--actions", help="an SVG file for the actions of all runs, row by row (default: none)")
@@ -83,6 +84,12 @@ def _told(one: Diagnosis) -> str:
     total, variation = (one.measures[name] for name in ("return", "action_variation"))
     head = f"{one.name}: return {total:.4g}, action variation {variation:.3g}"
     return "\n".join([head, *(f"  - {found.text}" for found in findings(one))])
+
+
+def _runs(folders: Iterable[str]) -> list[str]:
+    """Finds the runs at or below folders; a folder without any stays."""
+    below = [sorted(Path(folder).rglob("config.json")) or [Path(folder, "_")] for folder in folders]
+    return [str(path.parent) for paths in below for path in paths]
 
 
 def _names(folders: Sequence[str]) -> list[str]:
