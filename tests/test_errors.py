@@ -1,8 +1,12 @@
 """Which errors a command shows in one line, and which with a traceback."""
 
+import os
+import subprocess
+import sys
+
 import pytest
 import torch
-from processes import run_train
+from processes import ROOT, run_train
 
 from torchrl_l2c2.experiment.checkpoints import CheckpointError
 from torchrl_l2c2.experiment.command import _tell
@@ -76,6 +80,16 @@ def test_too_little_memory_is_told_with_the_settings_that_need_it(error):
     error = too_large(error) if isinstance(error, int) else error
     told = _tell(error)
     assert "There is no memory for it: choose smaller algorithm.hidden, replay.capacity" in told
+
+
+def test_help_may_have_no_reader():
+    """As in ``--help | head``, which leaves before the end."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, str(ROOT / "train.py"), "--help"]
+    ended = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, check=False)
+    os.close(writer)
+    assert (ended.returncode, ended.stderr) == (1, b"")
 
 
 # A regularizer and an algorithm of a user's own, which a line each makes known to the command.

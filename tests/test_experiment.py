@@ -4,7 +4,6 @@ import contextlib
 import csv
 import json
 import math
-import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -564,7 +563,7 @@ gymnasium.register("Broken-v0", entry_point=Broken)
 def test_an_error_of_the_users_own_task_is_shown_with_its_lines(tmp_path, monkeypatch, workers):
     """Also where it happened in another process."""
     (tmp_path / "broken_task.py").write_text(BROKEN_TASK)
-    monkeypatch.setenv("PYTHONPATH", f"{ROOT}{os.pathsep}{tmp_path}")
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))  # The task lies in the current folder.
     settings = ["task.env_id=broken_task:Broken-v0", "task.episodes=4", f"num_workers={workers}"]
     done = run_train(*PENDULUM_OVERRIDES, *settings, folder=tmp_path, check=False)
     assert done.returncode == 1

@@ -102,10 +102,13 @@ def main() -> None:
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Nothing is reported unasked.
     keep_ctrl_c_from_children()
     signal.signal(signal.SIGTERM, terminate)
+    if "" not in sys.path:  # As with python -m: modules with tasks may lie here.
+        sys.path.append(os.getcwd())
     register()
     if not any(map(_asks_for_a_sweep, sys.argv[1:])):
-        with composing():
+        with composing(), _reader_may_leave():
             _main()
+            sys.stdout.flush()
         return
     check_sweep(sys.argv[1:])
     with begin_sweep(sys.argv[1:]) as sweep:
@@ -118,6 +121,17 @@ def main() -> None:
             tell_end(sweep)
         stopped_by, failures = sweep.stopped_by, sweep.failures
     sys.exit(bool(failures) if stopped_by is None else 128 + stopped_by)
+
+
+@contextmanager
+def _reader_may_leave() -> Iterator[None]:
+    """Ends in order where the output's reader has closed it, as in ``--help | head``."""
+    try:
+        yield
+    except BrokenPipeError:
+        # Python flushes once more when it ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
 
 
 def _asks_for_a_sweep(argument: str) -> bool:

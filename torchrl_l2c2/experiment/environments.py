@@ -174,7 +174,8 @@ def _explained(task: TaskConfig) -> Iterator[None]:
         raise UserError(
             f"task.env_id={task.env_id!r} is not a task that Gymnasium can make here ({cause}). "
             "Use one of this package's (train.py --help names them), or task=gymnasium with a "
-            "registered id; `module:id` imports the module that registers it."
+            "registered id; `module:id` imports the module that registers it, from the current "
+            "folder or PYTHONPATH."
         ) from cause
 
 

@@ -102,7 +102,8 @@ class Progress:
         means = [statistics.fmean(r[key] for r in lately) for key in ("return", "action_variation")]
         state = (
             f"mean of the last {len(lately)} episodes: return {means[0]:.1f}, "
-            f"action variation {means[1]:.3f}, {rows[-1]['frames_per_second']:.0f} frames/s"
+            f"action variation {means[1]:.3f}, "
+            f"{rows[-1]['frames_per_second']:.0f} frames/s"
         )
         self._bar.set_postfix_str(state)
         # A last rollout may go on far beyond the end.
