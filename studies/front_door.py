@@ -1,8 +1,8 @@
 """Trains SAC, TD3 and PPO in plain TorchRL loops, with and without ``smooth(loss)``.
 
 ``python -m studies.front_door FILE.csv`` makes 10 seeds of each on Pendulum, and adds
-a line to the file after each run; runs that the file has are skipped. The loops know nothing of the
-regularizer: they sum the losses by name, as TorchRL's own scripts do.
+a line to the file after each run; runs that the file has are skipped. The loops are those of TorchRL's
+own scripts, which sum the losses by name, with two lines more: ``smooth`` and ``set_progress``.
 """
 
 from __future__ import annotations
@@ -43,7 +43,9 @@ def train_sac(seed: int, smoothed: bool, frames: int = 5_000) -> torch.nn.Module
     collector = Collector(
         env, actor, frames_per_batch=50, total_frames=frames, init_random_frames=500
     )
-    for collected in collector:
+    for number, collected in enumerate(collector):
+        if smoothed:
+            loss.set_progress(50 * number / frames)
         replay.extend(collected)
         for _ in range(25 if len(replay) >= 500 else 0):
             terms = loss(replay.sample())
@@ -77,7 +79,9 @@ def train_td3(seed: int, smoothed: bool, frames: int = 5_000) -> torch.nn.Module
         total_frames=frames,
         init_random_frames=500,
     )
-    for collected in collector:
+    for number, collected in enumerate(collector):
+        if smoothed:
+            loss.set_progress(50 * number / frames)
         replay.extend(collected)
         for update in range(26 if len(replay) >= 500 else 0):
             batch = replay.sample()
@@ -96,7 +100,7 @@ def train_td3(seed: int, smoothed: bool, frames: int = 5_000) -> torch.nn.Module
 
 
 def train_ppo(seed: int, smoothed: bool, frames: int = 40_960) -> torch.nn.Module:
-    """PPO on rollouts of 2,048 frames, with the progress of training after each."""
+    """PPO on rollouts of 2,048 frames."""
     env = pendulum(seed)
     actor, critic = make_actor(3, env.action_spec, hidden=(64, 64)), make_critic(3, hidden=(64, 64))
     loss: LossModule = ClipPPOLoss(actor, critic, normalize_advantage=True, entropy_coeff=0.0)

@@ -45,6 +45,7 @@ PAPERS = [
     "regularizer.lambda_max=1.0",
     "regularizer.beta=0.1",
     "regularizer.shared=true",
+    "regularizer.gain=constant",
 ]
 RUNS = {
     "ppo_rpe": [*SWINGUP, "regularizer=none"],

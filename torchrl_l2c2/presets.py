@@ -115,6 +115,7 @@ PRESETS: dict[str, dict[str, Preset]] = {
                 "lambda_max": 1000.0,
                 "beta": 0.0,
             },
+            ramp=1.0,
             evidence="results/td3.md",
             tasks="Pendulum",
         ),
@@ -160,7 +161,7 @@ PRESETS: dict[str, dict[str, Preset]] = {
             tasks="Pendulum",
         ),
         "td3": Preset(
-            {"lambda_temporal": 10.0}, ramp=1.0, evidence="results/td3.md", tasks="Pendulum"
+            {"lambda_temporal": 3.0}, ramp=1.0, evidence="results/td3.md", tasks="Pendulum"
         ),
         "ppo_rpe": Preset({"lambda_temporal": 0.1}, ramp=1.0),
     },

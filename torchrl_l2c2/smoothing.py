@@ -39,9 +39,9 @@ def smooth(
     terms by name, or all ``loss_*`` keys, need no change. It is reported as ``penalty_*``.
 
     Settings come from one table, :data:`torchrl_l2c2.presets.PRESETS`, by the class of the loss.
-    PPO's gain rises with the progress of training: call
-    ``loss.set_progress(frames / total_frames)`` after every rollout. Without that it stays at its
-    last value.
+    The gains for PPO and TD3 rise with the progress of training: call
+    ``loss.set_progress(frames / total_frames)`` after every rollout. Without that they stay at
+    their last value.
 
     Args:
         loss (LossModule): a loss with a policy that is trained on transitions.
