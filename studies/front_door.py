@@ -1,8 +1,9 @@
 """Trains SAC, TD3 and PPO in plain TorchRL loops, with and without ``smooth(loss)``.
 
-``python -m studies.front_door FILE.csv`` makes 10 seeds of each on Pendulum, and adds
-a line to the file after each run; runs that the file has are skipped. The loops are those of TorchRL's
-own scripts, which sum the losses by name, with two lines more: ``smooth`` and ``set_progress``.
+``python -m studies.front_door FILE.csv`` makes 10 seeds of each on Pendulum, and adds a line to the
+file after each run; runs that the file has are skipped. The loops are like TorchRL's own scripts,
+which sum the losses by name. With the regularizer they have two lines more: ``smooth`` and
+``set_progress``.
 """
 
 from __future__ import annotations
