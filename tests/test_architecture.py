@@ -37,7 +37,7 @@ rsl_rl.__init__
 trainers __init__
 experiment.errors
 experiment.settings experiment.compilation experiment.spaces experiment.guard
-experiment.tracing experiment.priorities experiment.frames experiment.row_writer
+experiment.tracing experiment.frames experiment.row_writer
 experiment.loggers experiment.acting experiment.files experiment.versions
 experiment.checkpoints experiment.metrics_log
 experiment.environments experiment.lock experiment.signals

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 import torch._inductor.compile_fx
+from tensordict import TensorDict
 
 from torchrl_l2c2 import NeighborTransform
 from torchrl_l2c2.experiment import (
@@ -104,6 +105,16 @@ def test_priorities_are_on_the_cpu_wherever_the_batches_are():
     """TorchRL would put its trees where the storage is."""
     sampler = PrioritizedReplayConfig(capacity=50, batch_size=8).make(0, 1).sampler
     assert sampler._tree_device_from_storage(SimpleNamespace(device="cuda:0")).type == "cpu"
+
+
+def test_errors_of_0_are_drawn_with_every_exponent():
+    """(1e-8) ** 4 is 1e-32; to the sixth power it would be 0 in single precision."""
+    replay = PrioritizedReplayConfig(capacity=8, batch_size=8, alpha=4.0).make(0, 1)
+    replay.extend(TensorDict({"row": torch.arange(4)}, [4]))
+    replay.update_priority(torch.arange(4), torch.zeros(4))
+    assert set(replay.sample()["row"].tolist()) == {0, 1, 2, 3}
+    with pytest.raises(SettingError, match=r"alpha must be less than or equal to 4, got 6\.0"):
+        PrioritizedReplayConfig(alpha=6.0)
 
 
 @pytest.mark.parametrize("name", CASES)

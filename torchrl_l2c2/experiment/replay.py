@@ -28,7 +28,11 @@ class PrioritizedReplayConfig:
     capacity: int = Field(default=10_000, ge=1, le=10**12, description="transitions kept [paper]")
     batch_size: int = Field(default=32, ge=1, description="transitions per update [paper]")
     alpha: float = Field(
-        default=1.0, ge=0, description="exponent of the priorities; 0 is uniform [paper]"
+        # The least priority, 1e-8, to a higher power is 0, which cannot be drawn.
+        default=1.0,
+        ge=0,
+        le=4,
+        description="exponent of the priorities; 0 is uniform [paper]",
     )
     beta: float = Field(
         default=0.5,
@@ -61,7 +65,7 @@ class PrioritizedReplayConfig:
             beta=self.beta,
             priority_key="td_error",
             storage=LazyTensorStorage(self.capacity, device=device),
-            # Where draw_by_priority is; of a storage on a GPU they would lie there, too.
+            # replay_state reads the trees there; with a storage on a GPU they would lie there.
             sampler_device="cpu",
             batch_size=self.batch_size,
             generator=torch.Generator().manual_seed(seed),

@@ -18,7 +18,6 @@ from torchrl.objectives import LossModule
 
 from torchrl_l2c2.experiment.algorithms.agent import Agent
 from torchrl_l2c2.experiment.compilation import compiled
-from torchrl_l2c2.experiment.priorities import draw_by_priority, leave_out, set_priorities
 from torchrl_l2c2.experiment.tracing import traceable_step, traceable_targets
 from torchrl_l2c2.gains import is_loss
 from torchrl_l2c2.transforms import NeighborTransform
@@ -225,9 +224,8 @@ class ReplayUpdate:
 
     def _rows(self) -> tuple[Tensor, Tensor | None]:
         """What the buffer's sampler draws: rows, and their weights where they have priorities."""
-        if self._prioritized:
-            return draw_by_priority(self._sampler, len(self._storage), self._batch_size)
-        return self._sampler.sample(self._storage, self._batch_size)[0], None
+        rows, info = self._sampler.sample(self._storage, self._batch_size)
+        return rows, info.get("priority_weight")
 
     def example(self) -> TensorDictBase:
         """A batch from all over the storage, for which nothing that runs depend on is drawn."""
@@ -249,19 +247,29 @@ class ReplayUpdate:
     def prioritize(self, index: Tensor, priority: Tensor | None) -> None:
         """Sets the priorities of rows, where the buffer has any."""
         if self._prioritized and priority is not None:
-            set_priorities(self._sampler, index.to("cpu"), priority.to("cpu"))
+            self._sampler.update_priority(index, priority)
 
     def _leave_out(self, rows: Tensor, priority: Tensor | None) -> None:
-        """Finds the rows that made a batch not finite, and has them drawn no more."""
+        """Finds the rows that made a batch not finite, and stores a copy of another in their place.
+
+        Without that they would keep their priority, and be drawn again and again.
+        """
         assert self._source is not None
         rewards = self._source.get(("next", "reward"))[rows].flatten()
         sizes = (rewards.abs() if priority is None else priority.flatten()).nan_to_num(torch.inf)
         largest = sizes.argmax()
         self.culprit = int(rows[largest]), float(rewards[largest])
-        if self._prioritized and priority is not None:
-            bad = sizes.isinf()
-            alone = not bad.any() or bad.all()  # All of them are not to blame.
-            leave_out(self._sampler, (rows[largest : largest + 1] if alone else rows[bad]).cpu())
+        if not self._prioritized or priority is None:
+            return
+        bad = sizes.isinf()
+        if not bad.any() or bad.all():  # If all are infinite, not all of them are to blame.
+            bad = torch.arange(len(rows), device=rows.device) == largest
+        bad_rows, good_rows = rows[bad].cpu(), rows[~bad].cpu()
+        if len(good_rows):
+            copies = good_rows[torch.zeros_like(bad_rows)]
+            self._storage.set(bad_rows, self._storage.get(copies))
+            usual = sizes[~bad].nan_to_num(posinf=0.0).median()
+            self._sampler.update_priority(bad_rows, usual.expand(len(bad_rows)).cpu())
 
     def read(
         self,
