@@ -4,17 +4,13 @@ import importlib.util
 import json
 import os
 import signal
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import torch
 
 from tests.test_sweep import alive, episodes, numbers, runs, said, start, wait_until
-from torchrl_l2c2.experiment import Experiment, ExperimentConfig, TaskConfig
 from torchrl_l2c2.experiment.checkpoints import list_checkpoints
 from torchrl_l2c2.experiment.reports import read_runs, sweep_summary
-from torchrl_l2c2.experiment.settings import SettingError
 
 SWEEP = ("-m", "seed=0,1,2,3", "task.episodes=40", "compile=false", "checkpoint_interval=0")
 
@@ -123,47 +119,6 @@ def test_a_lost_machine_of_ray_is_made_up_for(tmp_path, undisturbed, ray_cluster
     assert "continuing after episode" in log
     assert ("SIGTERM ended the training" in log) == (number == signal.SIGTERM)
     assert_same(tmp_path, undisturbed)
-
-
-@pytest.fixture
-def ray_here(monkeypatch):
-    """Two cores of this machine."""
-    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-    import ray
-
-    memory = {"object_store_memory": 100_000_000}
-    yield ray.init("local", num_cpus=2, include_dashboard=False, log_to_driver=False, **memory)
-    ray.shutdown()
-
-
-def test_without_ray_its_extra_is_named(monkeypatch):
-    """Before anything is played."""
-    monkeypatch.setattr("torchrl_l2c2.experiment.workers.find_spec", lambda name: None)
-    config = ExperimentConfig(num_workers=2, workers="ray", compile=False)
-    with pytest.raises(SettingError, match=r"workers must be processes .*'torchrl-l2c2\[ray\]'"):
-        Experiment(config)
-
-
-@needs("ray")
-@pytest.mark.slow
-def test_workers_of_ray_play_what_processes_do(ray_here):
-    """The same episodes to the bit, also where one is lost: the run learns the same."""
-    import ray
-
-    task = TaskConfig(episodes=6, max_steps=30)
-    config = ExperimentConfig(task=task, num_workers=2, compile=False, late_share=0.0)
-    runs = [Experiment(config), Experiment(replace(config, workers="ray"))]
-    for run in runs:
-        run.train(4)
-    workers = runs[1].player.collector.remote_collectors
-    os.kill(ray.get(workers[1].__ray_call__.remote(lambda _: os.getpid())), signal.SIGKILL)
-    rows = [[row | {"frames_per_second": 0} for row in run.train(6)] for run in runs]
-    for run in runs:
-        run.close()
-    assert rows[0] == rows[1] and rows[0][-1]["updates"] > 0
-    ours, theirs = (run.agent.loss.state_dict() for run in runs)
-    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
 
 
 def parent(process):

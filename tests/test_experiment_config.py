@@ -438,7 +438,6 @@ def test_wrong_settings_are_refused_with_what_is_allowed(settings, message):
         ),
         ({"regularizer": L2C2Config(name="caps")}, r"regularizer.name must .*, got 'caps'"),
         ({"algorithm": SACConfig(name="td3")}, r"one of \['sac'\] with SACConfig, got 'td3'"),
-        ({"workers": "ray"}, "num_workers must be more than 1 with workers=ray, got 1"),
         ({"num_workers": 0}, "num_workers must be greater than or equal to 1, got 0"),
         (
             {"num_workers": 2, "algorithm": SACConfig()},

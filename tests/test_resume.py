@@ -46,6 +46,7 @@ from torchrl_l2c2.experiment.files import write_json
 from torchrl_l2c2.experiment.naming import run_name
 from torchrl_l2c2.experiment.progress import say
 from torchrl_l2c2.experiment.reports import find_runs, finished_run, read_runs, results
+from torchrl_l2c2.experiment.saved import as_it_was
 from torchrl_l2c2.experiment.trained import load_policy
 
 ROOT = Path(__file__).parent.parent
@@ -497,6 +498,14 @@ def test_a_setting_that_a_checkpoint_does_not_know_is_named(tmp_path):
     del saved["num_workers"]
     with pytest.raises(OtherRunError, match=r"made with num_workers=none, as it is .*, not 1:"):
         check_same_settings(saved, small().to_dict())
+
+
+def test_a_removed_setting_that_changed_nothing_may_be_there():
+    """A run of before continues, and its policy is loaded."""
+    now = small().to_dict()
+    saved = {**now, "workers": "processes"}
+    check_same_settings(saved, now)
+    assert ExperimentConfig.from_dict(as_it_was(saved)) == small()
 
 
 def test_a_setting_that_changes_nothing_may_be_new():

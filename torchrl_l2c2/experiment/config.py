@@ -106,11 +106,6 @@ class ExperimentConfig:
         "round whole: 4 play 352 episodes where 350 are asked for; more than 1 needs "
         "algorithm.schedule other than step",
     )
-    workers: Literal["processes", "ray"] = Field(
-        default="processes",
-        description="what num_workers are: processes of this machine, or Ray's, on all machines of "
-        "its cluster (extra ray); the same seed gives the same episodes",
-    )
     compile: bool = Field(
         default=True,
         description="compile updates and policies where a C++ compiler is found; false: eager",
@@ -255,11 +250,6 @@ class ExperimentConfig:
     def _check_rounds(self) -> None:
         """Several workers play whole episodes, and all of them as many."""
         workers = self.num_workers
-        if workers == 1 and self.workers != "processes":
-            raise SettingError(
-                "num_workers",
-                f"must be more than 1 with workers={self.workers}, got 1: one process plays here.",
-            )
         if workers > 1 and self.algorithm.num_envs is not None:
             raise SettingError(
                 "num_workers",
@@ -300,12 +290,13 @@ FREE_SETTINGS = {
     "evaluate_every",
     "record",
     "threads",
-    "workers",
     "checkpoint_interval",
     "checkpoint_keep",
 }
 # More episodes or frames are a longer run of the same kind.
 FREE_TASK_SETTINGS = {"name", "episodes", "frames", "solved_at"}
+# Settings of older runs that there are no more, and that changed none of the numbers.
+REMOVED_SETTINGS = ("workers",)
 # Settings that are newer than some runs, with the value at which they change none of the numbers.
 # Others are newer, too: null and false always are such values.
 NEUTRAL_SETTINGS = {

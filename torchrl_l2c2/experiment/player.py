@@ -17,7 +17,7 @@ from torchrl_l2c2.experiment.collection import EpisodeCollector
 from torchrl_l2c2.experiment.environments import simulating
 from torchrl_l2c2.experiment.frames import Frame, check_finite, stack_frames
 from torchrl_l2c2.experiment.rollouts import RolloutCollector
-from torchrl_l2c2.experiment.workers import MultiEpisodeCollector, RayEpisodeCollector
+from torchrl_l2c2.experiment.workers import MultiEpisodeCollector
 from torchrl_l2c2.metrics import action_variation
 
 Played = TypeVar("Played")
@@ -57,10 +57,7 @@ class Player:
 
     def __init__(
         self,
-        collector: EpisodeCollector
-        | MultiEpisodeCollector
-        | RayEpisodeCollector
-        | RolloutCollector,
+        collector: EpisodeCollector | MultiEpisodeCollector | RolloutCollector,
         agent: Agent,
         env_id: str,
     ) -> None:

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from torchrl_l2c2.experiment.config import GROUPS, NEUTRAL_SETTINGS
+from torchrl_l2c2.experiment.config import GROUPS, NEUTRAL_SETTINGS, REMOVED_SETTINGS
 from torchrl_l2c2.experiment.errors import UserError
 
 REMEDY = "it was changed or cut since it was written; restore it."
@@ -90,12 +90,16 @@ def read_config(run: str | Path) -> dict[str, Any]:
 def as_it_was(config: Mapping[str, Any]) -> dict[str, Any]:
     """Saved settings, with those that are newer as all runs had them when there was no setting.
 
-    Their defaults may be others by now.
+    Their defaults may be others by now. Removed settings are left out.
 
     Args:
         config (Mapping): of ``config.json`` or of a checkpoint, which names its groups' choices.
     """
-    whole = {k: dict(v) if isinstance(v, Mapping) else v for k, v in config.items()}
+    whole = {
+        k: dict(v) if isinstance(v, Mapping) else v
+        for k, v in config.items()
+        if k not in REMOVED_SETTINGS
+    }
     for setting, value in NEUTRAL_SETTINGS.items():
         group, _, name = setting.rpartition(".")
         values = whole[group] if group else whole

@@ -1,4 +1,4 @@
-"""Several processes, of this machine or of many, that play episodes at once, with one policy."""
+"""Several processes that play episodes at once, with one policy."""
 
 from __future__ import annotations
 
@@ -11,18 +11,15 @@ import traceback
 import weakref
 from collections.abc import Callable, Iterator
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torchrl._utils import seed_generator
 from torchrl.collectors import MultiSyncCollector
-from torchrl.collectors.distributed import RayCollector
 from torchrl.envs import EnvBase, ExplorationType
 
 from torchrl_l2c2.experiment.algorithms.agent import Agent
@@ -31,16 +28,14 @@ from torchrl_l2c2.experiment.config import ExperimentConfig
 from torchrl_l2c2.experiment.environments import make_env
 from torchrl_l2c2.experiment.errors import ChildFailedError
 from torchrl_l2c2.experiment.rollouts import RolloutCollector
-from torchrl_l2c2.experiment.settings import SettingError
 
 # Between the seeds of a run's simulators: far enough for no run to have another's.
 SEEDS_APART = 15_485_863
-RESTARTS = 3  # of a worker of Ray's
 
 
 def make_collector(
     config: ExperimentConfig, env: EnvBase, agent: Agent, *, compile: bool
-) -> EpisodeCollector | MultiEpisodeCollector | RayEpisodeCollector | RolloutCollector:
+) -> EpisodeCollector | MultiEpisodeCollector | RolloutCollector:
     """What plays a run's episodes: this process, or as many others as the settings say."""
     options: dict[str, Any] = {
         "compile_policy": compile,
@@ -55,16 +50,7 @@ def make_collector(
     if config.num_workers == 1:
         frames = 1 if algorithm.schedule == "step" else config.task.time_limit
         return EpisodeCollector(env, agent.policy, frames_per_batch=frames, **options)
-    ray = config.workers == "ray"
-    if ray and find_spec("ray") is None:
-        raise SettingError(
-            "workers",
-            "must be processes where Ray is not installed, got ray: pip install "
-            "'torchrl-l2c2[ray]'.",
-        )
-    kind: type[MultiEpisodeCollector | RayEpisodeCollector]
-    kind = RayEpisodeCollector if ray else MultiEpisodeCollector
-    return kind(
+    return MultiEpisodeCollector(
         partial(make_env, config.task, config.seed),
         agent.policy,
         num_workers=config.num_workers,
@@ -74,27 +60,7 @@ def make_collector(
     )
 
 
-class _Rounds:
-    """Rounds of an episode of every worker, which their number and the run's seed decide alone."""
-
-    _seed: int
-    _frames: int
-    _rounds_played = 0
-
-    def generator_state(self) -> dict[str, Any]:
-        """What the following episodes depend on, but for the policy."""
-        return {"rounds_played": self._rounds_played, "frames": self._frames}
-
-    def set_generator_state(self, state: dict[str, Any]) -> None:
-        """Restores what :meth:`generator_state` gave."""
-        self._rounds_played, self._frames = state["rounds_played"], state["frames"]
-
-    def _round_seed(self) -> int:
-        entropy = np.random.SeedSequence([self._seed, self._rounds_played])
-        return int(entropy.generate_state(1)[0])
-
-
-class MultiEpisodeCollector(_Rounds, MultiSyncCollector):
+class MultiEpisodeCollector(MultiSyncCollector):
     """An :class:`EpisodeCollector` in each of several processes, which play an episode at a time.
 
     Episodes depend on the seed, the number of rounds played before and their place in the round,
@@ -177,6 +143,15 @@ class MultiEpisodeCollector(_Rounds, MultiSyncCollector):
             auto_register_policy_transforms=False,
         )
         self._rounds: Iterator[TensorDictBase] | None = None
+        self._rounds_played = 0
+
+    def generator_state(self) -> dict[str, Any]:
+        """What the following episodes depend on, but for the policy."""
+        return {"rounds_played": self._rounds_played, "frames": self._frames}
+
+    def set_generator_state(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`generator_state` gave."""
+        self._rounds_played, self._frames = state["rounds_played"], state["frames"]
 
     def shutdown(self, *args: Any, **kwargs: Any) -> None:
         """Ends the processes; nothing can be collected any more."""
@@ -203,68 +178,9 @@ class MultiEpisodeCollector(_Rounds, MultiSyncCollector):
         self._rounds_played += 1
         return [episode.exclude("collector") for episode in episodes]
 
-
-class RayEpisodeCollector(_Rounds, RayCollector):
-    """A :class:`MultiEpisodeCollector` whose workers are Ray's, on whatever machines it has.
-
-    The same settings and seed give the same episodes, to the bit where processors are of one kind.
-    A worker whose machine is lost is begun elsewhere, and plays the round's episode again. Ray is
-    what ``RAY_ADDRESS`` names, or one that is begun here.
-
-    Args:
-        create_env (callable): makes an environment as :class:`EpisodeCollector` takes it; pickled.
-        policy (TensorDictModule): as for :class:`MultiEpisodeCollector`.
-
-    Keyword Args:
-        num_workers (int): workers, each on a core of its own.
-        max_steps (int): as for :class:`MultiEpisodeCollector`, and so are the others.
-    """
-
-    def __init__(
-        self,
-        create_env: Callable[[], EnvBase],
-        policy: TensorDictModule,
-        *,
-        num_workers: int,
-        max_steps: int,
-        seed: int = 0,
-        compile_policy: bool = False,
-        random_frames: int = 0,
-        exploration_type: ExplorationType = ExplorationType.RANDOM,
-        keep_previous: bool = False,
-    ) -> None:
-        self._seed, self._random_frames, self._frames = seed, random_frames, 0
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Nothing is reported unasked.
-        super().__init__(
-            [create_env] * num_workers,
-            policy,
-            frames_per_batch=max_steps * num_workers,
-            exploration_type=exploration_type,
-            collector_class=_RayWorker,
-            collector_kwargs=[
-                {"compiled_policy": compile_policy, "keep_previous": keep_previous}
-                for _ in range(num_workers)
-            ],
-            # Episodes come with all that they depend on, so that they can be played again.
-            remote_configs={"num_cpus": 1, "max_restarts": RESTARTS, "max_task_retries": RESTARTS},
-            sync=True,
-            weight_sync_schemes={},
-        )
-
-    def rollout(self) -> list[TensorDictBase]:
-        """One episode of every worker, as :meth:`EpisodeCollector.rollout` gives them."""
-        import ray
-
-        weights = ray.put(TensorDict.from_module(self.policy).data.clone())
-        seed, played = self._round_seed(), []
-        for worker in self.remote_collectors:
-            played.append(worker.play.remote(weights, seed, self._frames < self._random_frames))
-            seed = seed_generator(seed)
-        # Ray's memory is read-only.
-        episodes = [episode.exclude("collector").clone() for episode in ray.get(played)]
-        self._rounds_played += 1
-        self._frames += sum(map(len, episodes))
-        return episodes
+    def _round_seed(self) -> int:
+        entropy = np.random.SeedSequence([self._seed, self._rounds_played])
+        return int(entropy.generate_state(1)[0])
 
 
 class _EpisodeWorker(EpisodeCollector):
@@ -311,25 +227,6 @@ class _EpisodeWorker(EpisodeCollector):
             raise
         # The parent counts frames by this entry.
         return episode.set(("collector", "traj_ids"), torch.zeros(len(episode), dtype=torch.int64))
-
-
-class _RayWorker(_EpisodeWorker):
-    """What an actor of :class:`RayEpisodeCollector` runs."""
-
-    def __init__(
-        self, create_env: Callable[[], EnvBase], *, policy: TensorDictModule, **options: Any
-    ) -> None:
-        super().__init__(create_env, policy_factory=lambda: policy, **options)
-        self._weights = TensorDict.from_module(policy).data
-
-    def play(self, weights: TensorDictBase, seed: int, random: bool) -> TensorDictBase:
-        """An episode, which follows from the arguments alone."""
-        self._weights.update_(weights)
-        self.set_seed(seed)
-        torch.manual_seed(seed)
-        np.random.seed(seed)
-        self.init_random_frames = int(random)
-        return self.rollout()
 
 
 def _shut_down(collector: weakref.ref[MultiEpisodeCollector]) -> None:
