@@ -82,16 +82,14 @@ def test_a_batch_ends_where_the_episode_ends():
         assert episode["next", "done"].flatten().nonzero().flatten().tolist() == [len(episode) - 1]
 
 
-@pytest.mark.parametrize("other", [False, True], ids=["fast", "by TorchRL"])
-def test_frames_played_one_by_one_are_the_episode(other):
+def test_frames_played_one_by_one_are_the_episode():
     """Stacked they are its rollout, the random ones too; a row has all entries of each."""
 
     def collector():
         torch.manual_seed(0)
         env = GymEnv("Pendulum-v1", max_episode_steps=7)
-        env = stacked(env) if other else env
         env.set_seed(2)
-        actor = make_actor(6 if other else 3, env.action_spec)
+        actor = make_actor(3, env.action_spec)
         return EpisodeCollector(env, actor, frames_per_batch=7, random_frames=3)
 
     whole, alone = collector(), collector()
@@ -108,24 +106,16 @@ def test_frames_played_one_by_one_are_the_episode(other):
         assert all(torch.equal(row[key], batch[key][-1]) for key in batch.keys(True, True))
 
 
-def test_several_environments_have_no_one_frame():
-    """They step together: a frame of theirs is a batch."""
-    env = OTHERS["several"]()
-    collector = EpisodeCollector(env, make_actor(6, env.action_spec_unbatched), frames_per_batch=20)
-    with pytest.raises(RuntimeError, match="one environment"):
-        collector.step()
-
-
 def test_an_episode_that_was_interrupted_is_not_gone_on_with(monkeypatch):
     """Its frames are lost: the next batch is a whole episode."""
     env, actor = make(TaskConfig("pendulum", "Pendulum-v1", noise_scale=0.0, max_steps=9))
     collector = EpisodeCollector(env, actor, frames_per_batch=9)
     play, calls = collector._play, iter(range(100))
 
-    def interrupted(simulator):
+    def interrupted():
         if next(calls) == 4:
             raise KeyboardInterrupt
-        return play(simulator)
+        return play()
 
     monkeypatch.setattr(collector, "_play", interrupted)
     with pytest.raises(KeyboardInterrupt):
@@ -199,25 +189,15 @@ OTHERS = {
 
 
 @pytest.mark.parametrize("name", OTHERS)
-def test_other_environments_are_played_by_torchrls_own_loop(name):
-    """The same numbers; one environment's batch ends with its episode, where that is asked for."""
-    batches = []
-    for kind, extra in ((EpisodeCollector, {"stop_at_done": False}), (Collector, {})):
-        torch.manual_seed(0)
-        env = OTHERS[name]()
-        env.set_seed(2)
-        actor = make_actor(6, env.action_spec_unbatched)
-        collector = kind(env, actor, frames_per_batch=20, **extra)
-        torch.manual_seed(1)
-        batches.append(collector.rollout())
-    ours, theirs = batches
-    for key in ours.keys(True, True):
-        torch.testing.assert_close(ours[key], theirs[key], rtol=0, atol=0, msg=str(key))
-    by_episode = EpisodeCollector(env, actor, frames_per_batch=20)
-    shapes = [by_episode.rollout().shape for _ in range(2)]
-    assert shapes == ([(7,)] * 2 if name == "another transform" else [(2, 10)] * 2)
-    with pytest.raises(RuntimeError, match="ObservationNoise"):
-        by_episode.generator_state()
+@pytest.mark.parametrize(
+    "make", [EpisodeCollector, lambda env, *a, **k: RolloutCollector([env], *a, **k)]
+)
+def test_other_environments_are_refused(name, make):
+    """With what plays them."""
+    env = OTHERS[name]()
+    actor = make_actor(6, env.action_spec_unbatched)
+    with pytest.raises(ValueError, match=r"no transform but ObservationNoise, got"):
+        make(env, actor, frames_per_batch=20)
 
 
 @pytest.mark.parametrize("transforms", [[], [StepCounter()]], ids=("fast", "by torchrl"))

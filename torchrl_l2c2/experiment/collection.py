@@ -32,22 +32,19 @@ from torchrl_l2c2.transforms import ObservationNoise
 class EpisodeCollector(Collector):
     """A TorchRL :class:`~torchrl.collectors.Collector`, fast with one Gymnasium simulator.
 
-    It gives the batches that the collector gives, to the bit, but for the ``collector`` entry.
-    What it leaves out is the work around every step: specs, nested TensorDicts and their copies.
-    An episode's frames are stacked once. That is for a ``GymEnv`` or ``GymWrapper``, also one
-    transformed by :class:`ObservationNoise`; environments with other transforms, and several at
-    once, are played by TorchRL's own loop, at its pace, with the policy as it is, and a state of
-    theirs cannot be saved.
+    It gives the collector's batches, bit for bit, without the ``collector`` entry. What it leaves
+    out is the work around every step: specs, nested TensorDicts and their copies. An episode's
+    frames are stacked once.
 
     Args:
-        env (EnvBase): on the CPU, with one tensor of observations under ``"observation"``.
+        env (EnvBase): a ``GymEnv`` or ``GymWrapper``, also one transformed by
+            :class:`ObservationNoise`, with one tensor of observations under ``"observation"``.
         policy (TensorDictModule): reads ``"observation"``.
 
     Keyword Args:
         frames_per_batch (int): frames of a batch.
         stop_at_done (bool): whether a batch ends with the episode, even if it is shorter.
-            Learning at the end of every episode needs this. Several environments, whose episodes
-            end at different times, fill a batch in any case. Default ``True``.
+            Learning at the end of every episode needs this. Default ``True``.
         compile_policy (bool): whether to compile the policy. Random numbers are drawn as without.
             What is written into its parameters is followed; a parameter or a setting that is
             replaced after the first frame is overlooked. Default ``False``.
@@ -56,6 +53,10 @@ class EpisodeCollector(Collector):
         exploration_type (ExplorationType): default ``RANDOM``.
         keep_previous (bool): whether frames have the observation before theirs as well, as
             ``"previous_observation"``; in an episode's first it is their own. Default ``False``.
+
+    Raises:
+        ValueError: several environments at once, or one with other transforms. TorchRL's
+            ``Collector`` plays these.
 
     Examples:
         >>> from torchrl.envs import GymEnv
@@ -83,7 +84,6 @@ class EpisodeCollector(Collector):
         keep_previous: bool = False,
     ) -> None:
         self._simulator, self._noise = simulator_and_noise(env)
-        by_torchrl = self._simulator is None
         super().__init__(
             env,
             policy,
@@ -92,15 +92,7 @@ class EpisodeCollector(Collector):
             track_traj_ids=False,
             auto_register_policy_transforms=False,
             exploration_type=exploration_type,
-            # TorchRL's loop counts them itself, and keeps no batch that one here would change.
-            init_random_frames=random_frames if by_torchrl else 0,
-            use_buffers=False if by_torchrl else None,
         )
-        if keep_previous and by_torchrl:
-            raise ValueError(
-                "keep_previous needs one Gymnasium simulator with no transform but "
-                f"ObservationNoise, got {env}: append CatFrames to it instead."
-            )
         self.stop_at_done = stop_at_done
         self._keep_previous = keep_previous
         self._previous: Tensor | None = None
@@ -111,22 +103,19 @@ class EpisodeCollector(Collector):
         self._act = on_tensors(policy, self._policy_keys, compile_policy)
         # Of a policy whose samples go beyond the bounds: frames have these, the task what it takes.
         self._taken: Callable[[Tensor], Tensor] | None = getattr(policy, "taken", None)
-        if self._simulator is not None:
-            self._gymnasium = self._simulator._env
-            self._dtype = self._simulator.observation_spec["observation"].dtype
-            continuous = self._simulator.action_spec.dtype.is_floating_point
-            self._to_action = as_array if continuous else self._simulator.read_action
+        self._gymnasium = self._simulator._env
+        self._dtype = self._simulator.observation_spec["observation"].dtype
+        continuous = self._simulator.action_spec.dtype.is_floating_point
+        self._to_action = as_array if continuous else self._simulator.read_action
 
     @torch.no_grad()
     def rollout(self) -> TensorDictBase:
         """Plays up to ``frames_per_batch`` frames; what iterating over the collector calls."""
-        if self._simulator is None:
-            return self._rollout_by_torchrl()
         frames: list[Frame] = []
         try:
             with set_exploration_type(self.exploration_type):
                 while len(frames) < self.frames_per_batch:
-                    frames.append(self._play(self._simulator))
+                    frames.append(self._play())
                     if frames[-1].done and self.stop_at_done:
                         break
         except BaseException:
@@ -136,19 +125,11 @@ class EpisodeCollector(Collector):
 
     @torch.no_grad()
     def step(self) -> Frame:
-        """Plays one frame; an episode's frames, stacked, are its :meth:`rollout`.
-
-        Raises:
-            RuntimeError: there are several environments, whose frames are batches.
-        """
-        if self.env.batch_size:
-            raise RuntimeError(f"step() plays one environment, got {self.env}.")
-        if self._simulator is None:
-            return self._frame(self._steps_by_torchrl(1)[0])
+        """Plays one frame; an episode's frames, stacked, are its :meth:`rollout`."""
         with set_exploration_type(self.exploration_type):
-            return self._play(self._simulator)
+            return self._play()
 
-    def _play(self, simulator: GymWrapper) -> Frame:
+    def _play(self) -> Frame:
         # Late, so that between episodes nothing of the next one has happened yet: the
         # generators' states are then all there is to save.
         observation = self._observation
@@ -162,45 +143,15 @@ class EpisodeCollector(Collector):
         action = outputs["action"]
         if self._random_frames_left > 0:
             self._random_frames_left -= 1
-            action.copy_(simulator.action_spec.rand())
+            action.copy_(self._simulator.action_spec.rand())
         taken = action if self._taken is None else self._taken(action)
         seen, reward, terminated, truncated, _ = self._gymnasium.step(self._to_action(taken))
         following = self._observe(seen)
         self._observation = None if terminated or truncated else following
         return Frame(observation, outputs, following, as_reward(reward), terminated, truncated)
 
-    def _rollout_by_torchrl(self) -> TensorDictBase:
-        if self.env.batch_size or not self.stop_at_done:
-            return super().rollout()
-        return torch.cat(self._steps_by_torchrl(self.frames_per_batch))
-
-    def _steps_by_torchrl(self, most: int) -> list[TensorDictBase]:
-        """Frames ``[1]``, up to an episode's last one."""
-        steps: list[TensorDictBase] = []
-        frames_per_batch, self.frames_per_batch = self.frames_per_batch, 1
-        try:
-            while len(steps) < most and not (steps and steps[-1]["next", "done"].any()):
-                steps.append(super().rollout())
-        finally:
-            self.frames_per_batch = frames_per_batch
-        return steps
-
-    def _frame(self, step: TensorDictBase) -> Frame:
-        following = step["next"]
-        return Frame(
-            step["observation"][0],
-            # TorchRL does not ask the policy for a random frame.
-            {key: step[key][0] for key in self._policy_keys if key in step.keys()},
-            following["observation"][0],
-            following["reward"].item(),
-            following["terminated"].item(),
-            following["truncated"].item(),
-        )
-
     def reset(self, index: Any = None, **kwargs: Any) -> None:
         """The next frame begins an episode, wherever the present one is."""
-        if self._simulator is None:
-            super().reset(index, **kwargs)
         self._observation = None
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
@@ -223,14 +174,8 @@ class EpisodeCollector(Collector):
         """The states of the simulator's and the noise's random generators, between episodes.
 
         Raises:
-            RuntimeError: in the middle of an episode, whose simulator's state cannot be saved, or
-                where TorchRL's loop plays.
+            RuntimeError: in the middle of an episode, whose simulator's state cannot be saved.
         """
-        if self._simulator is None:
-            raise RuntimeError(
-                f"the random state of {self.env} is not known; only that of one GymEnv, with no "
-                "transform but ObservationNoise, can be saved."
-            )
         if self._observation is not None:
             raise RuntimeError("an episode is being played; a run can be saved between episodes.")
         states = generator_states(self._gymnasium, self._noise)
@@ -286,40 +231,64 @@ def play_episodes(
 ) -> Iterator[TensorDictBase]:
     """Episodes ``[T]`` of a policy, by its mean or by samples; the environment stays open.
 
-    The arguments are those of :func:`~torchrl_l2c2.experiment.evaluate_policy`.
+    The arguments are those of :func:`~torchrl_l2c2.experiment.evaluate_policy`. An environment
+    that :class:`EpisodeCollector` refuses is played by its own ``rollout``, with the policy as it
+    is.
 
     Raises:
         SimulatorError: the environment or the policy failed; names the episode.
     """
-    collector = EpisodeCollector(
-        env,
-        policy,
-        frames_per_batch=max_steps,
-        compile_policy=compile_policy,
-        exploration_type=ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC,
-    )
+    exploration = ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC
+    collector: EpisodeCollector | None = None
+    if _parts(env) is not None:
+        collector = EpisodeCollector(
+            env,
+            policy,
+            frames_per_batch=max_steps,
+            compile_policy=compile_policy,
+            exploration_type=exploration,
+        )
     try:
         for number in range(1, episodes + 1):
             with simulating(f"the task failed in test episode {number}"):
-                episode = collector.rollout()
-                if not episode["next", "done"][-1].any():  # No end of the environment's own.
-                    collector.reset()
+                if collector is None:
+                    with torch.no_grad(), set_exploration_type(exploration):
+                        episode = env.rollout(max_steps, policy)
+                else:
+                    episode = collector.rollout()
+                    if not episode["next", "done"][-1].any():  # No end of the environment's own.
+                        collector.reset()
             yield episode
     finally:
-        collector.shutdown(close_env=False)
+        if collector is not None:
+            collector.shutdown(close_env=False)
 
 
-def simulator_and_noise(env: EnvBase) -> tuple[GymWrapper | None, ObservationNoise | None]:
-    """The two parts of an environment; no simulator where there is more to the environment."""
+def simulator_and_noise(env: EnvBase) -> tuple[GymWrapper, ObservationNoise | None]:
+    """The two parts of an environment.
+
+    Raises:
+        ValueError: there are other parts.
+    """
+    parts = _parts(env)
+    if parts is None:
+        raise ValueError(
+            "Expected one Gymnasium environment with no transform but ObservationNoise, got "
+            f"{env}. Use TorchRL's Collector for others."
+        )
+    return parts
+
+
+def _parts(env: EnvBase) -> tuple[GymWrapper, ObservationNoise | None] | None:
     transforms: list[Transform] = []
     simulator = env
     if isinstance(env, TransformedEnv):
         transforms, simulator = list(_flat(env.transform)), env.base_env
     plain = isinstance(simulator, GymWrapper) and not simulator.batch_size
     if not plain or len(transforms) > 1:
-        return None, None
+        return None
     if not all(isinstance(transform, ObservationNoise) for transform in transforms):
-        return None, None
+        return None
     return simulator, transforms[0] if transforms else None
 
 

@@ -143,11 +143,6 @@ class _Stream:
 
     def __init__(self, env: EnvBase, keep_previous: bool) -> None:
         simulator, self._noise = simulator_and_noise(env)
-        if simulator is None:
-            raise ValueError(
-                "RolloutCollector plays Gymnasium environments with no transform but "
-                f"ObservationNoise, got {env}."
-            )
         self._env, self._gymnasium = env, simulator._env
         self._keep_previous = keep_previous
         self._dtype = simulator.observation_spec["observation"].dtype

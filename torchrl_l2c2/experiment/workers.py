@@ -18,7 +18,6 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
-from torch import Tensor
 from torchrl.collectors import MultiSyncCollector
 from torchrl.envs import EnvBase, ExplorationType
 
@@ -209,10 +208,6 @@ class _EpisodeWorker(EpisodeCollector):
             keep_previous=keep_previous,
         )
         self._use_buffers = False
-
-    def reset(self, index: Tensor | None = None, **kwargs: Any) -> None:
-        """The next episode resets the simulator by itself."""
-        self._observation = None
 
     def rollout(self) -> TensorDictBase:
         # The parent sets it for a round that is to be random, all of it or nothing.
