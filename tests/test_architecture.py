@@ -67,7 +67,7 @@ experiment.reports.comparison experiment.reports.measures
 experiment.reports.figures
 experiment.reports.report experiment.reports.results
 experiment.reports.__init__
-experiment.reports.__main__ experiment.front
+experiment.reports.__main__
 experiment.trained
 experiment.video
 experiment.workers
@@ -85,8 +85,6 @@ experiment.continuation experiment.schedules
 experiment.training
 experiment.composition
 experiment.command
-experiment.search_space
-experiment.search
 experiment.__init__
 experiment.__main__ __main__
 """.strip().splitlines()

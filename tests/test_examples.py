@@ -51,6 +51,20 @@ def test_it_trains_and_says_what_it_learned(
     assert 0 < float(told["action variation"]) <= 4  # its actions lie in [-2, 2]
 
 
+def test_a_search_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A trial that was interrupted is the first to be finished, and the next ones are new."""
+    monkeypatch.chdir(tmp_path)
+    search = runpy.run_path(str(ROOT / "examples" / "search.py"))
+    search["main"].__globals__["measure"] = lambda number, *_: [float(number), 0.1]
+    search["main"](1, 1)
+    lost = search["open_study"]().ask(search["SPACE"])
+    search["main"](3, 1)
+    trials = search["open_study"]().trials
+    assert [trial.state.name for trial in trials] == ["COMPLETE"] * 3
+    assert trials[1].params == lost.params and trials[1].values == [1.0, 0.1]
+    assert len({tuple(trial.params.values()) for trial in trials}) == 3
+
+
 def test_it_is_short(example: Path) -> None:
     """Under 80 lines, to be read in one go."""
     assert len(example.read_text().splitlines()) < 80

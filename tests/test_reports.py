@@ -769,3 +769,17 @@ class TestReport:
         with pytest.raises(SystemExit):
             main([])
         assert "name folders of runs" in capsys.readouterr().err
+
+
+def test_a_report_that_cannot_be_drawn_leaves_none(tmp_path, monkeypatch):
+    """Nor a half of one: a picture without its page would pass for all there is."""
+    make_run(tmp_path / "run", make_config(), 10.0, 0.05)
+    records = [run.record for run in read_runs(tmp_path)]
+
+    def fail(*_):
+        raise ValueError("no picture")
+
+    monkeypatch.setattr("torchrl_l2c2.experiment.reports.report.draw_plane", fail)
+    with pytest.raises(ValueError, match="no picture"):
+        write_report(tmp_path / "report", records)
+    assert not (tmp_path / "report").exists()

@@ -195,7 +195,10 @@ def test_a_launcher_says_what_it_needs(name, monkeypatch):
             "error: +experiment=glob(table3*): each ",
         ),
         ("experiment=[cartpole,pendulum]", "error: experiment=[cartpole,pendulum]: each "),
-        ("optimizer.lr=interval(0,1)", "error: an interval is nothing to sweep over: python -m"),
+        (
+            "optimizer.lr=interval(0,1)",
+            "error: an interval is nothing to sweep over: examples",
+        ),
     ],
 )
 def test_a_sweep_of_nothing_says_so(sweep, told):

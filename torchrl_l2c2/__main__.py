@@ -20,7 +20,6 @@ Commands, with the extra "experiment": pip install "torchrl-l2c2[experiment]"
   python -m torchrl_l2c2.experiment.diagnose FOLDER  a page of why its policy shakes
   python -m torchrl_l2c2.experiment.noise FOLDER     how the policies below it bear noise
   python -m torchrl_l2c2.experiment.reports FOLDER   tables and pictures of the runs below a folder
-  python -m torchrl_l2c2.experiment.search ...       gains by Optuna, for return and smoothness
   python -m torchrl_l2c2.experiment.manual           docs/settings.md
 
 torchrl-l2c2 is the first of them. The README, docs/ and examples/ of the source have the rest.

@@ -89,8 +89,7 @@ def check_sweep(arguments: Sequence[str]) -> None:
         empty = not list_jobs(arguments, {})
     except HydraException as error:  # Of which Hydra itself says more, or finds what a glob is.
         if "INTERVAL" in str(error):
-            search = "python -m torchrl_l2c2.experiment.search"
-            sys.exit(f"error: an interval is nothing to sweep over: {search} searches in it.")
+            sys.exit("error: an interval is nothing to sweep over: examples/search.py searches.")
         return
     if empty:
         sys.exit(f"error: a sweep of no job: one of {' '.join(arguments)} has no value.")

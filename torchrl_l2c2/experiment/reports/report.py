@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,7 +16,7 @@ from torchrl_l2c2.experiment.reports.document import picture, whole_page
 from torchrl_l2c2.experiment.reports.figures import draw_learning_curves, draw_plane
 from torchrl_l2c2.experiment.reports.groups import Group, group_records
 from torchrl_l2c2.experiment.reports.measures import measures_table
-from torchrl_l2c2.experiment.reports.tables import Table, runs_table, settings_notes
+from torchrl_l2c2.experiment.reports.tables import runs_table, settings_notes
 
 Draw = Callable[[Path], None]
 
@@ -26,8 +26,6 @@ def write_report(
     records: Sequence[Record],
     runs: Sequence[FinishedRun] = (),
     notes: Sequence[str] = (),
-    first: Sequence[Table] = (),
-    pictures: Mapping[str, Draw] | None = None,
 ) -> Path:
     """Writes ``report.md``, ``report.html``, ``report.json`` and the pictures as SVG files.
 
@@ -39,19 +37,17 @@ def write_report(
         runs (sequence of FinishedRun): The folders of the same runs, for learning curves and
             further measures.
         notes (sequence of str): Lines about left out folders, for example.
-        first (sequence of Table): Tables before the others.
-        pictures (mapping, optional): Functions that draw further pictures into a file, by its name.
 
     Returns:
         Path: The page, which contains its pictures and needs no other file.
     """
     groups = group_records(records)
     notes = [*notes, *settings_notes(groups)]
-    tables = [*first, *(comparison_table(test, groups) for test in known_tests(groups))]
+    tables = [comparison_table(test, groups) for test in known_tests(groups)]
     details = [table for table in (measures_table(runs), runs_table(records)) if table is not None]
     numbers = {"groups": summary(groups), "notes": notes}
     with TemporaryDirectory() as drawn:
-        for name, draw in (_pictures(groups, runs) | dict(pictures or {})).items():
+        for name, draw in _pictures(groups, runs).items():
             draw(Path(drawn) / name)
         shown = {path.name: path.read_bytes() for path in sorted(Path(drawn).iterdir())}
     text = "\n\n".join(
