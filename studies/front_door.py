@@ -84,7 +84,7 @@ def train_td3(seed: int, smoothed: bool, frames: int = 5_000) -> torch.nn.Module
         if smoothed:
             loss.set_progress(50 * number / frames)
         replay.extend(collected)
-        for update in range(26 if len(replay) >= 500 else 0):
+        for update in range(50 if len(replay) >= 500 else 0):
             batch = replay.sample()
             value_loss, _ = loss.value_loss(batch)
             critic_optimizer.zero_grad()
@@ -100,7 +100,7 @@ def train_td3(seed: int, smoothed: bool, frames: int = 5_000) -> torch.nn.Module
     return actor
 
 
-def train_ppo(seed: int, smoothed: bool, frames: int = 40_960) -> torch.nn.Module:
+def train_ppo(seed: int, smoothed: bool, frames: int = 30_720) -> torch.nn.Module:
     """PPO on rollouts of 2,048 frames."""
     env = pendulum(seed)
     actor, critic = make_actor(3, env.action_spec, hidden=(64, 64)), make_critic(3, hidden=(64, 64))
@@ -116,7 +116,7 @@ def train_ppo(seed: int, smoothed: bool, frames: int = 40_960) -> torch.nn.Modul
     for number, rollout in enumerate(collector):
         if smoothed:
             loss.set_progress(number * 2_048 / frames)
-        for _ in range(10):
+        for _ in range(8):
             with torch.no_grad():
                 advantage(rollout)
             replay.extend(rollout.reshape(-1))
