@@ -662,6 +662,7 @@ class TestLCP:
         rows = []
         base = PPOLoss(gaussian_actor(), None)
         loss, batch = regularizer(base), transitions(8)
+        loss.policy_regularizer(batch)  # The first call looks for random numbers.
         net = loss.actor_network.module[0].module
         net.register_forward_hook(lambda *of: rows.append(of[1][0].shape[:-1].numel()))
         loss.policy_regularizer(batch)

@@ -13,6 +13,8 @@ from torchrl_l2c2 import objectives
 from torchrl_l2c2._checks import check_real
 from torchrl_l2c2.neighborhood import Neighborhood
 from torchrl_l2c2.objectives import RegularizedLoss
+from torchrl_l2c2.objectives._batch import check_evaluates_states
+from torchrl_l2c2.objectives._networks import POLICY_NETWORK
 from torchrl_l2c2.presets import (
     GAIN_SETTING,
     KINDS,
@@ -95,6 +97,7 @@ def smooth(
     if method not in METHODS:
         raise ValueError(f"Expected method to be one of {list(METHODS)}, got {method!r}.")
     check_real("strength", strength, at_least=0)
+    check_evaluates_states(loss)
     chosen = _chosen(loss, method, overrides)
     make = getattr(objectives, METHODS[method])
     regularized = make(loss, **_arguments(method, make, chosen.settings))
@@ -131,10 +134,14 @@ def _chosen(loss: LossModule, method: str, overrides: Mapping[str, Any]) -> Pres
 
 def _no_preset(loss: LossModule, method: str) -> str:
     name = type(loss).__name__
-    names = [part.__name__ for part in type(loss).__mro__]
-    kind = next((NEAREST[each] for each in names if each in NEAREST), None)
-    if kind is None:
-        kind = "sac" if getattr(loss, "qvalue_network", None) is not None else "ppo"
+    if getattr(loss, POLICY_NETWORK, None) is None:
+        if method != "l2c2":
+            return f"{method} needs a policy: {name} has none. 'l2c2' smooths value functions, too."
+        kind = "ppo_rpe"  # The only preset that smooths values.
+    else:
+        names = [part.__name__ for part in type(loss).__mro__]
+        others = "sac" if getattr(loss, "qvalue_network", None) is not None else "ppo"
+        kind = next((NEAREST[each] for each in names if each in NEAREST), others)
     nearest = preset(method, kind)
     settings = dict(nearest.settings) | ({} if nearest.ramp is None else {"ramp": nearest.ramp})
     return (

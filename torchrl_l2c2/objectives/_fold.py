@@ -33,7 +33,10 @@ PARTS: dict[str, tuple[str, tuple[str, ...]]] = {
     "actor_bc_loss": ("policy", ALTERNATIVE_LOSSES),
     "value_loss": ("value", ("loss_value", "loss_qvalue")),
     "loss_value": ("value", ("loss_value",)),
+    "loss_critic": ("value", ("loss_critic", "loss_value")),
     "qvalue_loss": ("value", ("loss_qvalue",)),
+    "qvalue_v1_loss": ("value", ("loss_qvalue",)),
+    "qvalue_v2_loss": ("value", ("loss_qvalue",)),
     "q_loss": ("value", ("loss_qvalue",)),
 }
 
@@ -122,13 +125,15 @@ def make_part(
         regularize = self.policy_regularizer if kind == "policy" else self.value_regularizer
         value, *rest = out if isinstance(out, tuple) else (out,)
         metadata = rest[0] if rest and hasattr(rest[0], "update") else {}
-        own = [key for key in self.out_keys if key.startswith("loss")] or list(targets)
+        own = [key for key in self.out_keys_source if key.startswith("loss")] or list(targets)
         returned = next((key for key in targets if key in own), None)
         for key, term in list(regularize(tensordict).items()):
             if key not in self.added_terms:
                 metadata[key] = term
             elif returned in fold_targets(key, kind == "policy", own):
-                value = add_penalty(value, term, str(returned))
+                if value.ndim and not term.ndim and self._term_reduction == "sum":
+                    term = term / value.numel()  # The loop sums what this method did not reduce.
+                value = add_penalty(value, self._folded_value(key, term), str(returned))
                 metadata["penalty_" + key.removeprefix("loss_")] = term.detach()
         return (value, *rest) if isinstance(out, tuple) else value
 
@@ -157,9 +162,10 @@ class TermWatch:
         if self._forwards == PATIENCE and loss._ramp is not None and not self.progress_set:
             warnings.warn(
                 f"the gain of {type(loss).__name__} follows the progress of training, and "
-                f"set_progress was not called in {PATIENCE} updates: it stays at its last value, "
-                f"{loss._ramp[0]:g}. Call loss.set_progress(frames / total_frames) after every "
-                "rollout, or choose ramp=None.",
+                f"set_progress was not called in {PATIENCE} updates: it stays at "
+                f"{loss.regularizer_gain.item():g}. Call "
+                "loss.set_progress(frames / total_frames) after every rollout, or "
+                "choose ramp=None.",
                 stacklevel=4,
             )
         if loss.folded:

@@ -283,6 +283,8 @@ class EvaluatedNetworks:
         Or a network that was copied from it, by its name: a regularizer's own.
         """
         rows = self._rows(POLICY_NETWORK, tensordict, states, with_batch=False)
+        if network == POLICY_NETWORK:
+            self._check_repeatable(loss, network, rows)
         out = self._evaluate(loss, network, rows)
         (there,) = _split(out, 0, [len(states)], tensordict)
         return self._policy(loss, there)
@@ -399,7 +401,6 @@ class EvaluatedNetworks:
         spec = self.specs[network]
         if network in self._repeatable or is_compiling() or spec.trunk or not len(rows):
             return
-        self._repeatable.add(network)
         some = rows[:8]
         devices = {value.device for value in some.values(True, True) if value.is_cuda}
         with torch.random.fork_rng(devices), torch.no_grad():
@@ -418,6 +419,7 @@ class EvaluatedNetworks:
                     "numbers in its forward pass, and a regularizer would measure these. Make the "
                     "random numbers an input of the network, or draw them outside of it."
                 )
+        self._repeatable.add(network)
 
     def _rows(
         self, network: str, tensordict: TensorDictBase, states: TensorDictBase, with_batch: bool

@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from difflib import get_close_matches
+from textwrap import indent
 from types import MappingProxyType
 from typing import Any, ClassVar, TypeVar
 
@@ -221,6 +222,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         Args:
             tensordict (TensorDictBase): the batch that ``forward`` or ``value_loss`` takes.
         """
+        self._watch.see_regularizer(self)
         return TensorDict()
 
     # Folding and the gain.
@@ -241,14 +243,12 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             TypeError: the loss has no term that a penalty can be added to.
         """
         added = {*self.added_terms, *self._diagnostics}
-        own = [key for key in self.out_keys if key not in added]
+        own = [key for key in self.out_keys_source if key not in added]
         if own:  # Some losses list none.
             for term in sorted(self.added_terms):
                 fold_targets(term, term in self._policy_side, own)
         self._folded = True
-        self.out_keys = [
-            penalty_key(key) if key in self.added_terms else key for key in self.out_keys
-        ]
+        self._rename_out_keys({term: penalty_key(term) for term in self.added_terms})
         return self
 
     def unfold(self) -> RegularizedLoss:
@@ -258,9 +258,16 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             The loss itself.
         """
         self._folded = False
-        names = {penalty_key(term): term for term in self.added_terms}
-        self.out_keys = [names.get(key, key) for key in self.out_keys]
+        self._rename_out_keys({penalty_key(term): term for term in self.added_terms})
         return self
+
+    def _rename_out_keys(self, names: Mapping[str, str]) -> None:
+        """Renames entries of ``out_keys``; a selection of them stays one."""
+        selected = [names.get(key, key) for key in self.out_keys]
+        self.reset_out_keys()
+        self.out_keys = [names.get(key, key) for key in self.out_keys]
+        if selected != self.out_keys:
+            self.select_out_keys(*selected)
 
     @property
     def folded(self) -> bool:
@@ -328,22 +335,27 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         check_real("progress", progress, at_least=0, at_most=2, hint=hint)
         if self._ramp is None:
             return
+        self._watch.progress_set = True
         self._buffers[PROGRESS].fill_(min(1.0, progress))
         self._follow_progress()
 
     def _follow_progress(self) -> None:
-        progress = self._buffers[PROGRESS].item()
-        if self._ramp is not None and progress >= 0:
+        if self._ramp is not None:
             end, length = self._ramp
-            self.regularizer_gain = end * min(1.0, progress / length)
+            progress = self._buffers[PROGRESS].item()  # -1 before the first call
+            self.regularizer_gain = end * min(1.0, progress / length) if progress >= 0 else end
 
     def _load_from_state_dict(
         self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
     ) -> None:
-        if self._ramp is not None:  # A checkpoint of the base loss has no progress.
-            state_dict.setdefault(prefix + PROGRESS, self._buffers[PROGRESS].clone())
+        if self._ramp is None:
+            super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+            return
+        saved = prefix + PROGRESS in state_dict
+        if not saved:  # A checkpoint of the base loss: the progress stays.
+            state_dict[prefix + PROGRESS] = self._buffers[PROGRESS].clone()
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
-        if self._ramp is not None:
+        if saved:
             self._follow_progress()
 
     @property
@@ -351,9 +363,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         """Terms that train the policy, or a predictor of the regularizer's own."""
         return self.policy_terms | self.auxiliary_terms
 
-    def _add_penalties(
-        self, terms: TensorDictBase, added: TensorDictBase, only: Iterable[str] | None = None
-    ) -> None:
+    def _add_penalties(self, terms: TensorDictBase, added: TensorDictBase) -> None:
         """Adds penalties to the loss's own terms, and reports them."""
         own = [key for key in terms.keys() if key not in self.added_terms]
         for key, value in list(added.items()):
@@ -361,8 +371,13 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
                 terms.set(key, value)
                 continue
             for target in fold_targets(key, key in self._policy_side, own):
-                terms.set(target, add_penalty(terms.get(target), value, target))
+                folded = self._folded_value(key, value)
+                terms.set(target, add_penalty(terms.get(target), folded, target))
             terms.set(penalty_key(key), value.detach())
+
+    def _folded_value(self, key: str, term: Tensor) -> Tensor:
+        """A term as it is added: the gradient alone, if it trains the regularizer's own network."""
+        return term - term.detach() if key in self.auxiliary_terms else term
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name not in self._coefficients:
@@ -395,6 +410,12 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
                 f"{name!r} scales nothing in a {type(self).__name__}: the gain is {gains[0]!r}.",
                 stacklevel=3,
             )
+
+    def __repr__(self) -> str:
+        # TensorDict's modules leave extra_repr out.
+        start = f"{type(self).__name__}("
+        rest = super().__repr__().removeprefix(start).lstrip("\n")
+        return f"{start}\n{indent(self.extra_repr(), 4 * ' ')}\n{rest}"
 
     def extra_repr(self) -> str:
         """The settings of the regularizers, the first lines of ``print(loss)``."""

@@ -1,0 +1,853 @@
+"""The front door: smooth() in training loops like those of TorchRL, its presets and its ramp."""
+
+from __future__ import annotations
+
+import copy
+import math
+import pickle
+import re
+import warnings
+from types import SimpleNamespace
+
+import pytest
+import torch
+from losses import (
+    BOUNDS,
+    CASES,
+    batch_norm_qvalue,
+    critic,
+    deterministic_actor,
+    gaussian_actor,
+    heads_critic,
+    on_policy,
+    qvalue,
+    transitions,
+)
+from torch import nn
+from torchrl.objectives import (
+    BCLoss,
+    ClipPPOLoss,
+    CQLLoss,
+    CrossQLoss,
+    DDPGLoss,
+    DTLoss,
+    IQLLoss,
+    PPOLoss,
+    SACLoss,
+    TD3Loss,
+)
+from torchrl.objectives.value import GAE
+from torchrl.trainers import DefaultOptimizationStepper
+
+import torchrl_l2c2
+from torchrl_l2c2 import (
+    CATSLoss,
+    Neighborhood,
+    PPORPELoss,
+    smooth,
+)
+from torchrl_l2c2.presets import KINDS, METHODS, NEAREST, PRESETS
+
+# Settings for losses without a preset.
+GIVEN = {"policy_distance": "mean", "shared": True, "lambda_min": 10.0, "lambda_max": 1000.0}
+
+
+def seeded(make, *args, seed=0, **kwargs):
+    torch.manual_seed(seed)
+    return make(*args, **kwargs)
+
+
+def updated(loss, loop, batch, loss_seed=2):
+    """How a loop changes each parameter; the optimizers are SGD with a rate of 1."""
+    before = {name: p.detach().clone() for name, p in loss.named_parameters()}
+    torch.manual_seed(loss_seed)
+    loop(loss, batch.copy())
+    return {name: before[name] - p.detach() for name, p in loss.named_parameters()}
+
+
+def equal(a, b):
+    return bool((a == b).all())
+
+
+def gradients(loss, value):
+    names, parameters = zip(*loss.named_parameters(), strict=True)
+    found = torch.autograd.grad(value, parameters, allow_unused=True)
+    return {
+        name: torch.zeros_like(p) if g is None else g
+        for name, p, g in zip(names, parameters, found, strict=True)
+    }
+
+
+def step(parameters, value):
+    """Differentiates with respect to all parameters; an optimizer moves some."""
+    optimizer = torch.optim.SGD(list(parameters), lr=1.0)
+    optimizer.zero_grad()
+    value.mean().backward()  # Some methods return one number for each transition.
+    optimizer.step()
+
+
+def leaves(params):
+    return list(params.flatten_keys().values())
+
+
+# Training loops, in the forms of TorchRL's scripts. Each makes one update.
+
+
+def sac_loop(loss, batch):
+    """Named terms, and an optimizer for each network."""
+    terms = loss(batch)
+    actor = torch.optim.SGD(leaves(loss.actor_network_params), lr=1.0)
+    values = torch.optim.SGD(leaves(loss.qvalue_network_params), lr=1.0)
+    alpha = torch.optim.SGD([loss.log_alpha], lr=1.0)
+    (terms["loss_actor"] + terms["loss_qvalue"] + terms["loss_alpha"]).backward()
+    for optimizer in (actor, values, alpha):
+        optimizer.step()
+        optimizer.zero_grad()
+
+
+def sac_parts_loop(loss, batch):
+    """The methods of the loss, one after the other."""
+    value, _ = loss.qvalue_v2_loss(batch)
+    step(leaves(loss.qvalue_network_params), value)
+    value, metadata = loss.actor_loss(batch)
+    step(leaves(loss.actor_network_params), value)
+    step([loss.log_alpha], loss.alpha_loss(log_prob=metadata["log_prob"]))
+
+
+def ppo_loop(loss, batch):
+    """Advantages, then three named terms and one optimizer."""
+    with torch.no_grad():
+        estimate = GAE(gamma=0.9, lmbda=0.9, value_network=loss.critic_network)
+        estimate(batch, params=loss.critic_network_params)
+    terms = loss(batch)
+    value = terms["loss_critic"] + terms["loss_objective"] + terms["loss_entropy"]
+    step(loss.parameters(), value)
+
+
+def td3_loop(loss, batch):
+    """The critics, then the delayed policy."""
+    value, _ = loss.value_loss(batch)
+    step(leaves(loss.qvalue_network_params), value)
+    value, _ = loss.actor_loss(batch)
+    step(leaves(loss.actor_network_params), value)
+
+
+def ddpg_loop(loss, batch):
+    value, _ = loss.loss_value(batch)
+    step(leaves(loss.value_network_params), value)
+    value, _ = loss.loss_actor(batch)
+    step(leaves(loss.actor_network_params), value)
+
+
+def cql_loop(loss, batch):
+    """The critics' two terms, the actor, the temperature."""
+    value, _ = loss.q_loss(batch)
+    conservative, _ = loss.cql_loss(batch)
+    step(leaves(loss.qvalue_network_params), value + conservative)
+    value, metadata = loss.actor_loss(batch)
+    step(leaves(loss.actor_network_params), value)
+    step([loss.log_alpha], loss.alpha_loss(metadata)[0])
+
+
+def cql_cloning_loop(loss, batch):
+    """The first steps: the policy is cloned instead."""
+    value, _ = loss.actor_bc_loss(batch)
+    step(leaves(loss.actor_network_params), value)
+
+
+def cql_named_loop(loss, batch, cloning=True):
+    terms = loss(batch)
+    policy = terms["loss_actor_bc"] if cloning else terms["loss_actor"]
+    step(leaves(loss.actor_network_params), policy)
+
+
+def iql_loop(loss, batch):
+    value, _ = loss.value_loss(batch)
+    step(leaves(loss.value_network_params), value)
+    value, _ = loss.actor_loss(batch)
+    step(leaves(loss.actor_network_params), value)
+    value, _ = loss.qvalue_loss(batch)
+    step(leaves(loss.qvalue_network_params), value)
+
+
+def crossq_loop(loss, batch):
+    value, _ = loss.qvalue_loss(batch)
+    step(leaves(loss.qvalue_network_params), value)
+    value, metadata = loss.actor_loss(batch)
+    step(leaves(loss.actor_network_params), value)
+    step([loss.log_alpha], loss.alpha_loss(log_prob=metadata["log_prob"]))
+
+
+def trainer_loop(loss, batch):
+    """TorchRL's own optimization step."""
+    trainer = SimpleNamespace(
+        compute_loss=loss,
+        optimizer=torch.optim.SGD(loss.parameters(), lr=1.0),
+        clip_grad_norm=False,
+        clip_norm=None,
+    )
+    DefaultOptimizationStepper().step(trainer, batch)
+
+
+def isaac_lab_loop(loss, batch):
+    """Every loss_ key; then the divergence of the whole batch sets the learning rate."""
+    batch = batch.set("advantage", batch["next", "reward"]).set("value_target", batch["advantage"])
+    terms = loss(batch)
+    value = sum(terms[key] for key in terms.keys() if key.startswith("loss_"))
+    optimizer = torch.optim.SGD(loss.parameters(), lr=1.0)
+    value.backward()
+    optimizer.step()
+    with torch.no_grad():
+        divergence = loss(batch)["kl_approx"]
+    assert divergence.isfinite()
+
+
+def sac():
+    return SACLoss(gaussian_actor(), qvalue(), action_spec=BOUNDS)
+
+
+def ppo():
+    return ClipPPOLoss(gaussian_actor(), critic(), entropy_coeff=0.01)
+
+
+def td3():
+    return TD3Loss(deterministic_actor(), qvalue(), action_spec=BOUNDS)
+
+
+def ddpg():
+    return DDPGLoss(deterministic_actor(), qvalue())
+
+
+def cql():
+    return CQLLoss(gaussian_actor(), qvalue(), action_spec=BOUNDS)
+
+
+def iql():
+    return IQLLoss(gaussian_actor(), qvalue(), critic())
+
+
+def crossq():
+    return CrossQLoss(gaussian_actor(), batch_norm_qvalue(), action_spec=BOUNDS)
+
+
+def cloning():
+    """The least costly loss with a policy."""
+    return BCLoss(deterministic_actor())
+
+
+LOOPS = {
+    "SAC": (sac, transitions, sac_loop),
+    "SAC by parts": (sac, transitions, sac_parts_loop),
+    "PPO": (ppo, on_policy, ppo_loop),
+    "TD3": (td3, transitions, td3_loop),
+    "DDPG": (ddpg, transitions, ddpg_loop),
+    "CQL": (cql, transitions, cql_loop),
+    "CQL, cloning": (cql, transitions, cql_cloning_loop),
+    "CQL, cloning by name": (cql, transitions, cql_named_loop),
+    "IQL": (iql, transitions, iql_loop),
+    "CrossQ": (crossq, transitions, crossq_loop),
+    "Trainer with SAC": (sac, transitions, trainer_loop),
+    "Trainer with TD3": (td3, transitions, trainer_loop),
+    "Isaac Lab": (ppo, on_policy, isaac_lab_loop),
+}
+# The loops that train no value function.
+CLONING = ("CQL, cloning", "CQL, cloning by name")
+
+
+@pytest.mark.filterwarnings("ignore:.*takes the preset of")
+class TestLoops:
+    """Loops that know nothing of a regularizer train with one."""
+
+    @pytest.fixture(params=LOOPS)
+    def name(self, request):
+        return request.param
+
+    def losses(self, name, **overrides):
+        make, batch, loop = LOOPS[name]
+        given = GIVEN | {"beta": 0.0} if name == "IQL" else {}
+        given = {**given, **overrides}
+        base = seeded(make)
+        folded, separate = (smooth(seeded(make), fold=fold, **given) for fold in (True, False))
+        batch = seeded(batch, 12, seed=1)
+        seeded(separate.neighbor_transform(), batch, seed=3)
+        return base, folded, separate, batch, loop
+
+    def test_the_policy_moves_by_its_loss_and_the_penalty(self, name):
+        """The change is the baseline's plus the gradient of the separate term."""
+        base, folded, separate, batch, loop = self.losses(name)
+        term = separate.policy_regularizer(batch)["loss_l2c2_actor"]
+        penalty = gradients(separate, term)
+        expected, found = updated(base, loop, batch), updated(folded, loop, batch)
+        assert expected.keys() == found.keys() == penalty.keys()
+        for key in (key for key in expected if "actor" in key):
+            torch.testing.assert_close(found[key], expected[key] + penalty[key])
+        assert max(g.abs().max() for g in penalty.values()) > 1e-3
+
+    def test_value_functions_move_as_without_a_regularizer(self, name):
+        """Bit for bit: the presets have no value term."""
+        base, folded, _, batch, loop = self.losses(name)
+        expected, found = updated(base, loop, batch), updated(folded, loop, batch)
+        for key in (key for key in expected if "actor" not in key):
+            assert torch.equal(found[key], expected[key])
+
+    def test_value_functions_have_their_penalty_where_there_is_one(self, name):
+        """With beta, each value function's own term includes its penalty."""
+        if name in CLONING:
+            pytest.skip("trains no value function")
+        base, folded, separate, batch, loop = self.losses(name, beta=0.5)
+        terms = separate.value_regularizer(batch)
+        value = sum(terms[key] for key in separate.added_terms & set(terms.keys()))
+        penalty = gradients(separate, value)
+        expected, found = updated(base, loop, batch), updated(folded, loop, batch)
+        moved = [key for key in expected if "actor" not in key and "alpha" not in key]
+        for key in moved:
+            if name == "IQL" and key.startswith("qvalue"):
+                continue  # Its target is the value that has moved by then.
+            torch.testing.assert_close(found[key], expected[key] + penalty[key])
+        assert moved and max(penalty[key].abs().max() for key in moved) > 1e-3
+
+    def test_other_methods_fold_alike(self, name):
+        """With CAPS: two penalties in one term."""
+        make, batch, loop = LOOPS[name]
+        given = {"lambda_temporal": 1.0, "lambda_spatial": 5.0}
+        base, batch = seeded(make), seeded(batch, 12, seed=1)
+        folded = smooth(seeded(make), "caps", **given, sigma=1e-4)
+        separate = smooth(seeded(make), "caps", **given, sigma=1e-4, fold=False)
+        terms = separate.policy_regularizer(batch)
+        penalty = gradients(separate, terms["loss_caps_temporal"])
+        expected, found = updated(base, loop, batch), updated(folded, loop, batch)
+        for key in (key for key in expected if "actor" in key):
+            # The noise is so small that its term is about 0.
+            torch.testing.assert_close(found[key], expected[key] + penalty[key], atol=1e-4, rtol=0)
+        assert max(g.abs().max() for g in penalty.values()) > 1e-2
+
+
+def test_without_gradients_the_penalty_costs_nothing():
+    """Isaac Lab's loop calls the loss on the whole batch once more: networks run as often."""
+    counts = {}
+    batch = seeded(on_policy, 12)
+    batch["advantage"], batch["value_target"] = torch.randn(12, 1), torch.randn(12, 1)
+    for name, loss in (("base", ppo()), ("smooth", smooth(ppo()))):
+        rows = counts.setdefault(name, [])
+        for network in (loss.actor_network, loss.critic_network):
+            network.register_forward_hook(lambda *of, rows=rows: rows.append(of[0]))
+            inner = next(m for m in network.modules() if isinstance(m, nn.Linear))
+            inner.register_forward_hook(lambda *of, rows=rows: rows.append(of[2].shape))
+        with torch.no_grad():
+            terms = loss(batch.copy())
+    assert [r for r in counts["base"] if isinstance(r, torch.Size)] == [
+        r for r in counts["smooth"] if isinstance(r, torch.Size)
+    ]
+    assert len(counts["base"]) == len(counts["smooth"]) > 1
+    assert terms["penalty_l2c2_actor"].isnan() and terms["l2c2_gain"].isnan()
+
+
+def test_without_gradients_the_terms_are_the_baselines():
+    base, loss, batch = seeded(sac), smooth(seeded(sac)), seeded(transitions, 12, seed=1)
+    with torch.no_grad():
+        expected, found = seeded(base, batch.copy(), seed=2), seeded(loss, batch.copy(), seed=2)
+        value, metadata = seeded(loss.actor_loss, batch.copy(), seed=2)
+    for key, each in expected.items():
+        assert torch.equal(each, found[key])
+    assert value.shape == (12,) or value.ndim == 0
+    assert not any("l2c2" in key for key in metadata)
+    assert set(found.keys()) == set(loss.out_keys)
+
+
+# The penalties that each of the baseline's own terms has, by the network of the penalty.
+FOLDED = {
+    "PPO": {"loss_objective": ["actor"], "loss_critic": ["critic"]},
+    "ClipPPO": {"loss_objective": ["actor"], "loss_critic": ["critic"]},
+    "KLPENPPO": {"loss_objective": ["actor"], "loss_critic": ["critic"]},
+    "PPO-composite": {"loss_objective": ["actor"], "loss_critic": ["critic"]},
+    "MAPPO": {"loss_objective": ["actor"], "loss_critic": ["critic"]},
+    "IPPO": {"loss_objective": ["actor"], "loss_critic": ["critic"]},
+    "A2C": {"loss_objective": ["actor"], "loss_critic": ["critic"]},
+    "Reinforce": {"loss_actor": ["actor"], "loss_value": ["critic"]},
+    "PPORPE": {"loss_actor": ["actor"], "loss_critic": ["critic"]},
+    "SAC": {"loss_actor": ["actor"], "loss_qvalue": ["qvalue"]},
+    "SAC-v1": {"loss_actor": ["actor"], "loss_qvalue": ["qvalue"], "loss_value": ["value"]},
+    "TQC": {"loss_actor": ["actor"], "loss_qvalue": ["qvalue"]},
+    "DiscreteSAC": {"loss_actor": ["actor"], "loss_qvalue": ["qvalue"]},
+    "DDPG": {"loss_actor": ["actor"], "loss_value": ["value"]},
+    "TD3": {"loss_actor": ["actor"], "loss_qvalue": ["qvalue"]},
+    "TD3BC": {"loss_actor": ["actor"], "loss_qvalue": ["qvalue"]},
+    "REDQ": {"loss_actor": ["actor"], "loss_qvalue": ["qvalue"]},
+    "IQL": {"loss_actor": ["actor"], "loss_qvalue": ["qvalue"], "loss_value": ["value"]},
+    "DiscreteIQL": {"loss_actor": ["actor"], "loss_qvalue": ["qvalue"], "loss_value": ["value"]},
+    "BC": {"loss_bc": ["actor"]},
+    "deterministic BC": {"loss_bc": ["actor"]},
+    "CQL": {"loss_actor": ["actor"], "loss_actor_bc": ["actor"], "loss_qvalue": ["qvalue"]},
+    "DiscreteCQL": {"loss_qvalue": ["value"]},
+    "CrossQ": {"loss_actor": ["actor"], "loss_qvalue": ["qvalue"]},
+    "DQN": {"loss": ["value"]},
+    "DistributionalDQN": {"loss": ["value"]},
+    "QMixer": {"loss": ["local_value"]},
+}
+# Wide and strong, so that a penalty is well above the rounding of the loss's own term.
+WIDE = {"sigma": 1.0, "lambda_min": 2.0, "lambda_max": 20.0, "beta": 0.5, "ramp": None}
+
+
+@pytest.mark.filterwarnings("ignore")
+class TestFolding:
+    @pytest.fixture(params=CASES, ids=str)
+    def case(self, request):
+        return request.param
+
+    def losses(self, case, **kwargs):
+        base, folded, separate = (seeded(case.make, **kwargs) for _ in range(3))
+        folded = smooth(folded, **WIDE)
+        return base, folded, smooth(separate, fold=False, **WIDE)
+
+    def folded(self, case):
+        """A new one: some losses keep what they have seen."""
+        return smooth(seeded(case.make), **WIDE)
+
+    def run(self, loss, case):
+        return seeded(loss, seeded(case.batch, 6, seed=1), seed=2)
+
+    def test_each_penalty_is_part_of_the_term_of_its_network(self, case):
+        """The own terms are the baseline's plus the separate penalties, which are reported."""
+        base, folded, separate = (self.run(each, case) for each in self.losses(case))
+        targets = FOLDED[case.name]
+        for key in base.keys():
+            expected = base[key]
+            for network in targets.get(key, ()):
+                expected = expected + separate[f"loss_l2c2_{network}"]
+            assert equal(folded[key], expected)
+        for network in {name for names in targets.values() for name in names}:
+            penalty = folded[f"penalty_l2c2_{network}"]
+            assert torch.equal(penalty, separate[f"loss_l2c2_{network}"]) and penalty > 0
+            assert not penalty.requires_grad
+        losses = {key for key in folded.keys() if key.startswith("loss")}
+        assert losses == {key for key in base.keys() if key.startswith("loss")}
+
+    def test_separate_terms_leave_the_own_ones_bit_for_bit(self, case):
+        base, _, separate = self.losses(case)
+        expected, found = self.run(base, case), self.run(separate, case)
+        assert all(equal(value, found[key]) for key, value in expected.items())
+
+    @pytest.mark.parametrize("fold", [True, False])
+    def test_no_strength_is_the_baseline_bit_for_bit(self, case, fold):
+        """Values and gradients."""
+        base, *_ = self.losses(case)
+        loss = smooth(seeded(case.make), strength=0, fold=fold, **WIDE)
+        expected, found = self.run(base, case), self.run(loss, case)
+        assert all(equal(value, found[key]) for key, value in expected.items())
+        keys = [key for key in expected.keys() if key.startswith("loss")]
+        totals = [sum(terms[key] for key in keys) for terms in (expected, found)]
+        ours = gradients(loss, totals[1])
+        for name, gradient in gradients(base, totals[0]).items():
+            assert torch.equal(gradient, ours[name])
+
+    def test_unfolding_undoes_it(self, case):
+        """Terms, values and out_keys are those of a loss that was never folded."""
+        _, folded, separate = self.losses(case)
+        assert folded.folded and not separate.folded
+        if case.declares_keys:
+            assert not any(key.startswith("loss_l2c2") for key in folded.out_keys)
+            assert {f"penalty_{term.removeprefix('loss_')}" for term in case.terms} <= set(
+                folded.out_keys
+            )
+        folded.unfold()
+        assert not folded.folded and folded.out_keys == separate.out_keys
+        expected, found = self.run(separate, case), self.run(folded, case)
+        assert set(expected.keys()) == set(found.keys())
+        assert all(equal(value, found[key]) for key, value in expected.items())
+
+    @pytest.mark.parametrize("reduction", ["sum", "none"])
+    def test_with_other_reductions(self, case, reduction):
+        """Penalties are reduced as the own terms, or it is said why they are not added."""
+        if reduction not in case.reductions:
+            pytest.skip("the baseline has no such reduction")
+        base, folded, separate = self.losses(case, reduction=reduction)
+        expected, penalties = self.run(base, case), self.run(separate, case)
+        try:
+            found = self.run(folded, case)
+        except ValueError as error:
+            assert reduction == "none" and "use a loss with reduction='mean', or fold=False" in str(
+                error
+            )
+            return
+        for key in (key for key in expected.keys() if key.startswith("loss")):
+            value = expected[key]
+            for network in FOLDED[case.name].get(key, ()):
+                penalty = penalties[f"loss_l2c2_{network}"]
+                assert value.numel() == penalty.numel() and (penalty.ndim > 0) == (
+                    reduction == "none"
+                )
+                value = value + penalty.reshape(value.shape)
+            assert equal(found[key], value)
+
+    def test_copies_and_pickles_are_folded(self, case):
+        if case.name == "CrossQ":
+            pytest.skip("a copy of the baseline has other values, too")
+        folded, expected = self.folded(case), self.run(self.folded(case), case)
+        twins = [copy.deepcopy(folded)]
+        try:
+            pickle.dumps(seeded(case.make))
+            twins.append(pickle.loads(pickle.dumps(folded)))
+        except (AttributeError, pickle.PicklingError):
+            pass  # The baseline does not pickle either.
+        for twin in twins:
+            assert type(twin) is type(folded) and twin.folded and twin.out_keys == folded.out_keys
+            found = self.run(twin, case)
+            assert all(equal(value, found[key]) for key, value in expected.items())
+
+    def test_checkpoints_are_interchangeable_with_the_baseline(self, case):
+        base, folded, _ = self.losses(case)
+        assert list(folded.state_dict()) == list(base.state_dict())
+        folded.load_state_dict(seeded(case.make, seed=5).state_dict())
+
+    def test_out_keys_can_be_selected_and_reset(self, case):
+        if not (case.declares_keys and case.selects):
+            pytest.skip("the baseline does not do so either")
+        folded, expected = self.folded(case), self.run(self.folded(case), case)
+        keys = list(folded.out_keys)
+        network = case.terms[0].removeprefix("loss_")
+        wanted = [next(iter(FOLDED[case.name])), f"penalty_{network}"]
+        folded.select_out_keys(*wanted)
+        found = self.run(folded, case)
+        assert set(found.keys()) == set(wanted) == set(folded.out_keys)
+        assert all(torch.equal(found[key], expected[key]) for key in wanted)
+        assert folded.unfold().fold().out_keys == wanted
+        folded.reset_out_keys()
+        assert folded.out_keys == keys
+        assert set(keys) <= set(self.run(folded, case).keys())
+
+    def test_keys_can_be_renamed(self, case):
+        if not case.values:
+            pytest.skip("behavior cloning reads no rewards")
+        folded, expected = self.folded(case), self.run(self.folded(case), case)
+        keys = list(folded.out_keys)
+        folded.set_keys(reward="other_reward")
+        assert folded.out_keys == keys
+        batch = seeded(case.batch, 6, seed=1)
+        batch["next"].rename_key_("reward", "other_reward")
+        found = seeded(folded, batch, seed=2)
+        assert all(equal(value, found[key]) for key, value in expected.items())
+
+
+def previous(batch, key="observation"):
+    """With the observation before each state, which Grad-CAPS and ASAP read."""
+    return batch.set("before", batch[key] + 0.1 * torch.randn_like(batch[key]))
+
+
+def overrides_of(method):
+    return {"previous_key": "before"} if method in ("grad_caps", "asap") else {}
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("method", METHODS)
+class TestEveryMethod:
+    def test_no_strength_is_the_baseline_bit_for_bit(self, method):
+        """Values and gradients of the baseline's parameters, folded or not."""
+        for fold in (True, False):
+            base = seeded(sac)
+            loss = smooth(seeded(sac), method, strength=0, fold=fold, **overrides_of(method))
+            batch = previous(seeded(transitions, 12, seed=1))
+            expected, found = (seeded(each, batch.copy(), seed=2) for each in (base, loss))
+            keys = list(expected.keys())
+            assert all(torch.equal(expected[key], found[key]) for key in keys)
+            keys = [key for key in keys if key.startswith("loss")]
+            totals = [sum(terms[key] for key in keys) for terms in (expected, found)]
+            ours = gradients(loss, totals[1])
+            for name, gradient in gradients(base, totals[0]).items():
+                assert torch.equal(gradient, ours[name])
+
+    def test_twice_the_strength_is_twice_the_penalty(self, method):
+        batch = previous(seeded(transitions, 12, seed=1))
+        once, twice = (
+            smooth(seeded(sac), method, strength=strength, **overrides_of(method))
+            for strength in (1, 2)
+        )
+        expected, found = (seeded(each, batch.copy(), seed=2) for each in (once, twice))
+        penalties = [f"penalty_{key.removeprefix('loss_')}" for key in once.policy_terms]
+        assert penalties
+        for key in penalties:
+            assert expected[key] > 0 or key == "penalty_asap_spatial"  # A copy predicts at first.
+            torch.testing.assert_close(found[key], 2 * expected[key])
+
+    def test_its_gradient_is_the_separate_terms(self, method):
+        """For parameters of the regularizer's own, too."""
+        batch = previous(seeded(transitions, 12, seed=1))
+        folded, separate = (
+            smooth(seeded(sac), method, fold=fold, **overrides_of(method)) for fold in (True, False)
+        )
+        torch.manual_seed(2)
+        terms = separate(batch.copy())
+        keys = [key for key in terms.keys() if key.startswith("loss_")]
+        expected = gradients(separate, sum(terms[key] for key in keys))
+        torch.manual_seed(2)
+        terms = folded(batch.copy())
+        value = terms["loss_actor"] + terms["loss_qvalue"] + terms["loss_alpha"]
+        found = gradients(folded, value)
+        for name, gradient in expected.items():
+            torch.testing.assert_close(found[name], gradient)
+
+
+class MySACLoss(SACLoss):
+    """A user's own."""
+
+
+EXACT = {
+    "ppo": [ppo, lambda: PPOLoss(gaussian_actor(), critic())],
+    "sac": [sac, lambda: MySACLoss(gaussian_actor(), qvalue(), action_spec=BOUNDS)],
+    "td3": [td3],
+    "ppo_rpe": [lambda: PPORPELoss(gaussian_actor(), heads_critic())],
+}
+
+
+class TestPresets:
+    """Which settings a loss takes, and what is said of it."""
+
+    SIMILAR = ("A2C", "KLPENPPO", "MAPPO", "IPPO", "REDQ", "TQC", "CrossQ", "CQL", "DDPG")
+    WITHOUT = ("Reinforce", "BC", "deterministic BC", "TD3BC", "IQL", "DiscreteIQL", "DiscreteSAC")
+
+    @pytest.mark.parametrize("kind", EXACT)
+    def test_the_losses_that_it_was_found_with_take_it_in_silence(self, kind):
+        for make in EXACT[kind]:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")
+                loss = smooth(make())
+            settings = PRESETS["l2c2"][kind].settings
+            near = loss.l2c2_neighborhood
+            assert near.lambda_min == settings["lambda_min"]
+            assert near.lambda_max == settings["lambda_max"]
+            assert near.shared == settings.get("shared", False)
+            assert loss.l2c2_policy_distance == settings.get("policy_distance", "hellinger")
+            assert loss.regularizer_gain.item() == 1.0
+
+    def test_the_numbers(self):
+        """As the pages of results have them."""
+        assert "lambda_min=10.0, lambda_max=1000.0" in str(smooth(sac()))
+        assert "lambda_min=1.0, lambda_max=100.0" in str(smooth(ppo()))
+        loss = smooth(td3(), "caps")
+        gains = [loss.caps_lambda_temporal, loss.caps_lambda_spatial]
+        assert [gain.item() for gain in gains] == [1.0, 5.0] and loss.caps_sigma == 0.2
+        assert smooth(ppo(), "cats").cats_lambda_temporal.item() == pytest.approx(0.1)
+
+    @pytest.mark.parametrize("name", SIMILAR)
+    def test_similar_losses_take_it_with_one_warning(self, name):
+        (case,) = (case for case in CASES if case.name == name)
+        with pytest.warns(UserWarning) as told:
+            loss = smooth(case.make())
+        (message,) = (str(each.message) for each in told)
+        nearest = "TD3Loss" if name == "DDPG" else "SACLoss" if "Q" in name else "PPOLoss"
+        base = type(case.make()).__name__
+        assert message.startswith(f"{base} takes the preset of {nearest}")
+        assert f"not tried with {base}" in message
+        assert told[0].filename == __file__
+        assert loss.l2c2_neighborhood.lambda_max in (100.0, 1000.0)
+
+    @pytest.mark.parametrize("method", METHODS)
+    @pytest.mark.parametrize("name", WITHOUT)
+    def test_the_error_of_others_shows_a_call_that_works(self, name, method):
+        (case,) = (case for case in CASES if case.name == name)
+        base = case.make()
+        with pytest.raises(TypeError, match=f"{type(base).__name__} has no preset") as error:
+            smooth(base, method)
+        nearest, call = re.search(
+            r"The nearest is that of (\w+); .*: (smooth\(.*\))\.$", str(error.value)
+        ).groups()
+        kind = NEAREST[type(base).__name__]
+        assert nearest == KINDS[kind][0][0]
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            loss = eval(call, {"smooth": smooth, "loss": base})
+        assert isinstance(loss, getattr(torchrl_l2c2, METHODS[method]))
+        expected = PRESETS[method][kind]
+        assert (loss._ramp is None) == (expected.ramp is None)
+        if method == "l2c2":
+            assert loss.l2c2_neighborhood.lambda_min == expected.settings["lambda_min"]
+
+    @pytest.mark.parametrize("name", ["DQN", "QMixer", "DiscreteCQL", "DistributionalDQN"])
+    def test_losses_without_a_policy_are_told_what_smooths_values(self, name):
+        (case,) = (case for case in CASES if case.name == name)
+        base = case.make()
+        with pytest.raises(TypeError, match="has no preset") as error:
+            smooth(base)
+        call = re.search(r"smooth\(.*\)", str(error.value)).group()
+        with pytest.warns(UserWarning, match="leaves out the policy term"):
+            loss = eval(call, {"smooth": smooth, "loss": base})
+        assert loss.added_terms == {f"loss_l2c2_{case.values[0]}"}
+        with pytest.raises(TypeError, match=r"caps needs a policy: \w+ has none"):
+            smooth(base, "caps")
+
+    @pytest.mark.parametrize("method", ["grad_caps", "asap", "lcp", "sr2l"])
+    def test_methods_without_runs_say_so_and_what_they_take(self, method):
+        with pytest.warns(UserWarning, match="takes the settings of its authors, ") as told:
+            smooth(sac(), method)
+        (message,) = (str(each.message) for each in told)
+        for name, value in PRESETS[method]["sac"].settings.items():
+            assert f"{name}={value!r}" in message
+
+    def test_overrides_replace_single_settings(self):
+        loss = smooth(sac(), lambda_min=3.0, sigma=0.5, fraction=0.5, beta=0.2)
+        near = loss.l2c2_neighborhood
+        assert (near.lambda_min, near.lambda_max, near.sigma) == (3.0, 1000.0, 0.5)
+        assert loss.l2c2_fraction == 0.5 and loss.l2c2_beta.item() == pytest.approx(0.2)
+        near = Neighborhood(sigma=0.3, lambda_min=2.0, lambda_max=5.0)
+        assert smooth(sac(), neighborhood=near).l2c2_neighborhood is near
+        assert smooth(ppo(), ramp=None)._ramp is None
+        assert smooth(sac(), ramp=0.5)._ramp == (1.0, 0.5)
+
+    @pytest.mark.parametrize(
+        ("arguments", "error", "message"),
+        [
+            (
+                {"lamda_min": 1.0},
+                TypeError,
+                r"settings of l2c2, .*'lambda_min'.*got \['lamda_min'\]",
+            ),
+            ({"method": "caps", "beta": 0.1}, TypeError, r"settings of caps, .*got \['beta'\]"),
+            (
+                {"method": "caps", "shared": True},
+                TypeError,
+                r"settings of caps, .*got \['shared'\]",
+            ),
+            ({"method": "l2c3"}, ValueError, r"one of \['l2c2', .*got 'l2c3'"),
+            (
+                {"neighborhood": Neighborhood(), "sigma": 1.0},
+                TypeError,
+                r"a neighborhood or its fields, got both it and \['sigma'\]",
+            ),
+            ({"strength": -1.0}, ValueError, "strength must be .*at least 0"),
+            ({"strength": "2"}, TypeError, "strength must be a real number"),
+            ({"ramp": 2.0}, ValueError, "ramp|length"),
+        ],
+    )
+    def test_wrong_settings_are_refused(self, arguments, error, message):
+        with pytest.raises(error, match=message):
+            smooth(sac(), **arguments)
+
+    def test_what_cannot_be_regularized_is_refused_with_the_reason(self):
+        """Not with settings to pass."""
+        with pytest.raises(TypeError, match=r"a loss without a regularizer, got a L2C2Loss\[SAC"):
+            smooth(smooth(sac()), "cats")
+        with pytest.raises(TypeError, match="Call smooth before the loss is compiled"):
+            smooth(torch.compile(sac(), backend="eager"))
+        with pytest.raises(TypeError, match="got a Linear"):
+            smooth(nn.Linear(1, 1))
+        with pytest.raises(TypeError, match="sequences"):
+            smooth(DTLoss(gaussian_actor()))
+
+    def test_a_folded_loss_takes_no_further_regularizer(self):
+        with pytest.raises(TypeError, match=r"call fold\(\) on the outermost"):
+            CATSLoss(smooth(sac()))
+        both = CATSLoss(smooth(sac(), fold=False)).fold()
+        terms = both(seeded(transitions, 12))
+        assert terms["penalty_cats"] > 0 and terms["penalty_l2c2_actor"] > 0
+        assert {key for key in terms.keys() if key.startswith("loss")} == {
+            "loss_actor",
+            "loss_qvalue",
+            "loss_alpha",
+        }
+
+
+class TestProgress:
+    """The gain of a ramp follows set_progress."""
+
+    def test_the_ramp_by_hand(self):
+        """Full before the first call; then linear over its length."""
+        loss = smooth(sac(), strength=2.0, ramp=0.5)
+        assert loss.regularizer_gain.item() == 2.0
+        for progress, gain in ((0.0, 0.0), (0.125, 0.5), (0.25, 1.0), (0.5, 2.0), (1.3, 2.0)):
+            loss.set_progress(progress)
+            assert loss.regularizer_gain.item() == gain
+
+    def test_the_penalty_follows(self):
+        batch = seeded(on_policy, 12)
+        batch["advantage"], batch["value_target"] = torch.randn(12, 1), torch.randn(12, 1)
+        loss = smooth(seeded(ppo))
+        full = seeded(loss, batch.copy())
+        loss.set_progress(0.25)
+        quarter = seeded(loss, batch.copy())
+        torch.testing.assert_close(quarter["penalty_l2c2_actor"], full["penalty_l2c2_actor"] / 4)
+        added = full["loss_objective"] - quarter["loss_objective"]
+        torch.testing.assert_close(added, 0.75 * full["penalty_l2c2_actor"], rtol=1e-3, atol=1e-6)
+
+    def test_a_checkpoint_has_it(self):
+        """Saved and restored, also in another module; of a fresh loss, the gain is full."""
+        loss = smooth(ppo())
+        fresh = copy.deepcopy(loss.state_dict())
+        loss.set_progress(0.25)
+        other = smooth(ppo())
+        other.load_state_dict(loss.state_dict())
+        assert other.regularizer_gain.item() == 0.25
+        other.load_state_dict(fresh)
+        assert other.regularizer_gain.item() == 1.0
+        holder, loaded = nn.ModuleDict({"loss": loss}), nn.ModuleDict({"loss": smooth(ppo())})
+        loaded.load_state_dict(holder.state_dict())
+        assert loaded["loss"].regularizer_gain.item() == 0.25
+        twin = pickle.loads(pickle.dumps(loss))
+        twin.set_progress(0.5)
+        assert (twin.regularizer_gain.item(), loss.regularizer_gain.item()) == (0.5, 0.25)
+
+    def test_a_checkpoint_of_the_baseline_loads(self):
+        """The progress stays."""
+        base, loss = seeded(ppo, seed=3), smooth(seeded(ppo))
+        loss.set_progress(0.25)
+        loss.load_state_dict(base.state_dict())
+        assert loss.regularizer_gain.item() == 0.25
+        for name, value in base.named_parameters():
+            assert torch.equal(value, dict(loss.named_parameters())[name])
+
+    def test_between_calls_of_a_compiled_loss(self):
+        """Without compiling again."""
+        torch._dynamo.reset()
+        loss = smooth(seeded(cloning), "cats", lambda_temporal=1.0, ramp=1.0)
+        batch = seeded(transitions, 12)
+        loss(batch.copy())  # Some losses make attributes in their first call.
+        graphs = []
+
+        def backend(graph, inputs):
+            graphs.append(graph)
+            return graph
+
+        compiled = torch.compile(loss, backend=backend, fullgraph=True)
+        for progress in (0.25, 0.5, 1.0):
+            compiled.set_progress(progress)
+            found, expected = (seeded(each, batch.copy()) for each in (compiled, loss))
+            for key in ("loss_bc", "penalty_cats"):
+                torch.testing.assert_close(found[key], expected[key])
+            assert loss.regularizer_gain.item() == progress
+        assert len(graphs) == 1
+
+    def test_presets_with_a_constant_gain_ignore_it(self):
+        loss = smooth(sac())
+        loss.set_progress(0.1)
+        assert loss.regularizer_gain.item() == 1.0
+        assert "regularizer_progress" not in loss.state_dict()
+
+    @pytest.mark.parametrize("make", [sac, ppo])
+    def test_a_number_of_frames_is_no_progress(self, make):
+        loss = smooth(make())
+        for wrong in (-0.1, 2.5, 10_000, math.nan):
+            with pytest.raises(ValueError, match=r"progress must be .*frames / total_frames"):
+                loss.set_progress(wrong)
+        with pytest.raises(TypeError):
+            loss.set_progress("half")
+        loss.set_progress(torch.tensor(0.5))
+
+    def train(self, loss, updates=60):
+        batch = seeded(transitions, 4)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            for _ in range(updates):
+                loss(batch.copy())
+        return [str(each.message) for each in told if "set_progress" in str(each.message)]
+
+    def test_a_ramp_that_is_never_moved_is_told_once(self):
+        loss = smooth(cloning(), **GIVEN, ramp=1.0)
+        (message,) = self.train(loss)
+        assert "not called in 50 updates: it stays at 1." in message
+        assert "loss.set_progress(frames / total_frames)" in message
+        assert not self.train(loss)
+
+    def test_a_ramp_that_is_moved_is_not(self):
+        loss = smooth(cloning(), **GIVEN, ramp=1.0)
+        loss.set_progress(0.0)
+        assert not self.train(loss)
+        assert not self.train(smooth(cloning(), **GIVEN))
+        assert not self.train(smooth(cloning(), **GIVEN, ramp=1.0), updates=40)
