@@ -1,4 +1,4 @@
-"""A vectorized task for rsl_rl: points that are seen through noise, and shake for it."""
+"""A vectorized task for rsl_rl: points that are seen through noise."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from torch import Tensor
 class NoisyPoints(VecEnv):
     """Points on a line, to be pushed to the origin and kept there; beyond [-2, 2] they are lost.
 
-    A step is a tenth of a second. What is seen is position and velocity, each with white noise of
-    a standard deviation of 0.1; the action is the acceleration, in [-1, 1].
+    A step takes 0.1 s. Observations are position and velocity, each with white noise (standard
+    deviation 0.1). The action is the acceleration, in [-1, 1].
     """
 
     num_actions, max_episode_length = 1, 100

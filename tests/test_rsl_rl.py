@@ -18,8 +18,9 @@ from torch import Tensor, nn
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss
 
-from torchrl_l2c2 import CATSLoss, L2C2Loss, Neighborhood, NeighborTransform
+from torchrl_l2c2 import CATSLoss, L2C2Loss, Neighborhood, NeighborTransform, smooth
 from torchrl_l2c2.gains import gradient_shares
+from torchrl_l2c2.presets import preset
 
 rsl = pytest.importorskip("torchrl_l2c2.rsl_rl", reason="needs the extra rsl-rl")
 
@@ -153,7 +154,8 @@ def gradients(terms: TensorDictBase, loss: ClipPPOLoss) -> list[Tensor]:
 
 
 FIXED = {"schedule": "fixed", "max_grad_norm": 1e9}
-NEAR = {"sigma": 1.5, "lambda_min": 0.2, "lambda_max": 2.0}
+NEAR = {"sigma": 1.5, "lambda_min": 0.2, "lambda_max": 2.0, "shared": False}
+PAPER = {"policy_distance": "hellinger", "beta": 0.1}
 
 
 @pytest.mark.parametrize(
@@ -169,6 +171,7 @@ NEAR = {"sigma": 1.5, "lambda_min": 0.2, "lambda_max": 2.0}
 def test_terms_and_gradients_are_those_of_the_loss_for_torchrl(options: dict[str, Any]) -> None:
     """On the same states and draws, with normalizations and a critic that sees more."""
     plain = collected(make(PPO, **FIXED))
+    options = {**PAPER, **options}
     ppo = collected(make(rsl.L2C2PPO, regularizer_cfg={**NEAR, **options}, **FIXED))
 
     near = Neighborhood(**NEAR)
@@ -185,7 +188,7 @@ def test_terms_and_gradients_are_those_of_the_loss_for_torchrl(options: dict[str
 
 def test_it_reports_the_terms_that_it_added_and_what_they_are_made_of() -> None:
     """At constant gains of the neighborhood's edge the terms are multiples of the distances."""
-    near = {"lambda_min": 0.1, "lambda_max": 0.1000001}
+    near = {"lambda_min": 0.1, "lambda_max": 0.1000001, **PAPER}
     ppo = collected(make(rsl.L2C2PPO, regularizer_cfg={**near, "beta": 0.5, "coeff": 2.0}))
     losses = update(ppo)
     assert losses["l2c2_gain"] == pytest.approx(0.2, rel=1e-4)
@@ -194,13 +197,123 @@ def test_it_reports_the_terms_that_it_added_and_what_they_are_made_of() -> None:
     assert "symmetry" not in losses
 
 
-def test_the_term_of_cats_is_that_of_the_loss_for_torchrl() -> None:
-    """Its value and its gradients, which the critic has none of."""
+@pytest.mark.parametrize(
+    "algorithm, given, method",
+    [
+        (rsl.L2C2PPO, {"ramp_updates": None}, "l2c2"),
+        (rsl.CATSPPO, {"lambda_temporal": 0.3}, "cats"),
+        # Without the noise, which the actions of rsl_rl's update are drawn before.
+        (rsl.RegularizedPPO, {"method": "caps", "lambda_spatial": 0.0, "strength": 3.0}, "caps"),
+    ],
+)
+def test_the_terms_are_those_of_smooth(
+    algorithm: type[PPO], given: dict[str, Any], method: str
+) -> None:
+    """Their values and gradients, with the preset of TorchRL's PPO and what replaces it."""
     plain = collected(make(PPO, **FIXED))
-    ppo = collected(make(rsl.CATSPPO, regularizer_cfg={"lambda_temporal": 0.3}, **FIXED))
+    ppo = collected(make(algorithm, regularizer_cfg=given, **FIXED))
     base = torchrl_loss(ppo)
-    terms = CATSLoss(base, 0.3).policy_regularizer(transitions(torch.arange(ENVS * STEPS)))
-    check_added(plain, ppo, terms, base)
+    settings = {name: value for name, value in given.items() if name.startswith("lambda_")}
+    loss = smooth(base, method, given.get("strength", 1.0), fold=False, ramp=None, **settings)
+    torch.manual_seed(5)  # as in update
+    batch = transitions(torch.randperm(ENVS * STEPS))
+    if isinstance(loss, L2C2Loss):
+        generator = torch.Generator().manual_seed(0)  # that of make's torch.manual_seed(0)
+        batch = loss.neighbor_transform(generator)(batch)
+    check_added(plain, ppo, loss.policy_regularizer(batch), base)
+
+
+def test_zero_rewards_leave_a_shared_deviation_where_it_is() -> None:
+    """As without a regularizer; the Hellinger distance and the KL are lowered by a larger one."""
+
+    def deviation(algorithm: type[PPO], **cfg: Any) -> float:
+        ppo = make(algorithm, normal=NORMAL | {"init_std": 0.3}, entropy_coef=0.0, **cfg)
+        torch.nn.init.zeros_(ppo.critic.mlp[-1].weight)  # No advantages: no noise of the surrogate.
+        torch.nn.init.zeros_(ppo.critic.mlp[-1].bias)
+        for _ in range(30):
+            for step in range(STEPS):
+                ppo.act(observations(step))
+                ppo.process_env_step(
+                    observations(step + 1), torch.zeros(ENVS), torch.zeros(ENVS), {}
+                )
+            ppo.compute_returns(observations(STEPS))
+            ppo.update()
+        return ppo.actor.distribution.std_param.max().item()
+
+    still = deviation(PPO)
+    assert still == pytest.approx(0.3)
+    for algorithm in (rsl.L2C2PPO, rsl.CATSPPO):
+        assert deviation(algorithm) == still
+    for distance in ("hellinger", "kl"):
+        assert deviation(rsl.L2C2PPO, regularizer_cfg={"policy_distance": distance}) > 0.31
+
+
+@pytest.mark.parametrize(
+    "given, said",
+    [
+        (
+            {},
+            "L2C2PPO: method='l2c2', policy_distance='mse', shared=True, lambda_min=1.0, "
+            "lambda_max=100.0, beta=0.0, strength=1.0 (the preset: there is no regularizer_cfg). "
+            "The gain is constant; for the preset's ramp, set ramp_updates in regularizer_cfg to "
+            "the number of the runner's iterations (max_iterations).",
+        ),
+        (
+            {"max_iterations": 30, "regularizer_cfg": {"beta": 0.5, "strength": 2}},
+            "L2C2PPO: method='l2c2', policy_distance='mse', shared=True, lambda_min=1.0, "
+            "lambda_max=100.0, beta=0.5, strength=2. The gain rises over 30 updates.",
+        ),
+    ],
+)
+def test_one_line_says_what_is_trained_with(
+    given: dict[str, Any], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also if nothing was given, as by a class name alone."""
+    make(rsl.L2C2PPO, **given)
+    assert capsys.readouterr().out == said + "\n"
+
+
+def test_an_explicit_ramp_goes_before_the_runners_iterations() -> None:
+    """``None`` is a constant gain; methods whose preset has no ramp have none."""
+    for cfg, updates in (
+        ({"ramp_updates": 7}, 7),
+        ({"ramp_updates": None}, None),
+        ({"method": "caps"}, None),
+        ({"method": "cats"}, 30),
+    ):
+        ppo = make(rsl.RegularizedPPO, regularizer_cfg=cfg, max_iterations=30)
+        assert ppo.regularization.ramp_updates == updates
+        assert ppo.regularization.loss.regularizer_gain == (1.0 if updates is None else 0.0)
+
+
+@pytest.mark.parametrize("method", ["caps", "lcp", "sr2l"])
+def test_other_methods_train(method: str) -> None:
+    """Their terms are logged, and the actor's update is another."""
+    plain, ppo = make(PPO), make(rsl.RegularizedPPO, regularizer_cfg={"method": method})
+    losses = [update(collected(each)) for each in (plain, ppo)]
+    assert all(value > 0 for name, value in losses[1].items() if name.startswith(method))
+    assert losses[1].keys() > losses[0].keys()
+    assert not torch.equal(parameters(plain)[0], parameters(ppo)[0])
+
+
+@pytest.mark.parametrize(
+    "algorithm, method, said",
+    [
+        (rsl.RegularizedPPO, "asap", "'asap', which needs the observation before each state"),
+        (
+            rsl.RegularizedPPO,
+            "l2c3",
+            r"one of \['l2c2', 'caps', 'cats', 'lcp', 'sr2l'\], got 'l2c3'",
+        ),
+        (rsl.L2C2PPO, "cats", "method 'l2c2' of L2C2PPO, got 'cats'. Use .*:RegularizedPPO"),
+    ],
+)
+def test_methods_that_do_not_work_here_are_refused(
+    algorithm: type[PPO], method: str, said: str
+) -> None:
+    """With those that do."""
+    with pytest.raises(ValueError, match=said):
+        make(algorithm, regularizer_cfg={"method": method})
 
 
 @pytest.mark.parametrize("distribution", ["Gaussian", "HeteroscedasticGaussian"])
@@ -349,7 +462,7 @@ def test_groups_with_names_that_batches_need_are_refused(
 @pytest.mark.parametrize("algorithm", [rsl.L2C2PPO, rsl.CATSPPO])
 def test_an_option_that_there_is_not_is_named_with_those_that_there_are(algorithm: Any) -> None:
     """Not by an error of a class that the user has not named."""
-    with pytest.raises(TypeError, match=r"regularizer_cfg has \['gane'\]; .*'ramp_updates'"):
+    with pytest.raises(TypeError, match=r"in regularizer_cfg, .*'ramp_updates'.*got \['gane'\]"):
         make(algorithm, regularizer_cfg={"gane": 1.0})
 
 
@@ -383,15 +496,14 @@ def test_a_symmetry_extension_works_as_before(augment: bool) -> None:
 
 def test_the_gain_rises_with_the_updates_and_is_resumed() -> None:
     """In a line to its end, from where a checkpoint left off, with the same draws of neighbors."""
-    cfg = {"coeff": 0.8, "ramp_updates": 4}
+    # Of one number, as the mean gain depends on the draws otherwise.
+    cfg = {"strength": 0.8, "ramp_updates": 4, "lambda_max": 1.00001}
     gains, ppo = [], make(rsl.L2C2PPO, regularizer_cfg=cfg)
     for _ in range(6):
         saved = copy.deepcopy(ppo.save())
         losses = update(collected(ppo))
-        gains.append(losses["l2c2_gain"] / 0.8 if losses["l2c2_gain"] else 0.0)
-    full = gains[-1]
-    steepness = [gain / full for gain in gains]
-    assert steepness == pytest.approx([0, 0.25, 0.5, 0.75, 1, 1], rel=0.2)
+        gains.append(losses["l2c2_gain"])
+    assert gains == pytest.approx([0, 0.2, 0.4, 0.6, 0.8, 0.8], rel=1e-3)
 
     resumed = make(rsl.L2C2PPO, regularizer_cfg=cfg)
     resumed.load(saved, None, strict=True)
@@ -418,6 +530,21 @@ def test_only_the_first_of_several_processes_draws_as_it_did() -> None:
         drawn = ppo.regularization.neighbors.generator.get_state()
         assert drawn.equal(saved["regularization_state_dict"]["generator"]) == same
         assert ppo.regularization.updates == 1
+
+
+@pytest.mark.parametrize("algorithm, updates", [(rsl.L2C2PPO, 3), (rsl.CATSPPO, 0)])
+def test_checkpoints_of_older_versions_are_resumed(algorithm: type[PPO], updates: int) -> None:
+    """They name a coefficient instead of the method; another regularizer's is a beginning."""
+    saved = update_and_save(make(rsl.L2C2PPO))
+    generator = saved["regularization_state_dict"]["generator"]
+    older = {"coefficient": "l2c2_coeff", "updates": 3, "generator": generator}
+    saved["regularization_state_dict"] = older
+    ppo = make(algorithm, regularizer_cfg={"ramp_updates": 4})
+    ppo.load(saved, None, strict=True)
+    assert ppo.regularization.updates == updates
+    assert ppo.regularization.loss.regularizer_gain == updates / 4
+    if updates:
+        assert ppo.regularization.neighbors.generator.get_state().equal(generator)
 
 
 def update_and_save(ppo: PPO) -> dict[str, Any]:
@@ -452,33 +579,74 @@ def test_what_cannot_be_regularized_is_refused(settings: dict[str, Any], said: s
 
 def test_the_groups_that_move_can_be_chosen() -> None:
     """Of what the critic reads only that which the actor reads, too; the actor has to be moved."""
-    cfg: dict[str, Any] = {"moved_keys": ["policy"], "neighbor_key": "near"}
+    cfg: dict[str, Any] = {"moved_keys": ["policy"], "neighbor_key": "near", "beta": 0.5}
     ppo = make(rsl.L2C2PPO, regularizer_cfg=cfg)
     assert ppo.regularization.neighbors.in_keys == ["policy"]
     assert ppo.regularization.neighbors.out_key == "near"
     assert update(collected(ppo))["l2c2_critic"] > 0
     with pytest.raises(ValueError, match=r"\['privileged'\], and actor_network reads \['policy'\]"):
-        make(rsl.L2C2PPO, regularizer_cfg={"moved_keys": ["privileged"]})
+        make(rsl.L2C2PPO, regularizer_cfg={"moved_keys": ["privileged"], "beta": 0.5})
     with pytest.raises(ValueError, match=r"names \['nonsense'\], and .*'policy', 'privileged'"):
-        make(rsl.L2C2PPO, regularizer_cfg={"moved_keys": ["nonsense"]})
+        make(rsl.L2C2PPO, regularizer_cfg={"moved_keys": ["nonsense"], "beta": 0.5})
 
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "rsl_rl_l2c2.py"
 
 
+def runner_config(**algorithm: Any) -> dict[str, Any]:
+    """A small runner's; new each time, as rsl_rl 5.4 takes names of classes out of it."""
+    network = {"class_name": "MLPModel", "hidden_dims": [8]}
+    return {
+        "algorithm": {"class_name": "torchrl_l2c2.rsl_rl:L2C2PPO", **algorithm},
+        "actor": {**network, "distribution_cfg": dict(NORMAL)},
+        "critic": dict(network),
+        "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
+        "num_steps_per_env": 4,
+        "save_interval": 1,
+    }
+
+
 def test_the_pages_configuration_builds(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As it stands there, on any task."""
+    """As it stands there, on any task, with the preset of PPO and its ramp."""
     monkeypatch.syspath_prepend(EXAMPLE.parent)
     from rsl_rl.runners import OnPolicyRunner
-    from rsl_rl_l2c2 import GAINS
     from rsl_rl_points import NoisyPoints
 
     page = (EXAMPLE.parents[1] / "docs" / "rsl_rl.md").read_text()
     told: dict[str, Any] = {}
     exec(re.search(r"^```python\n(.*?)^```", page, re.M | re.S)[1], told)
-    loss = OnPolicyRunner(NoisyPoints(2), told["config"]).alg.regularization.loss
-    near = loss.l2c2_neighborhood
-    assert {"lambda_min": near.lambda_min, "lambda_max": near.lambda_max} == GAINS
+    regularization = OnPolicyRunner(NoisyPoints(2), told["config"]).alg.regularization
+    assert regularization.ramp_updates == 1500
+    chosen = dict(preset("l2c2", "ppo").settings)
+    near = regularization.loss.l2c2_neighborhood
+    for name in ("shared", "lambda_min", "lambda_max"):
+        assert getattr(near, name) == chosen.pop(name)
+    assert regularization.loss.l2c2_policy_distance == chosen.pop("policy_distance")
+    assert chosen == {"beta": 0.0} and regularization.loss.added_terms == {"loss_l2c2_actor"}
+
+
+def test_the_runners_iterations_are_the_ramp(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Isaac Lab and mjlab have them in the runner's configuration, which stays as it was."""
+    monkeypatch.syspath_prepend(EXAMPLE.parent)
+    from rsl_rl.runners import OnPolicyRunner
+    from rsl_rl_points import NoisyPoints
+
+    config = {**runner_config(), "max_iterations": 20}
+    runner = OnPolicyRunner(NoisyPoints(2), config)
+    assert runner.alg.regularization.ramp_updates == 20
+    assert runner.cfg["obs_groups"] == {"actor": ["policy"], "critic": ["policy"]}
+    assert "max_iterations" not in config["algorithm"] and config["max_iterations"] == 20
+
+
+def test_settings_beside_the_algorithm_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """rsl_rl would train without them."""
+    monkeypatch.syspath_prepend(EXAMPLE.parent)
+    from rsl_rl.runners import OnPolicyRunner
+    from rsl_rl_points import NoisyPoints
+
+    config = {**runner_config(), "regularizer_cfg": {"strength": 2.0}}
+    with pytest.raises(ValueError, match="regularizer_cfg in the algorithm's configuration, got"):
+        OnPolicyRunner(NoisyPoints(2), config)
 
 
 def test_the_runner_builds_it_by_its_name(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -487,29 +655,21 @@ def test_the_runner_builds_it_by_its_name(monkeypatch: pytest.MonkeyPatch, tmp_p
     from rsl_rl.runners import OnPolicyRunner
     from rsl_rl_points import NoisyPoints
 
-    network = {"class_name": "MLPModel", "hidden_dims": [8]}
     cfg = {"sigma": 0.5, "lambda_max": 3.0, "beta": 0.25, "policy_distance": "kl"}
-    algorithm = {"class_name": "torchrl_l2c2.rsl_rl:L2C2PPO", "regularizer_cfg": cfg}
-    config = {
-        "algorithm": algorithm,
-        "actor": {**network, "distribution_cfg": NORMAL},
-        "critic": network,
-        "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
-        "num_steps_per_env": 4,
-        "save_interval": 1,
-    }
+    config = runner_config(regularizer_cfg=cfg)
     # rsl_rl 5.4 takes the names of classes out of what it is given.
     runner = OnPolicyRunner(NoisyPoints(8), copy.deepcopy(config), log_dir=str(tmp_path))
     loss = runner.alg.regularization.loss
     assert isinstance(runner.alg, rsl.L2C2PPO)
-    assert (loss.l2c2_neighborhood, loss.l2c2_beta) == (Neighborhood(0.5, lambda_max=3.0), 0.25)
+    near = Neighborhood(0.5, lambda_min=1.0, lambda_max=3.0, shared=True)
+    assert (loss.l2c2_neighborhood, loss.l2c2_beta) == (near, 0.25)
     logged = []
     monkeypatch.setattr(runner.logger, "log", lambda **told: logged.append(told["loss_dict"]))
     runner.learn(2)
     assert logged[1].keys() >= {"surrogate", "l2c2_actor", "l2c2_critic", "l2c2_kl", "l2c2_gain"}
     assert logged[1]["l2c2_actor"] > 0
 
-    again = OnPolicyRunner(NoisyPoints(8), config)
+    again = OnPolicyRunner(NoisyPoints(8), runner_config(regularizer_cfg=cfg))
     again.load(str(tmp_path / "model_1.pt"))
     assert again.alg.regularization.updates == 2
 

@@ -1,4 +1,4 @@
-"""L2C2 and CATS in rsl_rl's PPO, by class name in a run's configuration.
+"""L2C2, CATS and other regularizers in rsl_rl's PPO, by class name in a run's configuration.
 
 Needs the extra ``rsl-rl``. ``docs/rsl_rl.md`` shows what to write.
 """

@@ -2,37 +2,67 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import fields
+from collections.abc import Iterable, Mapping
 from inspect import signature
 from typing import Any, ClassVar
 
 import torch
 from rsl_rl.algorithms import PPO
+from rsl_rl.env import VecEnv
 from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 from tensordict import NestedKey, TensorDict
 from torch import Tensor
 
-from torchrl_l2c2.neighborhood import Neighborhood
-from torchrl_l2c2.objectives import CATSLoss, L2C2Loss, RegularizedLoss
+from torchrl_l2c2 import objectives
+from torchrl_l2c2.objectives import L2C2Loss, RegularizedLoss
+from torchrl_l2c2.presets import METHODS, NEIGHBORHOOD_FIELDS, preset
 from torchrl_l2c2.rsl_rl.networks import ENTRIES, ActorCriticLoss
 from torchrl_l2c2.rsl_rl.regularization import Regularization
 from torchrl_l2c2.rsl_rl.storage import ROW, SuccessorStorage
+from torchrl_l2c2.smoothing import smooth
 from torchrl_l2c2.transforms import NeighborTransform
 
 FINAL = "final_obs"
 """The entry of an environment's extras with the last observations of ended episodes."""
 
+PREVIOUS = ("grad_caps", "asap")
+"""Methods that need the observation before each state, which rollouts of rsl_rl lack."""
+
 
 class RegularizedPPO(PPO):
-    """rsl_rl's PPO with a regularizer: what :class:`L2C2PPO` and :class:`CATSPPO` have in common.
+    """rsl_rl's PPO with a regularizer: :class:`L2C2PPO`, :class:`CATSPPO` or another method.
 
-    A subclass defines :meth:`regularize` and names the coefficient of its loss.
+    A run's configuration names it instead of PPO, ``"class_name":
+    "torchrl_l2c2.rsl_rl:RegularizedPPO"``. The preset is the same as with TorchRL's PPO
+    (:func:`~torchrl_l2c2.smooth`). One printed line has the settings.
+
+    Args:
+        actor (MLPModel): the policy, feed-forward and normal.
+        critic (MLPModel): the value function, feed-forward.
+        storage (RolloutStorage): as rsl_rl makes it; it is taken over.
+        *args: arguments of rsl_rl's PPO.
+        regularizer_cfg (dict, optional): ``method``, any that
+            :func:`~torchrl_l2c2.smooth` has but ``"grad_caps"`` and ``"asap"``, by default
+            ``"l2c2"``; ``strength``, which multiplies the penalty, by default 1; ``ramp_updates``,
+            the number of updates over which the gain rises from 0, an integer of at least 1, or
+            ``None`` for a constant gain (smaller numbers smooth earlier); and overrides of the
+            preset, by the names that ``smooth`` has for them. Without ``ramp_updates`` a preset
+            with a ramp takes ``max_iterations``.
+        max_iterations (int, optional): Number of updates in the whole training. The runner's
+            configuration gives it in Isaac Lab and mjlab. ``None``: unknown, and the gain is
+            constant unless there is ``ramp_updates``.
+        **kwargs: arguments of rsl_rl's PPO.
+
+    Raises:
+        TypeError: a model is recurrent, the policy is not normal, or an argument is unknown or of
+            the wrong type.
+        ValueError: an argument is out of its range, or the method is not known or does not work
+            with rsl_rl.
     """
 
-    coefficient: ClassVar[str]
-    """The coefficient of the regularized loss that ``ramp_updates`` is about."""
+    method: ClassVar[str | None] = None
+    """The method of a subclass that has only one."""
 
     storage: SuccessorStorage
     symmetry: Any
@@ -44,28 +74,54 @@ class RegularizedPPO(PPO):
         storage: RolloutStorage,
         *args: Any,
         regularizer_cfg: dict[str, Any] | None = None,
+        max_iterations: int | None = None,
         **kwargs: Any,
     ) -> None:
         networks = ActorCriticLoss(actor, critic)
         _check_groups(storage.observations.keys(), (*ENTRIES, ROW, "next"))
         super().__init__(actor, critic, SuccessorStorage(storage), *args, **kwargs)
-        options = dict(regularizer_cfg or {})
-        ramp_updates = options.pop("ramp_updates", None)
-        loss, neighbors = self.regularize(networks, **options)
-        self.symmetry = self.regularization = Regularization(
-            loss.to(self.device), neighbors, self.coefficient, ramp_updates, self.symmetry
+        overrides = dict(regularizer_cfg or {})
+        method = overrides.pop("method", self.method or "l2c2")
+        _check_method(method, type(self))
+        _check_options(method, overrides)
+        strength = overrides.pop("strength", 1.0)
+        chosen = preset(method, "ppo").overridden(
+            {name: value for name, value in overrides.items() if name != "ramp_updates"}
         )
+        ramp_updates = overrides.pop("ramp_updates", chosen.ramp and max_iterations)
+        loss = smooth(networks, method, strength, fold=False, **overrides, ramp=None)
+        self.symmetry = self.regularization = Regularization(
+            loss.to(self.device), self._neighbors(loss), method, ramp_updates, self.symmetry
+        )
+        if not self.gpu_global_rank:
+            settings = {"method": method, **chosen.settings, "strength": strength}
+            hint = ramp_updates is None and chosen.ramp is not None
+            print(_told(type(self).__name__, settings, ramp_updates, hint, bool(regularizer_cfg)))
 
-    def regularize(
-        self, networks: ActorCriticLoss, **options: Any
-    ) -> tuple[RegularizedLoss, NeighborTransform | None]:
-        """The regularized loss, and what writes neighbors into its batches, if anything does.
+    @staticmethod
+    def construct_algorithm(obs: TensorDict, env: VecEnv, cfg: dict[str, Any], device: str) -> PPO:
+        """As rsl_rl's; ``max_iterations`` of the runner's configuration reaches the algorithm."""
+        if "regularizer_cfg" in cfg:
+            raise ValueError(
+                "Expected regularizer_cfg in the algorithm's configuration, got it next to that, "
+                "where it has no effect. Move it next to class_name."
+            )
+        updates = {"max_iterations": cfg.get("max_iterations")}
+        made = {**cfg, "algorithm": {**updates, **cfg["algorithm"]}}
+        algorithm = PPO.construct_algorithm(obs, env, made, device)
+        cfg["obs_groups"] = made["obs_groups"]
+        return algorithm
 
-        Args:
-            networks: the loss to put the regularizer around.
-            **options: ``regularizer_cfg``, but for ``ramp_updates``.
-        """
-        raise NotImplementedError
+    def _neighbors(self, loss: RegularizedLoss) -> NeighborTransform | None:
+        """Draws the neighbors of L2C2 in all observation groups that its networks read."""
+        if not isinstance(loss, L2C2Loss):
+            return None
+        stored = self.storage.observations
+        _check_groups(stored.keys(), [loss.l2c2_neighbor_key])
+        read = dict.fromkeys(group for spec in loss.networks.values() for group in spec.states)
+        groups = [group for group in read if stored[group].is_floating_point()]
+        generator = torch.Generator(self.device).manual_seed(torch.initial_seed())
+        return loss.neighbor_transform(generator, loss.l2c2_moved_keys or groups)
 
     def process_env_step(
         self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]
@@ -135,7 +191,7 @@ def _check_final(final: Any, obs: TensorDict) -> None:
 class L2C2PPO(RegularizedPPO):
     r"""rsl_rl's PPO under the locally Lipschitz continuous constraint (Kobayashi, L2C2, 2022).
 
-    A run's configuration names it in the place of PPO, ``"class_name":
+    A run's configuration names it instead of PPO, ``"class_name":
     "torchrl_l2c2.rsl_rl:L2C2PPO"``, and may say more under ``"regularizer_cfg"``. To the loss of
     PPO it adds the terms of :class:`~torchrl_l2c2.L2C2Loss`,
 
@@ -145,33 +201,22 @@ class L2C2PPO(RegularizedPPO):
         + \beta\lambda_\pi\, \mathbb E\left[\frac{d_V(V(s), V(\tilde s))}
         {d(s, \tilde s; s')}\right],
 
-    over the transitions of each minibatch. Neighbors move in all observation groups that the
-    regularized networks read, before these normalize them: the mean and scale of a normalization
-    change neither the neighbors nor their distances. Where an episode ended, the next observation
+    over the transitions of each minibatch, with the settings that
+    :func:`~torchrl_l2c2.smooth` has for PPO: the distance of the means, and no value term.
+    Neighbors move in all observation groups that the regularized networks read, before these
+    normalize them: the mean and scale of a normalization change neither the neighbors nor their
+    distances. Where an episode ended, the next observation
     that rsl_rl knows is that after the reset, and the transition is left out of the mean; unless
     the environment gives the episode's own last observations as ``extras["final_obs"]``, a
     TensorDict of all groups, ``[num_envs]``, in steps that end one.
 
     Neighbors are drawn with a generator of their own, seeded with :func:`torch.initial_seed`: at a
-    gain of 0 a training run has the numbers of plain PPO. A symmetry extension goes on working as
-    before. What ``update`` returns, and rsl_rl logs, has the terms ``l2c2_actor`` and
+    gain of 0 a training run has the numbers of rsl_rl's PPO. A symmetry extension works as
+    before. ``update`` returns, and rsl_rl logs, the terms ``l2c2_actor`` and, unless ``beta`` is 0,
     ``l2c2_critic``, as they were added to the loss, and L2C2Loss's diagnostics.
 
-    Args:
-        actor (MLPModel): the policy, feed-forward and normal.
-        critic (MLPModel): the value function, feed-forward.
-        storage (RolloutStorage): as rsl_rl makes it; it is taken over.
-        *args: those of rsl_rl's PPO.
-        regularizer_cfg (dict, optional): the arguments of :class:`~torchrl_l2c2.Neighborhood` and
-            of L2C2Loss, by name, with their defaults; and ``ramp_updates``, the number of updates
-            over which ``coeff`` rises from 0 in a line, an integer of at least 1, or ``None``, the
-            default, for a constant one. Smaller ones smooth earlier.
-        **kwargs: those of rsl_rl's PPO.
-
-    Raises:
-        TypeError: a model is recurrent, the policy is not normal, or an argument is unknown or of
-            the wrong type.
-        ValueError: an argument is out of its range.
+    Takes the arguments of :class:`RegularizedPPO`. ``regularizer_cfg`` has arguments of
+    :class:`~torchrl_l2c2.Neighborhood` and L2C2Loss, by name, ``strength`` and ``ramp_updates``.
 
     Examples:
         >>> import torch
@@ -185,45 +230,18 @@ class L2C2PPO(RegularizedPPO):
         >>> actor = MLPModel(obs, names, "actor", 2, distribution_cfg=normal)
         >>> critic = MLPModel(obs, names, "critic", 1)
         >>> storage = RolloutStorage("rl", 8, 4, obs, [2])
-        >>> cfg = {"beta": 0.0, "policy_distance": "mean"}
-        >>> ppo = L2C2PPO(actor, critic, storage, regularizer_cfg=cfg)
+        >>> cfg = {"ramp_updates": 1500}
+        >>> ppo = L2C2PPO(actor, critic, storage, regularizer_cfg=cfg)  # doctest: +ELLIPSIS
+        L2C2PPO: method='l2c2', policy_distance='mse', ... The gain rises over 1500 updates.
         >>> for _ in range(4):
         ...     _ = ppo.act(obs)
         ...     ppo.process_env_step(obs, torch.ones(8), torch.zeros(8), {})
         >>> ppo.compute_returns(obs)
         >>> list(ppo.update())[3:]
-        ['l2c2_actor', 'l2c2_mean_distance', 'l2c2_distance', 'l2c2_gain']
+        ['l2c2_actor', 'l2c2_mse', 'l2c2_distance', 'l2c2_gain', 'l2c2_counted']
     """
 
-    coefficient = "l2c2_coeff"
-
-    def regularize(
-        self, networks: ActorCriticLoss, **options: Any
-    ) -> tuple[RegularizedLoss, NeighborTransform]:
-        _check_options(options, Neighborhood, L2C2Loss)
-        given = {field.name for field in fields(Neighborhood)} & options.keys()
-        near = Neighborhood(**{name: options.pop(name) for name in given})
-        loss = L2C2Loss(networks, near, **options)
-        read = list(networks.actor_network.in_keys)
-        if "loss_l2c2_critic" in loss.added_terms:
-            read += networks.critic_network.in_keys
-        stored = self.storage.observations
-        groups = [group for group in dict.fromkeys(read) if stored[group].is_floating_point()]
-        _check_groups(stored.keys(), [loss.l2c2_neighbor_key])
-        moved = groups if loss.l2c2_moved_keys is None else [*loss.l2c2_moved_keys]
-        if not set(moved) <= set(groups):
-            raise ValueError(
-                f"moved_keys must be among the groups that the networks read, {groups}, got "
-                f"{moved}."
-            )
-        generator = torch.Generator(self.device).manual_seed(torch.initial_seed())
-        return loss, NeighborTransform(
-            near,
-            moved,
-            out_key=loss.l2c2_neighbor_key,
-            num_samples=loss.l2c2_num_samples,
-            generator=generator,
-        )
+    method = "l2c2"
 
 
 class CATSPPO(RegularizedPPO):
@@ -236,33 +254,57 @@ class CATSPPO(RegularizedPPO):
         \min\left(1, \frac kK\right) \lambda\,
         \mathbb E\left[\lVert \mu(s) - \mu(s') \rVert_2^2\right],
 
-    in update :math:`k`, over the transitions that an episode's end leaves out as there.
+    in update :math:`k`, with :math:`K` = ``ramp_updates``, over the transitions that an episode's
+    end leaves out as there.
 
-    Args:
-        actor (MLPModel): as for L2C2PPO, like all others that are not named here.
-        critic (MLPModel): likewise.
-        storage (RolloutStorage): likewise.
-        *args: likewise.
-        regularizer_cfg (dict, optional): ``lambda_temporal``, at least 0, as for CATSLoss: larger
-            values slow the actions down; and ``ramp_updates``, :math:`K`, an integer of at least 1.
-            The method's own is the number of updates of the whole training, which is known to the
-            runner alone; without it the gain is constant.
-        **kwargs: likewise.
-
-    Raises:
-        TypeError: as for L2C2PPO.
-        ValueError: likewise.
+    Takes the arguments of :class:`RegularizedPPO`. ``regularizer_cfg`` has arguments of
+    CATSLoss, by name, ``strength`` and ``ramp_updates``.
     """
 
-    coefficient = "cats_lambda_temporal"
-
-    def regularize(self, networks: ActorCriticLoss, **options: Any) -> tuple[RegularizedLoss, None]:
-        _check_options(options, CATSLoss)
-        return CATSLoss(networks, **options), None
+    method = "cats"
 
 
-def _check_options(options: Iterable[str], *takers: Callable[..., Any]) -> None:
-    allowed = {name for taker in takers for name in signature(taker).parameters}
-    allowed = allowed - {"base_loss", "neighborhood"} | {"ramp_updates"}
+def _check_method(method: str, algorithm: type[RegularizedPPO]) -> None:
+    possible = [name for name in METHODS if name not in PREVIOUS]
+    if method in PREVIOUS:
+        raise ValueError(
+            f"Expected method to be one of {possible}, got {method!r}, which needs the observation "
+            "before each state. Rollouts of rsl_rl lack it."
+        )
+    if method not in METHODS:
+        raise ValueError(f"Expected method to be one of {possible}, got {method!r}.")
+    if algorithm.method not in (None, method):
+        raise ValueError(
+            f"Expected the method {algorithm.method!r} of {algorithm.__name__}, got {method!r}. "
+            "Use the class name torchrl_l2c2.rsl_rl:RegularizedPPO."
+        )
+
+
+def _check_options(method: str, options: Iterable[str]) -> None:
+    allowed = set(signature(getattr(objectives, METHODS[method])).parameters)
+    if "neighborhood" in allowed:
+        allowed |= NEIGHBORHOOD_FIELDS
+    # The ends of episodes are left out always.
+    allowed -= {"base_loss", "neighborhood", "skip_ends"}
+    allowed |= {"method", "strength", "ramp_updates"}
     if unknown := sorted(set(options) - allowed):
-        raise TypeError(f"regularizer_cfg has {unknown}; it may have {sorted(allowed)}.")
+        raise TypeError(
+            f"Expected settings of {method} in regularizer_cfg, {sorted(allowed)}, got {unknown}."
+        )
+
+
+def _told(
+    name: str, settings: Mapping[str, Any], ramp_updates: int | None, hint: bool, given: bool
+) -> str:
+    """The line with the settings in use."""
+    line = f"{name}: " + ", ".join(f"{key}={value!r}" for key, value in settings.items())
+    line += "." if given else " (the preset: there is no regularizer_cfg)."
+    if ramp_updates is not None:
+        return f"{line} The gain rises over {ramp_updates} updates."
+    line += " The gain is constant"
+    if hint:
+        line += (
+            "; for the preset's ramp, set ramp_updates in regularizer_cfg to the number of the "
+            "runner's iterations (max_iterations)"
+        )
+    return f"{line}."

@@ -12,10 +12,13 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_l2c2._checks import check_positive_int
-from torchrl_l2c2.gains import ConstantGain, RampGain, is_loss
+from torchrl_l2c2.gains import is_loss
 from torchrl_l2c2.objectives import RegularizedLoss
 from torchrl_l2c2.rsl_rl.networks import VALID, write_parameters
 from torchrl_l2c2.transforms import NeighborTransform
+
+# Older checkpoints name a coefficient instead of the method.
+_METHODS = {"l2c2_coeff": "l2c2", "cats_lambda_temporal": "cats"}
 
 
 class Regularization:
@@ -29,8 +32,9 @@ class Regularization:
         loss (RegularizedLoss): around an
             :class:`~torchrl_l2c2.rsl_rl.ActorCriticLoss`.
         neighbors (NeighborTransform, optional): writes into batches what the loss reads there.
-        coefficient (str): the coefficient of the loss that the ramp is of.
-        ramp_updates (int, optional): updates over which it rises from 0. ``None`` keeps it.
+        method (str): The regularizer's name, which checkpoints have.
+        ramp_updates (int, optional): Number of updates over which ``regularizer_gain`` rises from
+            0. ``None``: constant.
         symmetry (Symmetry, optional): the real extension.
     """
 
@@ -41,20 +45,18 @@ class Regularization:
         self,
         loss: RegularizedLoss,
         neighbors: NeighborTransform | None,
-        coefficient: str,
+        method: str,
         ramp_updates: int | None,
         symmetry: Symmetry | None,
     ) -> None:
         self.loss, self.neighbors, self.symmetry = loss, neighbors, symmetry
-        self.coefficient, self.ramp_updates, self.updates = coefficient, ramp_updates, 0
-        end = float(getattr(loss, coefficient))
-        self._gain: ConstantGain = ConstantGain(end)
+        self.method, self.ramp_updates, self.updates = method, ramp_updates, 0
         if ramp_updates is not None:
             check_positive_int("ramp_updates", ramp_updates)
-            self._gain = RampGain(end)
+            loss.ramp(end=float(loss.regularizer_gain))
         self._sums: dict[str, Tensor] = {}
         self._batches = 0
-        self._set_gain()
+        self._set_progress()
 
     def augment_batch(self, batch: RolloutStorage.Batch, original_batch_size: int) -> None:
         """Adds mirrored rows where there is a symmetry that does."""
@@ -90,22 +92,23 @@ class Regularization:
         return {name.removeprefix("loss_"): mean for name, mean in zip(names, means, strict=True)}
 
     def step(self) -> None:
-        """Counts an update; the gain follows where it is on a ramp."""
+        """Counts an update, which moves the gain of a ramp."""
         self.updates += 1
-        self._set_gain()
+        self._set_progress()
 
     def state_dict(self) -> dict[str, Any]:
         """What the next updates depend on."""
         generator = None if self.neighbors is None else self.neighbors.generator
         drawn = {} if generator is None else {"generator": generator.get_state()}
-        return {"coefficient": self.coefficient, "updates": self.updates, **drawn}
+        return {"method": self.method, "updates": self.updates, **drawn}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores what :meth:`state_dict` gave; of another regularizer nothing."""
-        if state.get("coefficient", self.coefficient) != self.coefficient:
+        older = _METHODS.get(state["coefficient"]) if "coefficient" in state else self.method
+        if state.get("method", older) != self.method:
             return
         self.updates = state["updates"]
-        self._set_gain()
+        self._set_progress()
         generator = None if self.neighbors is None else self.neighbors.generator
         # One of another kind is saved by another kind of device: this one's then begins anew.
         if generator is not None and "generator" in state:
@@ -113,9 +116,9 @@ class Regularization:
             if saved.shape == generator.get_state().shape:
                 generator.set_state(saved)
 
-    def _set_gain(self) -> None:
-        progress = min(1.0, self.updates / self.ramp_updates) if self.ramp_updates else 1.0
-        setattr(self.loss, self.coefficient, self._gain.step(progress))
+    def _set_progress(self) -> None:
+        if self.ramp_updates is not None:
+            self.loss.set_progress(min(1.0, self.updates / self.ramp_updates))
 
     def _transitions(
         self, actor: MLPModel, batch: RolloutStorage.Batch, count: int
