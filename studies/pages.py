@@ -41,9 +41,12 @@ OURS = "L2C2, mse 1, ramp"
 RIVALS = ("vanilla", "CAPS", "CAPS, lambda_spatial=0.005", "CATS")
 TARGETS = ("targets", "runs", "sac_pendulum", "field", "walker2d", "hopper")
 HEADLINE = """\
-| | seeds | measure | vanilla | with L2C2 | change | P(smoother) | return: vanilla | with L2C2 | P(returns more) |
+| | seeds | measure | baseline | with L2C2 | change | P(smoother) | return: baseline | with L2C2 | P(returns more) |
 | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |"""  # noqa: E501
-# Rows of the README's first table: whose records, of which method and length.
+SUMMARY = """\
+| task | algorithm (seeds) | action change per step: baseline | with L2C2 | change | return: baseline | with L2C2 |
+| --- | --- | --- | --- | --- | --- | --- |"""  # noqa: E501
+# Rows of the table of results: whose records, of which method and length.
 HEADLINES = {
     "SAC, Pendulum": ("sac_pendulum", "L2C2, means 10", "30000 frames"),
     "PPO, LunarLander": ("field", OURS, "500000 frames"),
@@ -54,6 +57,8 @@ HEADLINES = {
     "PPO-RPE, Swingup, as in the paper": ("runs", "L2C2", "350 episodes"),
     "PPO-RPE, Swingup, with a target": ("runs", "L2C2, means, target 0.045", "350 episodes"),
 }
+# Rows of the README's table; the text below it has Swingup.
+SUMMARIZED = [label for label in HEADLINES if "Swingup" not in label]
 # What the page of the setting's parts calls them, by their names in tables and in its order.
 PARTS = {
     "vanilla": "vanilla",
@@ -102,9 +107,8 @@ def pages() -> dict[str, Page]:
     # Only the first one has its title and legend.
     targets[1:] = [text.split("\n\n")[1] for text in targets[1:]]
     return {
-        "README.md": Page(
-            {"headline": headline(), "table3": paper_table(shown_groups(runs)).markdown()}
-        ),
+        "README.md": Page({"summary": summary()}),
+        "docs/results.md": Page({"headline": headline()}),
         "results/paper.md": _paper_page(runs),
         **{f"results/{name}.md": _field_page(name, records(name)) for name in FIELD_PAGES},
         "results/one_setting.md": _field_page("one_setting", one_setting()),
@@ -130,7 +134,7 @@ def one_setting() -> list[Record]:
 
 
 def headline_groups(label: str) -> tuple[Group, Group]:
-    """L2C2 and the baseline on the same seeds, of a row of the README's first table."""
+    """L2C2 and the baseline on the same seeds, for a row of the table of results."""
     name, method, length = HEADLINES[label]
     named = label.split(", ")[1].lower()
     task = f"{named}_v5" if named in ("hopper", "walker2d") else named
@@ -147,8 +151,24 @@ def is_usual_pace(record: Record) -> bool:
     return TAU not in record.other_settings
 
 
+def summary() -> str:
+    """The README's table: means of the baseline and of L2C2, the roughest baseline first."""
+    rows = {}
+    for label in SUMMARIZED:
+        ours, baseline = headline_groups(label)
+        algorithm, task = label.split(", ")[:2]
+        (before, after), (lost, kept) = (
+            [side.scores(TEST, quantity).mean() for side in (baseline, ours)]
+            for quantity in ("action_variation", "return")
+        )
+        cells = [task, f"{algorithm} ({len(ours.seeds)})", f"{before:.3f}", f"{after:.3f}"]
+        cells += [f"**{after / before - 1:+.0%}**", _rounded(lost), _rounded(kept)]
+        rows[before] = f"| {' | '.join(cells)} |"
+    return "\n".join([SUMMARY, *(rows[before] for before in sorted(rows, reverse=True))])
+
+
 def headline() -> str:
-    """The README's first table: means of the baseline and of L2C2, and the probabilities."""
+    """The table of results: means of the baseline and of L2C2, and the probabilities."""
     return "\n".join([HEADLINE, *(row for label in HEADLINES for row in _headline_rows(label))])
 
 
@@ -231,6 +251,10 @@ def _field_page(name: str, shown: Sequence[Record]) -> Page:
     more = partial(draw_published, field.point, "hollow: published")
     draw = partial(draw_plane, groups, TEST, measure="sm_asap", more=more)
     return Page({"results": "\n\n".join(texts)}, groups, draw)
+
+
+def _rounded(total: float) -> str:
+    return f"{total:.{0 if abs(total) >= 100 else 1}f}"
 
 
 def _headline_rows(label: str) -> list[str]:

@@ -46,8 +46,8 @@ def test_the_page_says_where_it_stops_scaling():
     assert "The longest takes 3.0 hours" in page and "from 5 cores on" in page
 
 
-def test_the_readme_has_the_hours_of_the_page():
-    """Those of one core."""
-    readme, page = ((ROOT / name).read_text() for name in ("README.md", "results/cores.md"))
-    (told,) = re.findall(r"\[(\d+) hours of one core\]", readme)
+def test_the_guide_has_the_hours_of_the_page():
+    """Hours of one core."""
+    guide, page = ((ROOT / name).read_text() for name in ("docs/experiment.md", "results/cores.md"))
+    (told,) = re.findall(r"\[(\d+) hours of one core\]", guide)
     assert f"one core each, {told} hours in all" in page
