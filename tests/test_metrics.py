@@ -241,7 +241,7 @@ def test_noise_sensitivity_of_a_linear_policy():
 
 def test_noise_sensitivity_refuses_what_is_no_action():
     """A TorchRL actor returns more than its action."""
-    with pytest.raises(TypeError, match="the mean actions alone, got a tuple"):
+    with pytest.raises(TypeError, match="only the mean actions, got a tuple"):
         noise_sensitivity(lambda s: (s, s), torch.zeros(4, 3), 0.2)
 
 

@@ -301,7 +301,7 @@ class TestChoice:
                 "'hellinger' or 'mean' or 'mse' or 'kl', got 'wasserstein'. Or",
             ),
             (2.0, None, TypeError, "policy_distance must be .* Or give a function"),
-            ("kl", 4, ValueError, "hellinger_samples is for policy_distance='hellinger' alone"),
+            ("kl", 4, ValueError, "hellinger_samples is only for policy_distance='hellinger'"),
             ("hellinger", 0, ValueError, "hellinger_samples must be at least 1"),
         ],
     )

@@ -1,4 +1,4 @@
-"""What a setting may be, such as a real number in a range, and what a regularizer may be given."""
+"""Checks of settings, such as a real number in a range, and of a regularizer's input."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torch.compiler import is_compiling
 
 
 def check_positive_int(name: str, value: Any) -> None:
-    """Refuses all but integers of at least 1, also NumPy's; ``True`` is not one.
+    """Checks for an integer of at least 1, also NumPy's; ``True`` is no integer.
 
     Raises:
         TypeError: it is not an integer.
@@ -27,7 +27,7 @@ def check_positive_int(name: str, value: Any) -> None:
 
 
 def as_number(name: str, value: Any) -> Any:
-    """A tensor of one number as that number, which is checked as others are; all else as it is.
+    """Converts a tensor of one number to that number; returns everything else unchanged.
 
     Raises:
         TypeError: the tensor has several numbers, or a gradient, which would be lost.
@@ -51,17 +51,17 @@ def check_real(
     finite: bool = True,
     hint: str = "",
 ) -> None:
-    """Refuses all but real numbers within bounds; ``True`` is not one, and NaN never is within.
+    """Checks for a real number within bounds; ``True`` is no number, NaN is never within.
 
     Args:
-        name: what the message calls it.
-        value: what was given.
-        above: lower bound, itself outside.
-        at_least: lower bound, itself inside.
-        below: upper bound, itself outside.
-        at_most: upper bound, itself inside.
-        finite: whether infinity is refused.
-        hint: what to do instead, a sentence that ends the message.
+        name: the value's name in the message.
+        value: the value to check.
+        above: lower bound, exclusive.
+        at_least: lower bound, inclusive.
+        below: upper bound, exclusive.
+        at_most: upper bound, inclusive.
+        finite: whether infinity is an error.
+        hint: advice, a sentence that ends the message.
 
     Raises:
         TypeError: it is not a real number.
@@ -84,17 +84,17 @@ def check_real(
 
 
 def check_choice(name: str, value: Any, allowed: Sequence[str], *, hint: str = "") -> None:
-    """Refuses all but the strings that are allowed.
+    """Checks for one of the allowed strings.
 
     Args:
-        name: what the message calls it.
-        value: what was given.
-        allowed: which there are.
-        hint: what to do instead, a sentence that ends the message.
+        name: the value's name in the message.
+        value: the value to check.
+        allowed: the allowed strings.
+        hint: advice, a sentence that ends the message.
 
     Raises:
         TypeError: it is not a string.
-        ValueError: it is another one.
+        ValueError: it is not an allowed string.
     """
     listed = " or ".join(map(repr, allowed))
     if not isinstance(value, str):
@@ -123,10 +123,10 @@ def _range(
 
 
 def read_key(name: str, key: NestedKey) -> NestedKey:
-    """An entry's name, flat.
+    """Flattens an entry's name.
 
     Raises:
-        TypeError: it is none; says what it is of.
+        TypeError: it is not a name.
     """
     if isinstance(key, str) or (isinstance(key, tuple) and key):
         return unravel_key(key)
@@ -134,10 +134,10 @@ def read_key(name: str, key: NestedKey) -> NestedKey:
 
 
 def check_of_each(shape: Sequence[int], batch: Sequence[int]) -> None:
-    """Refuses differences that a network without a last dimension has summed over the batch.
+    """Checks that a network without a last dimension has not summed over the batch.
 
     Raises:
-        ValueError: their shape does not begin with the batch's.
+        ValueError: the shape does not begin with the batch's shape.
     """
     if tuple(shape[: len(batch)]) != tuple(batch):
         raise ValueError(
@@ -148,10 +148,10 @@ def check_of_each(shape: Sequence[int], batch: Sequence[int]) -> None:
 
 
 def check_takes_gradients(regularizer: str) -> None:
-    """Refuses inference mode, for what takes gradients of its own.
+    """Checks that inference mode is off, for regularizers that take their own gradients.
 
     Raises:
-        RuntimeError: torch keeps none in this mode.
+        RuntimeError: torch keeps no gradients in this mode.
     """
     if not is_compiling() and torch.is_inference_mode_enabled():
         raise RuntimeError(

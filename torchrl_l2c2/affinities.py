@@ -91,7 +91,7 @@ def sum_to(x: Tensor, ndim: int) -> Tensor:
 @register_hellinger(Normal)
 def _normal(p: Normal, q: Normal) -> Tensor:
     # 2 s t / (s^2 + t^2) = 1 / (1 + (s - t)^2 / (2 s t)): no cancellation for close scales, no
-    # overflow for distant ones. Quotients come first so that tiny scales do not underflow.
+    # overflow for distant scales. Quotients come first: tiny scales would underflow.
     difference = p.scale - q.scale
     spread = 0.5 * (difference / p.scale) * (difference / q.scale)
     shift = (p.loc - q.loc) / torch.hypot(p.scale, q.scale)
@@ -110,11 +110,11 @@ def _masked_categorical(p: MaskedCategorical, q: MaskedCategorical) -> Tensor:
 
 
 def all_probs(distribution: Any) -> Tensor:
-    """The probabilities ``[*B, N]`` of all discrete actions, those of masked ones included."""
+    """The probabilities ``[*B, N]`` of all discrete actions, including masked actions."""
     if not getattr(distribution, "_sparse_mask", False):
         return distribution.probs
-    # A sparse mask keeps the probabilities of the listed actions only. Padding has none, and may
-    # be listed under any number.
+    # A sparse mask keeps only the probabilities of the listed actions. Padding has probability 0
+    # and may be listed under any number.
     listed = distribution._mask.clamp(0, distribution.num_samples - 1)
     shape = (*distribution.batch_shape, distribution.num_samples)
     return distribution.probs.new_zeros(shape).scatter_add(-1, listed, distribution.probs)
@@ -126,7 +126,7 @@ def _bernoulli(p: Bernoulli, q: Bernoulli) -> Tensor:
 
 
 def _both_outcomes(distribution: Bernoulli) -> Tensor:
-    # 1 - probs has no digits left where a policy given by its logits is sure.
+    # 1 - probs has no digits left if a policy given by its logits is nearly certain.
     from_logits = distribution._param is distribution.logits
     failure = torch.sigmoid(-distribution.logits) if from_logits else 1.0 - distribution.probs
     return torch.stack((distribution.probs, failure), -1)
@@ -166,10 +166,10 @@ def _tanh_normal(p: TanhNormal, q: TanhNormal) -> Tensor:
 
 
 def same_bounds(p: TanhNormal, q: TanhNormal) -> bool | Tensor:
-    """Whether actions are squashed alike; a tensor where Python cannot wait for the answer.
+    """Compares the bounds of two policies; returns a tensor where Python cannot wait for it.
 
-    There, under ``torch.compile`` or while a CUDA graph is captured, a wrong one must at least
-    show: as NaN.
+    That is under ``torch.compile`` and while a CUDA graph is captured. The caller then makes
+    different bounds visible as NaN.
     """
     same = (p.low == q.low).all() & (p.high == q.high).all()
     capturing = p.loc.is_cuda and torch.cuda.is_current_stream_capturing()

@@ -33,16 +33,16 @@ def squared_hellinger(
         H^2(p, q) = \frac 1 2 \int \left(\sqrt{p(a)} - \sqrt{q(a)}\right)^2 da
                   = 1 - \int \sqrt{p(a)\, q(a)}\, da
 
-    is the distance of policies of Kobayashi, L2C2, 2022 (:math:`d_\pi`). It lies in ``[0, 1]``,
-    is symmetric, and a bijection of the action does not change it. Its gradient flows into both
-    policies.
+    This is the distance between policies of Kobayashi, L2C2, 2022 (:math:`d_\pi`). It lies in
+    ``[0, 1]``, is symmetric, and a bijection of the action does not change it. Its gradient flows
+    into both policies.
 
     By default it is exact, in closed form, for normal, categorical and Bernoulli policies, masked,
     independent, squashed or composed of several (see :func:`register_hellinger` for others).
     A pair without a closed form is estimated from :data:`MONTE_CARLO_SAMPLES` actions each.
 
-    With ``num_samples`` it is estimated by importance sampling, as in the paper, the mixture
-    :math:`b = (p + q) / 2` being the sampler:
+    With ``num_samples`` it is estimated by importance sampling, as in the paper. The sampler is the
+    mixture :math:`b = (p + q) / 2`:
 
     .. math::
         H^2(p, q) = \mathbb E_{a \sim b}\left[
@@ -50,8 +50,8 @@ def squared_hellinger(
 
     The estimate and its gradient are unbiased, and each term lies in ``[0, 1]``.
 
-    With ``sample`` and ``sample_log_prob`` the one replayed action takes the place of the
-    expectation, its stored likelihood that of :math:`b`. That is unbiased too where the action was
+    With ``sample`` and ``sample_log_prob`` the estimate uses one replayed action, and its stored
+    likelihood instead of the likelihood under :math:`b`. This is also unbiased if the action was
     drawn from :math:`b`, but unbounded.
 
     .. note::
@@ -63,8 +63,8 @@ def squared_hellinger(
         p: one policy, batch shape ``[*B]``.
         q: the other, with the same event shape and a batch shape that broadcasts.
         num_samples: actions drawn from each of the two policies, at least 1; the standard
-            deviation falls with its square root. TorchRL's masked policies score no batch of
-            draws, so they have the closed form only. Defaults to ``None``, the closed form.
+            deviation falls with its square root. TorchRL's masked policies cannot score a batch of
+            draws and have only the closed form. Defaults to ``None``, the closed form.
         sample: replayed actions, shape ``[*B, *event]``.
         sample_log_prob: their log-likelihood when they were taken, shape ``[*B]``; carries no
             gradient.
@@ -115,8 +115,8 @@ def squared_hellinger(
 def squared_error(a: Tensor, b: Tensor) -> Tensor:
     r"""Half the squared error over the last dimension.
 
-    :math:`\frac 1 2 \lVert a - b \rVert_2^2`, the distance of values of Kobayashi, L2C2, 2022
-    (:math:`d_V`, over the heads of an ensemble) and the distance of mean actions of CAPS.
+    :math:`\frac 1 2 \lVert a - b \rVert_2^2`, the distance between values of Kobayashi, L2C2, 2022
+    (:math:`d_V`, over the heads of an ensemble), and between mean actions of CAPS.
 
     Args:
         a: values, shape ``[*B, N]``.
@@ -191,7 +191,7 @@ def check_pair(p: Distribution, q: Distribution) -> None:
 def _labels(distribution: Distribution) -> str:
     if not isinstance(distribution, Categorical):
         return "no labels"
-    # Of a mask that lists some, all.
+    # All labels, also if a mask lists only some.
     return f"{getattr(distribution, 'num_samples', distribution.probs.shape[-1])} labels"
 
 
@@ -203,7 +203,7 @@ def _monte_carlo(p: Distribution, q: Distribution, num_samples: int) -> Tensor:
             _mixture_difference(p, q, source.sample(draws(source, other, num_samples)))
             for source, other in ((p, q), (q, p))
         ]
-    except (NotImplementedError, ValueError) as error:  # Masked ones score no batch of draws.
+    except (NotImplementedError, ValueError) as error:  # Masked policies score no batch of draws.
         raise TypeError(
             f"{type(p).__name__} and {type(q).__name__} cannot be sampled and scored: leave "
             "num_samples, or hellinger_samples, at None where there is a closed form, or register "

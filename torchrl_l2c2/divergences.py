@@ -25,15 +25,15 @@ def kl_divergence(
     .. math::
         D(p \Vert q) = \int p(a) \ln\frac{p(a)}{q(a)}\, da
 
-    lies in ``[0, inf)`` and is not symmetric. Squashing both policies alike does not change it.
-    Closed forms are torch's; the heads of composite policies add up. A pair without one is
-    estimated from actions of :math:`p`, by
+    It lies in ``[0, inf)`` and is not symmetric. Squashing both policies in the same way does not
+    change it. Closed forms come from torch; the heads of composite policies add up. A pair without
+    a closed form is estimated from actions of :math:`p`:
 
     .. math::
         \mathbb E_{a \sim p}\left[r - 1 - \ln r\right], \qquad r = q(a) / p(a),
 
-    no term of which is negative (Schulman, "Approximating KL divergence", 2020: k3). The estimate
-    and its gradient, into both policies, are unbiased.
+    No term is negative (Schulman, "Approximating KL divergence", 2020: k3). The estimate and its
+    gradient into both policies are unbiased.
 
     Args:
         p: one policy, batch shape ``[*B]``.
@@ -72,7 +72,7 @@ def kl_divergence(
         if isinstance(p, kind) and isinstance(q, kind):
             return _categorical_kl(p, q)
     if isinstance(p, TanhNormal) and isinstance(q, TanhNormal):
-        # Torch would compare the bounds, in a way that does not compile.
+        # Torch's own comparison of the bounds does not compile.
         same = same_bounds(p, q)
         base = kl_divergence(p.base_dist, q.base_dist, num_samples=num_samples)
         if isinstance(same, Tensor):
@@ -86,7 +86,7 @@ def kl_divergence(
 
 
 def _normal_kl(p: Normal, q: Normal) -> Tensor:
-    """As torch's own, whose look-up of the closed form does not compile."""
+    """The closed form that torch has, too; torch's look-up of it does not compile."""
     ratio, apart = (p.scale / q.scale).square(), ((p.loc - q.loc) / q.scale).square()
     return 0.5 * (ratio + apart - 1 - ratio.log())
 
@@ -94,7 +94,7 @@ def _normal_kl(p: Normal, q: Normal) -> Tensor:
 def _categorical_kl(
     p: Categorical | OneHotCategorical, q: Categorical | OneHotCategorical
 ) -> Tensor:
-    """As torch's own, with a finite gradient where actions are impossible, as under a mask."""
+    """The closed form of torch, with a finite gradient for impossible (masked) actions."""
     probs_p, probs_q = all_probs(p), all_probs(q)
     possible, both = probs_p > 0, (probs_p > 0) & (probs_q > 0)
     logs = p.logits, q.logits
@@ -117,6 +117,6 @@ def _monte_carlo(p: Distribution, q: Distribution, num_samples: int) -> Tensor:
             "be sampled and scored: give a function of your own instead."
         ) from error
     log_ratio = log_q - log_p
-    # 1 in value; its gradient is that of the distribution that the actions are drawn from.
+    # The value is 1; the gradient is the sampling distribution's score.
     drawn = (log_p - log_p.detach()).exp()
     return (drawn * (torch.expm1(log_ratio) - log_ratio)).mean(0)

@@ -1,8 +1,8 @@
-r"""Gains that set themselves: how strong a regularizer is, from what comes of it.
+r"""Schedules for the gain of a regularizer: constant, ramp, and a target for a measure.
 
-A gain has a ``value`` that multiplies a term, a ``step`` that is told something between updates and
-returns the next value, and a ``state_dict``. The gain of a regularized loss is assigned to, also
-between calls of a compiled loss::
+A gain has a ``value`` that multiplies a term, a ``step`` that takes a measurement between updates
+and returns the next value, and a ``state_dict``. Assign the value to the gain of a regularized
+loss, also between calls of a compiled loss::
 
     loss.regularizer_gain = gain.step(measured)
 """
@@ -45,18 +45,18 @@ class ConstantGain:
         self.value = float(value)
 
     def step(self, measured: float = math.nan) -> float:
-        """The value, whatever was measured."""
+        """The value, for any measurement."""
         return self.value
 
     def state_dict(self) -> dict[str, float]:
-        """What the next steps depend on."""
+        """The values that the next steps depend on."""
         return {"value": self.value}
 
     def load_state_dict(self, state: dict[str, float]) -> None:
-        """Restores what :meth:`state_dict` gave; the coefficient is to be set to ``value`` then.
+        """Restores the result of :meth:`state_dict`; set the loss's gain to ``value`` then.
 
         Raises:
-            ValueError: it has other entries, as that of another kind of gain may; nothing is
+            ValueError: the entries differ, as in the state of another kind of gain; nothing is
                 changed.
         """
         if state.keys() != self.state_dict().keys():
@@ -99,13 +99,13 @@ class RampGain(ConstantGain):
         self.end, self.length = float(end), float(length)
 
     def step(self, measured: float = math.nan) -> float:
-        """The value where a share of training, ``measured``, is over, from 0 to 1.
+        """The value after a share of training, ``measured``, from 0 to 1.
 
-        A last batch may go beyond the end of training: what is somewhat above 1 counts as 1.
+        A last batch may exceed the end of training: a share above 1 counts as 1.
 
         Raises:
             TypeError: it is no number.
-            ValueError: it is below 0 or above 2: no share, but a number of frames or updates.
+            ValueError: it is below 0 or above 2, and so a number of frames or updates, no share.
         """
         measured = as_number("measured", measured)
         check_real("measured", measured, at_least=0, at_most=2, hint="It is a share of training.")
@@ -120,8 +120,8 @@ class TargetGain(ConstantGain):
         \ln\lambda \leftarrow \ln\lambda
             + \eta\, \mathrm{clip}\left(\frac{m - x}{x}, -1, 1\right)
 
-    is dual ascent on the constraint :math:`m \le x`, on the gain's logarithm, within bounds: the
-    form in which SAC sets its temperature. :math:`m` is what the term is there to lower, such as
+    This is dual ascent on the constraint :math:`m \le x`, on the gain's logarithm, within bounds.
+    SAC sets its temperature in the same way. :math:`m` is the measure that the term lowers, such as
     the variation of the actions in an episode.
 
     Args:
@@ -157,7 +157,7 @@ class TargetGain(ConstantGain):
         self._first = self.value
 
     def step(self, measured: float = math.nan) -> float:
-        """The next value after a measure :math:`m`; one that is not finite changes nothing.
+        """The next value after a measure :math:`m`; NaN and infinity change nothing.
 
         Raises:
             TypeError: it is no number.
@@ -178,33 +178,33 @@ def _measured(measured: Any) -> float:
     return float(measured)
 
 
-# CQL's cloning, which takes the place of its actor's term and is never added to it.
+# CQL minimizes its cloning term instead of the actor's term, never both.
 ALTERNATIVE = ("loss_actor_bc",)
 
 
 def is_loss(key: str) -> bool:
-    """Whether an entry of a loss's output is one of the terms that are summed."""
+    """Tells if an entry of a loss's output is a term of the sum."""
     return key == "loss" or key.startswith("loss_")
 
 
 @torch.enable_grad()
 def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]:
-    r"""The gradients' norms of a regularizer's terms, relative to those of the loss's own terms.
+    r"""Gradient norms of a regularizer's terms, relative to the loss's own gradient.
 
     .. math::
         \frac{\lVert \nabla_\theta L_r \rVert_2}{\lVert \nabla_\theta L \rVert_2}
 
-    for every term :math:`L_r` that a regularizer has added to a loss :math:`L`, in the parameters
-    :math:`\theta` that the term trains, whether it is separate or folded into the loss's own.
-    Nothing of the loss changes, and no number is drawn from torch's global generators.
+    for every term :math:`L_r` that a regularizer adds to a loss :math:`L`, in the parameters
+    :math:`\theta` that the term trains. The term may be separate or folded into the loss's own
+    terms. The loss does not change, and nothing is drawn from torch's global generators.
 
     Args:
-        loss (LossModule): as it is trained; one that is not regularized has no shares.
-        batch (TensorDictBase): what it reads; not written to.
+        loss (LossModule): the loss in training; a loss without a regularizer has no shares.
+        batch (TensorDictBase): the loss's input; not written to.
 
     Returns:
-        dict: at least 0 for every added ``loss_*`` key; infinite where the loss's own gradient is
-        zero and the term's is not, 0 of a term that trains nothing, as with frozen networks.
+        dict: at least 0 for every added ``loss_*`` key; infinite if the loss's own gradient is zero
+        and the term's is not, 0 for a term that trains nothing, as with frozen networks.
 
     Warns:
         UserWarning: the loss was called in training, and a term was never differentiated: the
@@ -244,7 +244,7 @@ def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]
             "the loss that is minimized. Add them, or call loss.fold() after making it.",
             stacklevel=3,
         )
-    # A copy, as some losses keep statistics of what they have seen.
+    # A copy, because some losses keep statistics of their batches.
     devices = {parameter.device for parameter in loss.parameters() if parameter.is_cuda}
     with torch.random.fork_rng(devices=devices):
         twin = deepcopy(loss)
@@ -259,13 +259,13 @@ def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]
     parameters = [parameter for parameter in twin.parameters() if parameter.requires_grad]
 
     def gradients(value: Tensor) -> tuple[Tensor | None, ...]:
-        if not value.requires_grad:  # What it would train is frozen.
+        if not value.requires_grad:  # It trains only frozen parameters.
             return (None,) * len(parameters)
         return torch.autograd.grad(value, parameters, allow_unused=True, retain_graph=True)
 
     others = (*added, *ALTERNATIVE)
     losses = (terms[key] for key in terms.keys() if is_loss(key) and key not in others)
-    own = gradients(sum(losses, torch.zeros(())))  # The loss may have none, as rsl_rl's.
+    own = gradients(sum(losses, torch.zeros(())))  # A loss may have no own terms, as in rsl_rl.
     shares = {}
     for key in added:
         pairs = [(g, o) for g, o in zip(gradients(terms[key]), own, strict=True) if g is not None]
@@ -275,5 +275,5 @@ def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]
 
 
 def _norm(gradients: Iterable[Tensor | None]) -> float:
-    # Not of their squares, which in half precision are 0 where gradients are small.
+    # Squares of small gradients would be 0 in half precision.
     return math.hypot(*(float(vector_norm(g)) for g in gradients if g is not None))

@@ -23,12 +23,13 @@ class Squish(nn.Module):
         \mathrm{squish}(x) = \frac{x}{2} \Big(1 + \frac{x}{\sqrt{x^2 + b}}\Big), \qquad
         \mathrm{squareplus}(x) = \frac{1}{2} \big(x + \sqrt{x^2 + b}\big)
 
-    as swish is the input times the derivative of softplus (Kobayashi, L2C2, 2022, "Setup").
+    In the same way, swish is the input times the derivative of softplus (Kobayashi, L2C2, 2022,
+    "Setup").
 
     Args:
         b (float): bend, greater than 0. Larger values bend more gently around 0; towards 0 it
-            becomes a ReLU. [inferred] Default 4.0, where squareplus has softplus's curvature at 0
-            and Squish so follows swish there to second order.
+            becomes a ReLU. [inferred] Default 4.0: squareplus then has the curvature of softplus at
+            0, and Squish follows swish there to second order.
 
     Raises:
         TypeError: ``b`` is not a real number.
@@ -65,8 +66,8 @@ class SigmoidNormal(TanhNormal):
         \sigma(x) = \tfrac{1}{2} \big(1 + \tanh \tfrac{x}{2}\big)
 
     Takes what :class:`~torchrl.modules.TanhNormal` takes; its base distribution has half the
-    location and half the scale that were given. Distances of means are taken of that, and so are a
-    quarter of those of the key ``loc``.
+    location and half the scale that were given. Distances of means use the base distribution and
+    are a quarter of the distances between entries ``loc``.
 
     Examples:
         >>> import torch
@@ -87,12 +88,12 @@ class SigmoidNormal(TanhNormal):
         return mode
 
 
-# How a sample of the normal is kept in the action's bounds.
+# Distributions by the function that keeps actions within their bounds.
 DISTRIBUTIONS = {"tanh": TanhNormal, "sigmoid": SigmoidNormal, "none": IndependentNormal}
 
 
 class EncodedNetwork(nn.Module):
-    """A network on what an encoder makes of the first input, with the other inputs as they are."""
+    """A network that reads the encoded first input and the other inputs unchanged."""
 
     def __init__(self, encoder: nn.Module, network: nn.Module) -> None:
         super().__init__()
@@ -143,9 +144,8 @@ def make_actor(
 ) -> ProbabilisticActor:
     r"""Builds the paper's policy: a diagonal normal from layers of ``Linear, LayerNorm, Squish``.
 
-    It writes ``loc``, ``scale``, ``action`` and ``action_log_prob``, and samples unless told
-    otherwise; under ``set_exploration_type(ExplorationType.DETERMINISTIC)`` the action is ``loc``,
-    squashed like a sample is.
+    It writes ``loc``, ``scale``, ``action`` and ``action_log_prob``. It samples by default; under
+    ``set_exploration_type(ExplorationType.DETERMINISTIC)`` the action is the squashed ``loc``.
 
     Args:
         observation_size (int): number of observed values: the sum of the last dimensions of
@@ -156,18 +156,18 @@ def make_actor(
     Keyword Args:
         hidden (sequence of int): neurons of each hidden layer. More can represent more and cost
             more. Default ``(100, 100)``.
-        squash (str): ``"tanh"`` maps the normal sample into the action's bounds, ``"sigmoid"``
-            too, at half the pace (:class:`SigmoidNormal`); ``"none"`` leaves
-            it unbounded, for an environment that clips. [inferred] Default ``"tanh"``.
+        squash (str): ``"tanh"`` maps the normal sample into the action's bounds; ``"sigmoid"``
+            does so with half the slope (:class:`SigmoidNormal`); ``"none"`` leaves it unbounded,
+            for an environment that clips. [inferred] Default ``"tanh"``.
         scale_mapping (str): how the scale is made positive, a name that
             :class:`~tensordict.nn.NormalParamExtractor` knows. [inferred] Default
             ``"biased_softplus_1.0"``, TorchRL's own: 1 where the network's output is 0.
         squish_b (float): bend of :class:`Squish`. Default 4.0.
         in_keys (str or sequence of NestedKey): observations to read; several are concatenated.
             Default ``("observation",)``.
-        encoder (nn.Module, optional): makes ``[*B, F]`` of the first of them, such as a
-            :class:`~torchrl.modules.ConvNet` of an image; ``observation_size`` counts ``F`` in its
-            place. Default ``None``: the observation as it is.
+        encoder (nn.Module, optional): maps the first observation to ``[*B, F]``, such as a
+            :class:`~torchrl.modules.ConvNet` for an image; ``observation_size`` then counts ``F``
+            for it. Default ``None``: the observation unchanged.
 
     Returns:
         ProbabilisticActor: the policy, for any leading batch dimensions.
@@ -241,9 +241,9 @@ def make_critic(
         squish_b (float): bend of :class:`Squish`. Default 4.0.
         in_keys (str or sequence of NestedKey): observations to read; several are concatenated.
             Default ``("observation",)``.
-        encoder (nn.Module, optional): makes ``[*B, F]`` of the first of them, such as a
-            :class:`~torchrl.modules.ConvNet` of an image; ``observation_size`` counts ``F`` in its
-            place. Default ``None``: the observation as it is.
+        encoder (nn.Module, optional): maps the first observation to ``[*B, F]``, such as a
+            :class:`~torchrl.modules.ConvNet` for an image; ``observation_size`` then counts ``F``
+            for it. Default ``None``: the observation unchanged.
 
     Returns:
         TensorDictModule: the critic, for any leading batch dimensions.

@@ -14,7 +14,7 @@ from torchrl_l2c2._checks import check_positive_int, check_real
 
 @dataclass(frozen=True)
 class Neighborhood:
-    r"""The local box around a state that its transition spans, with its distance and its gain.
+    r"""The local box that a transition spans around a state, with its distance and its gain.
 
     A transition :math:`s \to s'` spans a box with :math:`s` at its center and :math:`s'` at a
     corner. Neighbors are drawn from it and measured relative to the transition (Kobayashi, L2C2,
@@ -44,18 +44,18 @@ class Neighborhood:
             past :math:`s'`; smaller values regularize a smaller surrounding. Defaults to ``1.0``.
         lambda_min: gain at the edge of the box, greater than 0. Larger values smooth everywhere
             in it. Defaults to ``0.01``.
-        lambda_max: gain at its center, greater than ``lambda_min`` and than
+        lambda_max: gain at the center, greater than ``lambda_min`` and than
             ``sigma * lambda_min``. Larger values smooth more where the neighbor is close to the
             state, and change nothing at the edge. Defaults to ``1.0``.
-        shared: one :math:`u` for all dimensions of a state, so that neighbors lie on the line
-            through :math:`s` and :math:`s'`, as in implementations for robots; their distances are
-            uniform then, and the gain that of one dimension. Defaults to ``False``, one for each:
-            the paper.
-        max_step: the largest :math:`\lVert s' - s \rVert_2`, greater than 0, in the state's units;
-            where a state is several entries, of each by itself, and one that is longer is enough.
-            A transition with a longer one is a reset or a teleport, and counts nothing: its
-            neighbors are the state itself, in all entries, at an infinite distance with a gain of
-            0. Defaults to ``None``, no bound.
+        shared: one :math:`u` for all dimensions of a state. Neighbors then lie on the line through
+            :math:`s` and :math:`s'`, as in implementations for robots. Their distances are uniform,
+            and the mean gain is as large as for a state of one dimension. Defaults to ``False``,
+            one number for each dimension (the paper).
+        max_step: the largest :math:`\lVert s' - s \rVert_2`, greater than 0, in the state's units.
+            If a state has several entries, the bound applies to each, and one longer entry is
+            enough. A transition with a longer step is a reset or a teleport and does not count:
+            its neighbors are the state itself, in all entries, at an infinite distance with a gain
+            of 0. Defaults to ``None``, no bound.
 
     Raises:
         TypeError: if a value is not a real number, or ``shared`` is not a boolean.
@@ -239,7 +239,7 @@ class Neighborhood:
                 f"{tuple(state.shape)} with {batch_dims} batch dimensions, got "
                 f"{tuple(uniform.shape)}."
             )
-        # Shared numbers may be those of an entry of another dtype.
+        # Shared numbers may come from an entry of another dtype.
         u = ((2.0 * uniform - 1.0) * self.radius).to(state.dtype)
         displacement = (next_state - state).to(state.dtype)
         known = displacement.isfinite().reshape(*batch, features.numel()).any(-1)

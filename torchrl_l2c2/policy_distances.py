@@ -1,4 +1,4 @@
-"""Distances between policies other than Hellinger's: of their means, and the KL divergence."""
+"""Distances between policies besides the Hellinger distance: between means, and KL divergence."""
 
 from __future__ import annotations
 
@@ -26,23 +26,24 @@ from torchrl_l2c2.divergences import kl_divergence
 PolicyDistance = Callable[[Distribution, Distribution], Tensor]
 """A distance of two policies of batch shape ``[*B]``: a tensor of that shape, at least 0."""
 
-# What a distance is called where it is logged.
+# Names of the distances in logs.
 _NAMES = {"hellinger": "hellinger", "mean": "mean_distance", "mse": "mse", "kl": "kl"}
 
 
 def choose_policy_distance(
     chosen: str | PolicyDistance, hellinger_samples: int | None = None
 ) -> PolicyDistance:
-    """The function that a name stands for, or one's own with the shape of its result checked.
+    """Returns the distance with this name, or checks the results of a given function.
 
     Args:
         chosen: ``"hellinger"``, ``"mean"``, ``"mse"``, ``"kl"`` or a function.
-        hellinger_samples: actions drawn from each policy for an estimate of the first; ``None``
-            for its closed form.
+        hellinger_samples: actions drawn from each policy to estimate the Hellinger distance;
+            ``None`` for its closed form.
 
     Raises:
         TypeError: neither a string nor a function, or ``hellinger_samples`` is no integer.
-        ValueError: another name, or ``hellinger_samples`` is below 1 or for another distance.
+        ValueError: an unknown name, or ``hellinger_samples`` is below 1 or given with another
+            distance.
 
     Examples:
         >>> import torch
@@ -55,7 +56,7 @@ def choose_policy_distance(
         check_positive_int("hellinger_samples", hellinger_samples)
         if chosen != "hellinger":
             raise ValueError(
-                "hellinger_samples is for policy_distance='hellinger' alone, got policy_distance="
+                "hellinger_samples is only for policy_distance='hellinger', got policy_distance="
                 f"{chosen!r}: leave hellinger_samples at None."
             )
         hellinger_samples = int(hellinger_samples)  # NumPy's do not compile.
@@ -82,7 +83,7 @@ def _checked(distance: PolicyDistance, p: Distribution, q: Distribution) -> Tens
 def compare_policies(
     distance: PolicyDistance, p: Distribution | Tensor, q: Distribution | Tensor
 ) -> Tensor:
-    """A distance of two policies; of actions their mean squared error, or half the squared one."""
+    """A distance of two policies, or of two actions: mean squared error or half the squared."""
     if distance is mean_squared_error:
         return mean_squared_error(p, q)
     if isinstance(p, Distribution) and isinstance(q, Distribution):
@@ -94,7 +95,7 @@ def compare_policies(
 def distance_name(
     chosen: str | PolicyDistance, stochastic: bool, hellinger_samples: int | None = None
 ) -> str:
-    """How the distance of :func:`choose_policy_distance` is called where it is logged.
+    """Names the distance of :func:`choose_policy_distance` in logs.
 
     Args:
         chosen: as there.
@@ -110,8 +111,8 @@ def distance_name(
     if chosen not in ("hellinger", "mean", "mse"):
         raise TypeError(
             "the loss has a deterministic policy, which is no distribution to compare by "
-            f"policy_distance={chosen!r}: leave it at its default, which then is half the squared "
-            "distance of the actions."
+            f"policy_distance={chosen!r}: leave it at its default, here half the squared distance "
+            "of the actions."
         )
     if hellinger_samples is not None:
         raise TypeError(
@@ -125,11 +126,11 @@ def policy_mean(policy: Distribution | Tensor, *, squashed: bool = False) -> Ten
     r"""The mean action of a policy, before it is squashed into the action's bounds or after.
 
     Args:
-        policy: a distribution of batch shape ``[*B]``. Of discrete ones the probabilities are the
-            mean, that of an action written as one-hot vector; the heads of a composite one are put
-            behind one another. Actions ``[*B, A]`` are their own mean.
-        squashed: ``False`` takes the mean of the distribution that is squashed or truncated, so
-            that saturated policies differ as well; ``True`` the deterministic action.
+        policy: a distribution of batch shape ``[*B]``. The mean of a discrete distribution is its
+            probabilities (actions as one-hot vectors). The heads of a composite distribution are
+            concatenated. Actions ``[*B, A]`` are their own mean.
+        squashed: ``False`` takes the mean before squashing or truncation, where saturated policies
+            also differ; ``True`` takes the deterministic action.
 
     Returns:
         The means, shape ``[*B, A]``.
@@ -154,7 +155,7 @@ def policy_mean(policy: Distribution | Tensor, *, squashed: bool = False) -> Ten
     if isinstance(policy, Categorical | OneHotCategorical):
         return all_probs(policy)
     mean = _mean(policy, squashed=squashed)
-    # Actions of one number without a dimension of their own, as torch counts those of a Normal.
+    # Actions of one number may lack a dimension, as with torch's Normal.
     return mean if policy.event_shape else mean.unsqueeze(-1)
 
 
@@ -170,7 +171,7 @@ def _mean(policy: Distribution, *, squashed: bool) -> Tensor:
     if mean is not None:
         return mean
     if isinstance(policy, Independent):
-        # Torch's mean of actions that are labels is NaN, and that of squashed ones not there.
+        # Torch's mean is NaN for labels and missing for squashed distributions.
         base = policy_mean(policy.base_dist, squashed=squashed)
         return base.reshape(*policy.batch_shape, -1)
     try:
@@ -188,10 +189,10 @@ def mean_distance(p: Distribution, q: Distribution) -> Tensor:
     .. math::
         d(p, q) = \frac 1 2 \lVert \mu_p - \mu_q \rVert_2^2,
 
-    with the means of :func:`policy_mean`: the distance of CAPS (Mysore et al., 2021), and what
-    implementations of L2C2 for robots put in the place of Hellinger's. It does not see how wide the
-    policies are, and grows with their distance without a bound, in squared units of the action
-    before the squashing. Its gradient flows into both policies.
+    with the means of :func:`policy_mean`. CAPS (Mysore et al., 2021) uses this distance, and so do
+    implementations of L2C2 for robots instead of the Hellinger distance. It ignores how wide the
+    policies are and has no upper bound. It is in squared units of the action before squashing. Its
+    gradient flows into both policies.
 
     Args:
         p: one policy, batch shape ``[*B]``.
@@ -220,9 +221,9 @@ def mean_squared_error(p: Distribution | Tensor, q: Distribution | Tensor) -> Te
     .. math::
         d(p, q) = \frac 1 A \lVert \mu_p - \mu_q \rVert_2^2
 
-    over :math:`A` dimensions of the action: :func:`mean_distance` times :math:`2 / A`, so that a
-    gain that fits one robot does not grow stronger with the joints of the next. Of a choice among
-    discrete actions, :math:`A` is their number. Its gradient flows into both policies.
+    over :math:`A` dimensions of the action: :func:`mean_distance` times :math:`2 / A`. One gain is
+    therefore equally strong for robots with few and with many joints. For discrete actions
+    :math:`A` is their number. The gradient flows into both policies.
 
     Args:
         p: one policy, batch shape ``[*B]``, or its actions, ``[*B, A]``.

@@ -17,15 +17,15 @@ INITIAL_SCALE = 1e-8
 # Squared distances below this are under the resolution of float32 weights. The floor is met only
 # where source and target stay equal: there the scale would decay to 0, and 0 / 0 is NaN.
 SCALE_FLOOR = 1e-16
-# Below, the weight of a source that is where its target is comes near float32's largest number.
+# Below it, the weight of a source equal to its target comes near float32's largest number.
 SMALLEST_NU = 1e-30
 
 
 class TSoftUpdate(TargetNetUpdater):
-    r"""Moves target parameters towards their sources, the less the more the sources jumped.
+    r"""Moves target parameters towards their sources, less after a jump of the sources.
 
-    The update is a running mean under a Student's t-distribution: a source far from its target,
-    measured by how far it usually is, counts as an outlier and gets a small weight (Kobayashi and
+    The update is a running mean under a Student's t-distribution. A source much further from its
+    target than usual counts as an outlier and gets a small weight (Kobayashi and
     Ilboudo, "t-soft update of target network for deep reinforcement learning", 2021; the paper's
     target update). For each parameter tensor :math:`\theta` with target :math:`\bar\theta`:
 
@@ -43,7 +43,7 @@ class TSoftUpdate(TargetNetUpdater):
 
     There is one set of statistics for each tensor as it is stored: the copies of an ensemble's
     parameter (the leading dimension that, for example, ``SACLoss`` gives its critics) share one.
-    Parameters whose target is not distinct are left alone, as by every TorchRL updater.
+    Parameters whose target is not distinct stay as they are, as with every TorchRL updater.
 
     Args:
         loss_module (LossModule): the loss whose ``target_*_params`` are to follow.
@@ -122,10 +122,10 @@ class TSoftUpdate(TargetNetUpdater):
         }
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Restores what :meth:`state_dict` returned.
+        """Restores the result of :meth:`state_dict`.
 
         Args:
-            state_dict (Mapping): from an updater of a loss with the same parameters.
+            state_dict (Mapping): state of an updater of a loss with the same parameters.
 
         Raises:
             KeyError: statistics are missing, or belong to other parameters.
@@ -145,7 +145,7 @@ class TSoftUpdate(TargetNetUpdater):
             vector.copy_(torch.stack([state_dict[entry][name] for name in self._names]))
 
     def _follow_loss_module(self) -> None:
-        """Takes the statistics to where the loss was moved."""
+        """Moves the statistics to the device and dtype of the loss."""
         target = self._target_list[0]
         place = target.device, _precise(target)
         if (self._weight.device, self._weight.dtype) != place:
@@ -153,7 +153,7 @@ class TSoftUpdate(TargetNetUpdater):
 
 
 def _precise(target: Tensor) -> torch.dtype:
-    """Of the statistics: squared distances of weights in half precision are 0 in that."""
+    """The statistics' dtype: squared distances of weights would be 0 in half precision."""
     return torch.promote_types(target.dtype, torch.float32)
 
 
@@ -170,15 +170,15 @@ def t_soft_update(
 
     Args:
         targets (list of Tensor): ``N`` target parameters of one dtype, on one device.
-        sources (list of Tensor): what they follow.
+        sources (list of Tensor): the parameters that they follow.
         weight (Tensor): accumulated weights :math:`W`, shape ``[N]``, in float32 or better.
-        scale (Tensor): squared scales :math:`s^2`, likewise.
+        scale (Tensor): squared scales :math:`s^2`, shape ``[N]``, in float32 or better.
 
     Keyword Args:
         tau (float): pace.
         nu (float): degrees of freedom.
     """
-    # In terms of 1 / nu, so that nu = inf needs no case of its own.
+    # In terms of 1 / nu: nu = inf then needs no special case.
     rate = 0.0 if math.isinf(nu) else 1.0 / nu
     differences = torch._foreach_sub(sources, targets)
     wide = [difference.to(scale.dtype) for difference in differences]

@@ -1,4 +1,4 @@
-"""How smooth a policy is: the paper's measure, the field's others, and where a policy is steep."""
+"""Measures of smoothness: the paper's measure, other common measures, and local steepness."""
 
 from torchrl_l2c2.metrics.actions import (
     action_fluctuation_ratio,

@@ -1,4 +1,4 @@
-"""How smoothly actions follow one another: differences from step to step."""
+"""Smoothness of actions, from differences between steps."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def action_variation(actions: Tensor, mask: Tensor | None = None) -> Tensor:
 
 
 def action_rate(actions: Tensor) -> Tensor:
-    r"""Mean squared change of the action, as robots are punished for it in their reward.
+    r"""Mean squared change of the action, a common penalty in the rewards of robots.
 
     .. math::
         \frac{1}{T - 1} \sum_{t=1}^{T-1} \lVert a_{t+1} - a_t \rVert_2^2
@@ -61,10 +61,10 @@ def action_rate(actions: Tensor) -> Tensor:
     per step. A few large jumps count for more than in :func:`action_variation`.
 
     Args:
-        actions (Tensor): of whole episodes, shape ``[*B, T, A]`` with at least two steps.
+        actions (Tensor): actions of whole episodes, shape ``[*B, T, A]`` with at least two steps.
 
     Returns:
-        Tensor: of each episode, shape ``[*B]``.
+        Tensor: the measure of each episode, shape ``[*B]``.
 
     Raises:
         TypeError: the actions are no floating-point tensor.
@@ -90,10 +90,10 @@ def action_fluctuation_ratio(actions: Tensor) -> Tensor:
     unit per step.
 
     Args:
-        actions (Tensor): of whole episodes, shape ``[*B, T, A]`` with at least two steps.
+        actions (Tensor): actions of whole episodes, shape ``[*B, T, A]`` with at least two steps.
 
     Returns:
-        Tensor: of each episode, shape ``[*B]``.
+        Tensor: the measure of each episode, shape ``[*B]``.
 
     Raises:
         TypeError: the actions are no floating-point tensor.
@@ -120,11 +120,11 @@ def action_jerk(actions: Tensor, sampling_rate: float = 1.0) -> Tensor:
     rate. An action that moves with constant acceleration has none.
 
     Args:
-        actions (Tensor): of whole episodes, shape ``[*B, T, A]`` with at least four steps.
+        actions (Tensor): actions of whole episodes, shape ``[*B, T, A]`` with at least four steps.
         sampling_rate (float): actions per second, greater than 0. Default 1.
 
     Returns:
-        Tensor: of each episode, shape ``[*B]``.
+        Tensor: the measure of each episode, shape ``[*B]``.
 
     Raises:
         TypeError: the actions are no floating-point tensor, or the rate is no number.
@@ -143,21 +143,21 @@ def action_jerk(actions: Tensor, sampling_rate: float = 1.0) -> Tensor:
 
 
 def previous_action_gain(actions: Tensor) -> Tensor:
-    r"""How an action follows the one before: the slope of the line through :math:`(a_{t-1}, a_t)`.
+    r"""Gain of an action on the action before it: the slope of :math:`a_t` over :math:`a_{t-1}`.
 
     .. math::
         \frac{\sum_t (a_t - \bar a)(a_{t-1} - \bar a)}{\sum_t (a_{t-1} - \bar a)^2}
 
-    with the sums over all dimensions and :math:`\bar a` an episode's mean: the lag-1
-    autocorrelation of the actions, but for the ends, and so between -1 and 1, but for these. Near 1
-    the action moves slowly, near 0 every action is a draw of its own, near -1 it flips from step to
-    step, which is shaking at half the control rate.
+    The sums are over all dimensions, and :math:`\bar a` is the episode's mean. Apart from the
+    episode's ends, this is the lag-1 autocorrelation of the actions, between -1 and 1. Near 1 the
+    action moves slowly. Near 0 successive actions are unrelated. Near -1 the action flips from
+    step to step, which is shaking at half the control rate.
 
     Args:
-        actions (Tensor): of whole episodes, shape ``[*B, T, A]`` with at least two steps.
+        actions (Tensor): actions of whole episodes, shape ``[*B, T, A]`` with at least two steps.
 
     Returns:
-        Tensor: of each episode, shape ``[*B]``; NaN where the action never changes.
+        Tensor: the measure of each episode, shape ``[*B]``; NaN where the action never changes.
 
     Raises:
         TypeError: the actions are no floating-point tensor.
@@ -182,22 +182,22 @@ def saturation(
 ) -> Tensor:
     r"""The share of actions at or beyond their bounds, or within a margin of them.
 
-    A policy that is often there is bang-bang control, or asks for more than there is: what is
-    smooth in its network is not in its actions. Between 0 and 1.
+    A policy that is often at its bounds is bang-bang control, or asks for more than is possible:
+    its network may be smooth while its actions are not. Between 0 and 1.
 
     Args:
         actions (Tensor): mean actions, shape ``[*B, T, A]``.
         low (Tensor or float): lower bounds, broadcast over the actions.
         high (Tensor or float): upper bounds.
-        margin (float): share of the range that counts as its end, at least 0; a range that is open
-            on a side has none. Default .01.
+        margin (float): share of the range that counts as its end, at least 0; a range without a
+            bound on one side has no margin. Default 0.01.
 
     Returns:
-        Tensor: of each episode, shape ``[*B]``, over its steps and dimensions.
+        Tensor: the measure of each episode, shape ``[*B]``, over its steps and dimensions.
 
     Raises:
         TypeError: the actions are no floating-point tensor, or the margin is no number.
-        ValueError: they are no episodes, or the margin is negative.
+        ValueError: the shape is wrong, or the margin is negative.
 
     Examples:
         >>> import torch
@@ -214,11 +214,11 @@ def saturation(
 
 
 def check_episodes(name: str, actions: Tensor, least: int) -> None:
-    """Refuses actions that are no numbers of episodes of at least so many steps.
+    """Checks that actions are floating-point numbers of episodes with at least so many steps.
 
     Raises:
-        TypeError: they are no floating-point tensor.
-        ValueError: another shape, or fewer steps.
+        TypeError: the actions are no floating-point tensor.
+        ValueError: the shape is wrong, or there are fewer steps.
     """
     if not isinstance(actions, Tensor) or not actions.is_floating_point():
         given = getattr(actions, "dtype", type(actions).__name__)

@@ -1,4 +1,4 @@
-"""How steep a policy is around its observations, and how much it answers to noise on them."""
+"""Local steepness of a policy, and its sensitivity to noise on observations."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def local_lipschitz(
         \max_k \text{ or } \mathrm{mean}_k \;
         \frac{\lVert f(s) - f(\tilde s_k) \rVert_2}{\lVert s - \tilde s_k \rVert_\infty}
 
-    from the function's values at a state and at its neighbors, for example those of
+    It uses the function's values at a state and at its neighbors, for example from
     :meth:`Neighborhood.sample <torchrl_l2c2.Neighborhood.sample>`. Smaller is smoother. The
     largest quotient bounds the true constant in the neighborhood from below, and more neighbors
     tighten it. Unlike the regularization, which counts distance in units of the transition, this
@@ -43,7 +43,7 @@ def local_lipschitz(
 
     Returns:
         Tensor: the estimate for each state, shape ``[*B]``. Neighbors equal to their state are
-        left out; where none is left the estimate is NaN, as it is of one that is not a number.
+        left out; if none is left or a neighbor is NaN, the estimate is NaN.
 
     Raises:
         TypeError: ``reduction`` is no string.
@@ -66,7 +66,7 @@ def local_lipschitz(
         )
     distance = (neighbor - state.unsqueeze(-2)).abs().amax(-1)
     change = torch.linalg.vector_norm(neighbor_output - output.unsqueeze(-2), dim=-1)
-    moved = distance != 0.0  # A neighbor that is no number is told, not left out.
+    moved = distance != 0.0  # A NaN neighbor counts, and makes the result NaN.
     quotient = torch.where(moved, change / distance, 0.0)
     if reduction == "mean":
         return quotient.sum(-1) / moved.sum(-1)
@@ -81,7 +81,7 @@ def noise_sensitivity(
     *,
     generator: torch.Generator | None = None,
 ) -> Tensor:
-    r"""How much white noise on the observations moves the action.
+    r"""Change of the action under white noise on the observations.
 
     .. math::
         \frac{1}{2} \mathbb E \left[ \lVert \mu(s) - \mu(s + \epsilon) \rVert_2^2 \right],
@@ -92,11 +92,12 @@ def noise_sensitivity(
 
     Args:
         policy (callable): observations ``[*B, *F]`` to mean actions ``[*B, A]``.
-        observations (Tensor): where it is measured, shape ``[*B, *F]``.
+        observations (Tensor): observations to measure at, shape ``[*B, *F]``.
         scale (float): standard deviation of the noise, in the observation's unit, greater than 0.
 
     Keyword Args:
-        generator (torch.Generator, optional): of the noise. Default: PyTorch's global one.
+        generator (torch.Generator, optional): source of the noise. Default: PyTorch's global
+            generator.
 
     Returns:
         Tensor: a single number, the mean over ``[*B]``.
@@ -131,9 +132,9 @@ def noise_sensitivity(
     actions = policy(observations)
     if not isinstance(actions, torch.Tensor):
         raise TypeError(
-            f"noise_sensitivity: policy must return the mean actions alone, got a "
-            f"{type(actions).__name__}: of a TorchRL actor take the 'action' that it writes under "
-            "ExplorationType.DETERMINISTIC."
+            f"noise_sensitivity: policy must return only the mean actions, got a "
+            f"{type(actions).__name__}. With a TorchRL actor, return the 'action' that it writes "
+            "under ExplorationType.DETERMINISTIC."
         )
     change = policy(observations + scale * noise) - actions
     batch = change.shape[:-1]

@@ -1,4 +1,4 @@
-"""How smoothly actions follow one another: what their spectrum is made of."""
+"""Smoothness of actions, from their spectrum."""
 
 from __future__ import annotations
 
@@ -12,19 +12,20 @@ from torchrl_l2c2.metrics.actions import check_episodes
 
 
 def amplitude_spectrum(actions: Tensor, sampling_rate: float = 1.0) -> tuple[Tensor, Tensor]:
-    r"""Amplitudes of the frequencies that an episode's actions are made of.
+    r"""Amplitude spectrum of an episode's actions.
 
     .. math::
         M_i = \frac{c_i}{T} \Big| \sum_t a_t\, e^{-2 \pi \mathrm{i}\, i t / T} \Big|, \qquad
         f_i = \frac{i f_s}{T}, \qquad i = 0, \dots, \lfloor T / 2 \rfloor
 
-    with :math:`c_i = 2`, as a frequency between 0 and :math:`f_s / 2` stands for two of opposite
-    sign, and 1 at these two ends. A sine of amplitude 1 whose period divides the episode has the
-    amplitude 1 at its frequency, and 0 elsewhere. The first is the size of the mean; of even
-    :math:`T` the last, at half the rate, is that of an action that flips from step to step.
+    with :math:`c_i = 2`, because a frequency between 0 and :math:`f_s / 2` stands for two of
+    opposite sign, and :math:`c_i = 1` at these two ends. A sine of amplitude 1 whose period divides
+    the episode has the amplitude 1 at its frequency and 0 elsewhere. The first amplitude is the
+    size of the mean. For even :math:`T` the last amplitude, at half the rate, belongs to an action
+    that flips from step to step.
 
     Args:
-        actions (Tensor): of whole episodes, shape ``[*B, T, A]`` with at least four steps.
+        actions (Tensor): actions of whole episodes, shape ``[*B, T, A]`` with at least four steps.
         sampling_rate (float): actions per second :math:`f_s`, greater than 0. Default 1.
 
     Returns:
@@ -48,10 +49,10 @@ def amplitude_spectrum(actions: Tensor, sampling_rate: float = 1.0) -> tuple[Ten
     """
     check_episodes("amplitude_spectrum", actions, 4)
     check_real("amplitude_spectrum: sampling_rate", sampling_rate, above=0)
-    if actions.itemsize < 4:  # Of which there is no transform.
+    if actions.itemsize < 4:  # The transform does not take half precision.
         actions = actions.float()
     steps = actions.shape[-2]
-    # The constant part is taken off first: its rounding errors would move where nothing does.
+    # Without the constant part, whose rounding errors would look like motion.
     moved = actions - actions[..., :1, :]
     amplitudes = 2.0 / steps * torch.fft.rfft(moved, dim=-2).abs()
     amplitudes[..., 0, :] = actions.mean(-2).abs()
@@ -70,24 +71,24 @@ def spectral_smoothness(actions: Tensor, form: Literal["caps", "asap"] = "caps")
         \mathrm{caps} = \operatorname{mean}_i \Big( M_i \frac{i}{n - 1} \Big), \qquad
         \mathrm{asap} = \sum_i M_i f_i, \qquad n = \lfloor T / 2 \rfloor,
 
-    with :math:`M_i` and :math:`f_i` of :func:`amplitude_spectrum` at a rate of 1. The first is what
-    the authors of CAPS plot; the second what ASAP, PAVE and CATS print, where the transform is not
-    normalized: :math:`\frac{2}{T f_s} \sum_i f_i |\mathrm{FFT}_i|`. Both are means over the
-    action's dimensions. Smaller is smoother. For even :math:`T` the second is :math:`(T - 2) / 4`
-    times the first: it grows with the episode's length, so that episodes of different lengths are
-    not to be compared by it.
+    with :math:`M_i` and :math:`f_i` of :func:`amplitude_spectrum` at a rate of 1. The authors of
+    CAPS plot the first form. ASAP, PAVE and CATS print the second form, without normalization of
+    the transform: :math:`\frac{2}{T f_s} \sum_i f_i |\mathrm{FFT}_i|`. Both are means over the
+    action's dimensions. Smaller is smoother. For even :math:`T` the second form is
+    :math:`(T - 2) / 4` times the first. It grows with the episode's length: do not compare episodes
+    of different lengths by it.
 
     Both leave the highest frequency out, as their authors' code does: sums and means are over
-    :math:`i = 0, \dots, n - 1`. For even :math:`T` that is half the rate, and an action that flips
-    from step to step, the worst there is, counts as perfectly smooth. :func:`roughness` keeps it,
-    and is nearly free of the length.
+    :math:`i = 0, \dots, n - 1`. For even :math:`T` this frequency is half the rate, and an action
+    that flips from step to step counts as perfectly smooth. :func:`roughness` includes it and
+    hardly depends on the length.
 
     Args:
-        actions (Tensor): of whole episodes, shape ``[*B, T, A]`` with at least four steps.
+        actions (Tensor): actions of whole episodes, shape ``[*B, T, A]`` with at least four steps.
         form (str): ``"caps"`` or ``"asap"``. Default ``"caps"``.
 
     Returns:
-        Tensor: of each episode, shape ``[*B]``, in the action's unit.
+        Tensor: the measure of each episode, shape ``[*B]``, in the action's unit.
 
     Raises:
         TypeError: the actions are no floating-point tensor, or the form is no string.
@@ -121,15 +122,15 @@ def roughness(actions: Tensor) -> Tensor:
         \frac{\sum_{i \ge 1} M_i f_i}{\sum_{i \ge 1} M_i}
 
     with :math:`M_i` and :math:`f_i` of :func:`amplitude_spectrum` at a rate of 1: the spectral
-    centroid, a mean over the action's dimensions. Between 0 and .5: white noise has .25, an action
-    that flips from step to step .5, whatever the amplitude and nearly whatever the length. It says
-    how fast an action moves and not how much. The constant part is left out.
+    centroid, a mean over the action's dimensions. Between 0 and 0.5: white noise has 0.25 and an
+    action that flips from step to step has 0.5, for any amplitude and nearly any length. It
+    measures how fast an action moves, not how much. The constant part is left out.
 
     Args:
-        actions (Tensor): of whole episodes, shape ``[*B, T, A]`` with at least four steps.
+        actions (Tensor): actions of whole episodes, shape ``[*B, T, A]`` with at least four steps.
 
     Returns:
-        Tensor: of each episode, shape ``[*B]``; NaN where a dimension never changes.
+        Tensor: the measure of each episode, shape ``[*B]``; NaN where a dimension never changes.
 
     Raises:
         TypeError: the actions are no floating-point tensor.

@@ -21,8 +21,8 @@ class AdaTerm(Optimizer):
     r"""Adaptive moments estimated by a Student's t-distribution (AdaTerm).
 
     The gradients :math:`g` of each parameter tensor are modelled by a t-distribution with location
-    :math:`m`, squared scale :math:`v` and degrees of freedom :math:`\nu`. A gradient far from
-    what was seen before gets a small weight :math:`w`, and :math:`\nu` adapts to how often that
+    :math:`m`, squared scale :math:`v` and degrees of freedom :math:`\nu`. A gradient far from the
+    previous gradients gets a small weight :math:`w`, and :math:`\nu` adapts to how often that
     happens. With one scalar :math:`D, w, \nu` per tensor and the right-hand sides at their old
     values (Ilboudo, Kobayashi and Matsubara, "AdaTerm: Adaptive T-Distribution Estimated Robust
     Moments for Noise-Robust Stochastic Gradient Optimization", 2022; the paper's optimizer):
@@ -75,10 +75,10 @@ class AdaTerm(Optimizer):
         as their squares are finite.
 
     .. note:: **Compilation.** The state is allocated at construction and nothing is read back from
-        the device, so that :meth:`step` can be a part of a function compiled with
+        the device. Therefore :meth:`step` can be a part of a function compiled with
         ``torch.compile(fullgraph=True)`` without recompiling from step to step. A scheduled
-        learning rate takes effect there, too; given as a float, its first change recompiles once,
-        given as ``lr=torch.tensor(1e-3)`` none does. Move a model to its device before
+        learning rate also takes effect there. As a float, its first change recompiles once; as
+        ``lr=torch.tensor(1e-3)``, no change does. Move a model to its device before
         constructing the optimizer.
 
     Examples:
@@ -129,7 +129,7 @@ class AdaTerm(Optimizer):
                     f"AdaTerm: parameters must be float32 or float64, got {p.dtype}: keep them "
                     "in float32 and compute in lower precision with torch.autocast."
                 )
-        # Here and not at the first step, where it would cost a compiled update a second graph.
+        # At the first step it would cost a compiled update a second graph.
         for p in group["params"]:
             self.state[p] = {
                 "step": torch.zeros((), dtype=torch.float32, device=p.device),
@@ -141,13 +141,14 @@ class AdaTerm(Optimizer):
             }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restores what ``state_dict`` gave.
+        """Restores the result of ``state_dict``.
 
         Args:
-            state_dict (dict): of an AdaTerm with as many parameters, of the same shapes.
+            state_dict (dict): state of an AdaTerm with parameters of the same number and shapes.
 
         Raises:
-            ValueError: it is another optimizer's, or of other parameters; nothing is changed.
+            ValueError: the state belongs to another optimizer or to other parameters; nothing is
+                changed.
         """
         for group in state_dict["param_groups"]:
             if missing := SETTINGS - group.keys():
@@ -216,7 +217,7 @@ def adaterm(
 ) -> None:
     r"""Functional form of :class:`AdaTerm`: updates parameters and state in place.
 
-    The elements of all tensors are worked on list by list, the scalars of all tensors as one
+    It processes the elements of all tensors list by list, and the scalars of all tensors as one
     vector.
 
     Args:
@@ -271,7 +272,7 @@ def _next_nu(nu: Tensor, mean_distance: Tensor, beta: float, eps: float, nu_min:
 
 
 def _alike(params: list[Tensor]) -> Iterable[tuple[list[Tensor], list[Tensor]]]:
-    """Parameters with their gradients, by device and dtype: alike ones are worked on together."""
+    """Groups parameters and their gradients by device and dtype."""
     groups: dict[tuple[torch.device, torch.dtype], tuple[list[Tensor], list[Tensor]]] = {}
     for p in params:
         if p.grad is None or not p.numel():

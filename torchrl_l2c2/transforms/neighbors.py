@@ -23,9 +23,9 @@ def draw_neighbors(
     num_samples: int = 1,
     generator: torch.Generator | None = None,
 ) -> TensorDictBase:
-    """Draws neighbors for a batch ``[*B]``: what the transform writes and the loss reads.
+    """Draws the neighbors of a batch ``[*B]``, which the transform writes and the loss reads.
 
-    Arguments and errors are those of :class:`NeighborTransform`.
+    Arguments and errors are the same as for :class:`NeighborTransform`.
 
     Returns:
         The entry that :class:`NeighborTransform` writes.
@@ -78,7 +78,7 @@ def _place(
         distances.append(distance)
     distance = torch.stack(distances).amax(0)
     if len(transitions) > 1:
-        # One entry that is too far away or not known leaves the whole transition out.
+        # An entry that is too far away or unknown leaves the whole transition out.
         far = distance.isinf()
         for key, (state, _) in transitions.items():
             near, ndim = neighbors.get(key), tensordict.batch_dims
@@ -98,7 +98,7 @@ def _check_names(keys: Sequence[NestedKey]) -> None:
 
 
 def _check_apart(written: NestedKey, in_keys: Sequence[NestedKey]) -> None:
-    """Refuses to write over what is read, into it, or over what holds it."""
+    """Checks that writing an entry leaves the read entries as they are."""
     read = [key for in_key in in_keys for key in (in_key, unravel_key(("next", in_key)))]
     paths = [(key,) if isinstance(key, str) else key for key in (written, *read)]
     if any(all(a == b for a, b in zip(paths[0], path, strict=False)) for path in paths[1:]):
@@ -128,7 +128,7 @@ class NeighborTransform(RandomTransform):
     Appended to a replay buffer, it adds to every batch the states
     :math:`\tilde s = s + (s' - s)\, u` of a :class:`Neighborhood` and their distances (Kobayashi,
     L2C2, 2022, "Implementation"). :meth:`L2C2Loss.neighbor_transform` makes it with the settings of
-    a loss; made by itself, it has to have the same. It can equally be called on any tensordict with
+    a loss; otherwise give it the same settings. It can also be called on any tensordict with
     states and successors. The batch keeps its size; with batch size ``[*B]`` and ``K`` samples the
     new entry is, with the same batch size::
 
@@ -137,8 +137,8 @@ class NeighborTransform(RandomTransform):
             "distance": [*B, K],          # infinite where the transition does not count
         }
 
-    Several keys are parts of one state: their displacements are independent, unless ``shared``, and
-    the distance is that of the whole, the largest of the parts'.
+    Several keys are parts of one state. Their displacements are independent, unless ``shared``, and
+    the state's distance is the largest distance of its parts.
 
     .. note::
         A transform that widens the step from :math:`s` to :math:`s'`, such as
@@ -152,16 +152,17 @@ class NeighborTransform(RandomTransform):
         num_samples: neighbors ``K`` per state, at least 1. More give a less noisy regularization
             at ``K`` times its network evaluations. Defaults to ``1``.
         generator: source of the randomness, on the device of the batches, saved and restored with
-            the ``state_dict`` of the buffer. Defaults to PyTorch's global generator. It needs
-            another seed than the buffer's own, whose numbers it would draw, and which does not
-            reach transforms: one that prefetches needs a generator here, and a ``prefetch`` of 1.
+            the ``state_dict`` of the buffer. Defaults to PyTorch's global generator. Use a
+            different seed from the buffer's generator; otherwise both draw the same numbers. The
+            buffer's generator does not reach transforms: a buffer that prefetches needs a
+            generator here and ``prefetch=1``.
 
     Raises:
         TypeError: if ``neighborhood``, ``out_key``, ``num_samples`` or ``generator`` is of another
             type, or, in use, if an entry is not floating point.
-        ValueError: if ``num_samples`` is not positive, a key is reserved, ``out_key`` is among
-            what is read, or the transform is appended to an environment, which does not know
-            :math:`s'` when it shows :math:`s`.
+        ValueError: if ``num_samples`` is not positive, a key is reserved, ``out_key`` is also
+            read, or the transform is appended to an environment, which does not know :math:`s'`
+            when it shows :math:`s`.
         KeyError: in use, if an entry or its successor is missing.
 
     Examples:

@@ -19,10 +19,10 @@ class ObservationNoise(RandomTransform):
 
     The noise is drawn once per observation, at every step and reset, so the successor of a state
     and the state that follows it are the same noisy observation, as with a real sensor.
-    Environments that are not reset keep theirs. It is for environments alone: in a replay buffer
-    it would be drawn anew, for :math:`s` and not for :math:`s'`.
+    Environments that are not reset keep their noise. The transform is only for environments: a
+    replay buffer would draw new noise, for :math:`s` and not for :math:`s'`.
 
-    The paper states a "scale" of its white noise (Kobayashi, L2C2, 2022, "Setup"), read here as the
+    The paper states a "scale" of its white noise (Kobayashi, L2C2, 2022, "Setup"), here the
     standard deviation of a Gaussian [inferred]. The noise leaves the bounds of the observations, so
     their spec becomes unbounded.
 
@@ -30,21 +30,22 @@ class ObservationNoise(RandomTransform):
         scale: standard deviation of the noise, in units of the observation, finite and at least 0;
             a number, or a tensor that broadcasts to the observation. Larger values make the task
             harder; the paper uses 0.01 and 0.001.
-        in_keys: the observations to perturb. Defaults to ``["observation"]``; others, also
-            floating-point ones such as the episode's reward sum, stay exact unless named.
+        in_keys: the observations to perturb. Defaults to ``["observation"]``; other entries, such
+            as the episode's reward sum, stay exact unless named.
         generator: source of the randomness, on the device of the observations, saved and restored
             with the ``state_dict`` of the environment. Defaults to PyTorch's global generator.
             TorchRL gives the seed of ``env.set_seed`` to the simulator and not to transforms: seed
-            a generator, or call :func:`torch.manual_seed`. In the workers of a
-            :class:`~torchrl.envs.ParallelEnv` ``set_seed`` seeds each worker's global generator
-            differently, while one made in the environment's constructor would be the same in all.
+            a generator, or call :func:`torch.manual_seed`. In a
+            :class:`~torchrl.envs.ParallelEnv`, ``set_seed`` seeds each worker's global generator
+            differently; a generator made in the environment's constructor is the same in all.
 
     Raises:
         TypeError: if ``scale`` or ``generator`` is of another type, or, when an environment takes
             the transform, if an observation is not floating point.
-        ValueError: if ``scale`` is negative or not finite, or, likewise, does not broadcast to an
-            observation; in use, if it is given transitions, as in a replay buffer.
-        KeyError: likewise, if the environment has no such observation.
+        ValueError: if ``scale`` is negative or not finite, or, when an environment takes the
+            transform, does not broadcast to an observation; in use, if it is given transitions, as
+            in a replay buffer.
+        KeyError: when an environment takes the transform, if it has no such observation.
 
     Examples:
         >>> import torch
@@ -84,7 +85,7 @@ class ObservationNoise(RandomTransform):
 
     def _apply_transform(self, obs: Tensor) -> Tensor:
         noise = torch.randn(obs.shape, generator=self.generator, dtype=obs.dtype, device=obs.device)
-        # In place, so that the observation keeps its dtype.
+        # In place: the observation keeps its dtype.
         return noise.mul_(self.scale).add_(obs)
 
     def _reset(

@@ -1,4 +1,4 @@
-"""What transforms that draw have in common."""
+"""The base class of transforms that draw random numbers."""
 
 from __future__ import annotations
 
