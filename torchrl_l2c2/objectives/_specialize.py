@@ -15,8 +15,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.objectives import LossModule
 
-# The loss that each was made of, while it lives, with its keys and its value estimator of then.
-_ORIGINALS: WeakKeyDictionary[SpecializedLoss, tuple[weakref.ref[LossModule], Any, Any]] = (
+# The losses that each was made of, while they live, with their keys and value estimators of then.
+_ORIGINALS: WeakKeyDictionary[SpecializedLoss, list[tuple[weakref.ref[LossModule], Any, Any]]] = (
     WeakKeyDictionary()
 )
 
@@ -77,6 +77,7 @@ class SpecializedLoss(LossMixin):
     out_keys = TensorDictModuleBase.out_keys
 
     _parts: tuple[type, ...] = ()
+    _chose_estimator: bool = False  # whether this loss has been given another than its base
 
     def __class_getitem__(cls, base_class: type[LossModule]) -> type[SpecializedLoss]:
         """The subclass of this class and of ``base_class``."""
@@ -105,27 +106,31 @@ class SpecializedLoss(LossMixin):
         return {}
 
     def _warn_of_changed_base(self) -> None:
-        """Warns once if keys or the value estimator of the wrapped loss changed after wrapping."""
-        if (original := _ORIGINALS.get(self)) is None:
-            return
-        base, keys, estimator = original
-        if (loss := base()) is None:
-            return
-        changed = []
-        if loss.tensor_keys != keys:
-            changed.append("set_keys")
-        theirs = getattr(loss, "_value_estimator", None)
-        ours = getattr(self, "_value_estimator", None)
-        if theirs is not estimator and _describe(theirs) != _describe(ours):
-            changed.append("make_value_estimator")
-        if changed:
-            del _ORIGINALS[self]
-            warnings.warn(
-                f"{' and '.join(changed)} of the {type(loss).__name__} was called after it was "
-                f"wrapped, which does not reach the {type(self).__name__}: call it on the wrapped "
-                "loss, or before wrapping.",
-                stacklevel=3,
-            )
+        """Warns once if keys or the value estimator of a wrapped loss changed after wrapping."""
+        for base, keys, estimator in _ORIGINALS.get(self, ()):
+            if (loss := base()) is None:
+                continue
+            changed = ["set_keys"] if loss.tensor_keys != keys else []
+            theirs = getattr(loss, "_value_estimator", None)
+            ours = getattr(self, "_value_estimator", None)
+            other = theirs is not estimator and _describe(theirs) != _describe(ours)
+            if other and not self._chose_estimator:
+                changed.append("make_value_estimator")
+            if changed:
+                del _ORIGINALS[self]
+                warnings.warn(
+                    f"{' and '.join(changed)} of the {type(loss).__name__} was called after it was "
+                    f"wrapped, which does not reach the {type(self).__name__}: call it on the "
+                    "wrapped loss, or before wrapping.",
+                    stacklevel=3,
+                )
+                return
+
+    def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> Any:
+        """As for the loss itself."""
+        # A loss that has none makes the usual one, without any.
+        self._chose_estimator = bool(hyperparams.keys() - {"device"})
+        return super().make_value_estimator(value_type, **hyperparams)
 
     def set_keys(self, **kwargs: NestedKey | None) -> None:
         """As for the loss itself."""
@@ -205,7 +210,9 @@ def _adopt(self: SpecializedLoss, base_loss: LossModule) -> None:
         if hook.with_module:
             self._load_state_dict_pre_hooks[key] = type(hook)(hook.hook, self)
     estimator = getattr(base_loss, "_value_estimator", None)
-    _ORIGINALS[self] = weakref.ref(base_loss), copy.copy(base_loss.tensor_keys), estimator
+    original = weakref.ref(base_loss), copy.copy(base_loss.tensor_keys), estimator
+    inner = _ORIGINALS.get(base_loss, []) if isinstance(base_loss, SpecializedLoss) else []
+    _ORIGINALS[self] = [original, *inner]
     self.in_keys = getattr(base_loss, "in_keys", [])
     self.out_keys = getattr(base_loss, "out_keys", [])
 
