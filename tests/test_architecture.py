@@ -36,8 +36,9 @@ rsl_rl.ppo
 rsl_rl.__init__
 trainers __init__
 experiment.errors
-experiment.settings experiment.compilation experiment.spaces experiment.guard
-experiment.tracing experiment.frames experiment.row_writer
+experiment.settings experiment._torch_internals experiment.spaces experiment.guard
+experiment.compilation
+experiment.tracing experiment.frames experiment._torchrl_internals
 experiment.loggers experiment.acting experiment.files experiment.versions
 experiment.checkpoints experiment.metrics_log
 experiment.environments experiment.lock experiment.signals
@@ -49,7 +50,7 @@ experiment.regularizers.none experiment.regularizers.caps experiment.regularizer
 experiment.regularizers.cats experiment.regularizers.grad_caps experiment.regularizers.lcp
 experiment.regularizers.sr2l experiment.regularizers.asap
 experiment.regularizers.__init__
-experiment.algorithms.normalization experiment.algorithms.clip_ppo
+experiment.algorithms.normalization
 experiment.algorithms.agent experiment.algorithms.networks experiment.algorithms.base
 experiment.algorithms.ppo_rpe experiment.algorithms.sac experiment.algorithms.td3
 experiment.algorithms.dqn experiment.algorithms.ppo

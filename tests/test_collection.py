@@ -270,6 +270,10 @@ class TestSeveralWorkers:
         assert torch.equal(before["observation"][0], after["observation"][0])
         assert (after["scale"][0] > before["scale"][0]).all()
 
+    def test_what_sends_weights_is_known_and_keeps_no_buffers(self, collector):
+        """TorchRL's names for both, which ``shutdown`` and the workers use."""
+        assert collector._weight_sync_schemes and collector._use_buffers is False
+
     def test_an_error_of_the_pipes_says_what_it_means(self, collector, monkeypatch):
         """What TorchRL raises while it cleans up differs with the time that a process takes."""
 

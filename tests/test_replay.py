@@ -27,8 +27,8 @@ from torchrl_l2c2.experiment import (
     TD3Config,
     UniformReplayConfig,
 )
+from torchrl_l2c2.experiment._torchrl_internals import load_replay_state, replay_state
 from torchrl_l2c2.experiment.compilation import compiler_available
-from torchrl_l2c2.experiment.replay import load_replay_state, replay_state
 from torchrl_l2c2.experiment.settings import SettingError
 from torchrl_l2c2.experiment.update import ReplayUpdate, make_update
 

@@ -22,6 +22,7 @@ from torchrl.envs import (
     set_exploration_type,
 )
 
+from torchrl_l2c2.experiment._torchrl_internals import first_observation, noisy, simulator_of
 from torchrl_l2c2.experiment.acting import on_tensors
 from torchrl_l2c2.experiment.environments import NOISE_SEED, simulating
 from torchrl_l2c2.experiment.frames import PREVIOUS, Frame, as_reward, stack_frames
@@ -98,12 +99,12 @@ class EpisodeCollector(Collector):
         self._previous: Tensor | None = None
         self._random_frames_left = random_frames
         # The collector has reset the environment when it was made.
-        self._observation: Tensor | None = self._carrier.get("observation").clone()
+        self._observation: Tensor | None = first_observation(self)
         self._policy_keys = [key for key in policy.out_keys if not key.startswith("_")]
         self._act = on_tensors(policy, self._policy_keys, compile_policy)
         # Of a policy whose samples go beyond the bounds: frames have these, the task what it takes.
         self._taken: Callable[[Tensor], Tensor] | None = getattr(policy, "taken", None)
-        self._gymnasium = self._simulator._env
+        self._gymnasium = simulator_of(self._simulator)
         self._dtype = self._simulator.observation_spec["observation"].dtype
         continuous = self._simulator.action_spec.dtype.is_floating_point
         self._to_action = as_array if continuous else self._simulator.read_action
@@ -195,7 +196,7 @@ def observed(seen: np.ndarray, dtype: torch.dtype, noise: ObservationNoise | Non
     """What the policy gets of an observation: a copy, as a simulator may write into its own."""
     if noise is None:
         return torch.tensor(seen, dtype=dtype)
-    return noise._apply_transform(torch.as_tensor(seen, dtype=dtype))
+    return noisy(noise, torch.as_tensor(seen, dtype=dtype))
 
 
 def generator_states(gymnasium: Env, noise: ObservationNoise | None) -> dict[str, Any]:

@@ -16,15 +16,23 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch._guards import TracingContext, tracing
-from torch._inductor import config as inductor_config
-from torch._inductor.custom_graph_pass import CustomGraphPass, get_hash_for_files
-from torch._subclasses import FakeTensor, FakeTensorMode
 from torch.fx import Graph, GraphModule
 from torch.fx.experimental.proxy_tensor import get_proxy_mode, make_fx, track_tensor_tree
 from torch.fx.experimental.symbolic_shapes import ShapeEnv
-from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
-from torch.utils._pytree import tree_flatten, tree_map_only, tree_unflatten
+
+from torchrl_l2c2.experiment._torch_internals import (
+    CustomGraphPass,
+    FakeTensor,
+    FakeTensorMode,
+    TorchDispatchMode,
+    compile_graph,
+    disable_current_modes,
+    get_hash_for_files,
+    marked_as_compiling,
+    tree_flatten,
+    tree_map_only,
+    tree_unflatten,
+)
 
 from torchrl_l2c2.experiment.errors import ChildFailedError
 
@@ -118,15 +126,10 @@ def _without_contents(mode: FakeTensorMode, tensor: Tensor) -> Tensor:
 @contextmanager
 def _compiling() -> Iterator[None]:
     """Tells losses and distributions that they are traced: they then ask nothing of contents."""
-    before = torch.compiler._is_compiling_flag
-    torch.compiler._is_compiling_flag = True
-    try:
-        with warnings.catch_warnings():
-            # That locks are not watched meanwhile, and of a setting of torch's that it reads.
-            warnings.filterwarnings("ignore", module="tensordict")
-            yield
-    finally:
-        torch.compiler._is_compiling_flag = before
+    with marked_as_compiling(), warnings.catch_warnings():
+        # That locks are not watched meanwhile, and of a setting of torch's that it reads.
+        warnings.filterwarnings("ignore", module="tensordict")
+        yield
 
 
 class _Reached(TorchDispatchMode):
@@ -176,7 +179,7 @@ class _Reached(TorchDispatchMode):
     def _new_input(self, tensor: Tensor) -> Tensor:
         proxies = get_proxy_mode()
         assert proxies is not None
-        with _disable_current_modes():
+        with disable_current_modes():
             self.tensors.append(tensor.detach())
             self.inputs.append(_without_contents(self._mode, self.tensors[-1]))
         proxy = proxies.tracer.create_proxy("placeholder", f"reached_{len(self.inputs)}", (), {})
@@ -196,9 +199,6 @@ def _compile(
         if getattr(node.target, "namespace", None) == "profiler":
             graph.erase_node(node)
     module.recompile()
-    # Takes a second to import, which those who compile nothing need not wait.
-    from torch._inductor.compile_fx import compile_fx
-
     options = {
         "fallback_random": True,
         # The sizes of the inputs are checked before the program is chosen: once is enough.
@@ -206,12 +206,11 @@ def _compile(
         "post_grad_custom_post_pass": _BiasesApart(),
     }
     try:
-        with torch.no_grad(), tracing(TracingContext(mode)), inductor_config.patch(options):
-            program: Any = compile_fx(module, inputs)
+        with torch.no_grad():
+            return compile_graph(module, inputs, mode, options)
     # Of any kind: inductor's own mistakes are such as any program makes.
     except Exception as error:
         raise CompilerError(_failure(str(error).splitlines())) from error
-    return program
 
 
 def _failure(lines: Sequence[str]) -> str:

@@ -29,6 +29,7 @@ from torch import Tensor, nn
 from torchrl.data import OneHot
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
+from torchrl_l2c2.experiment._torchrl_internals import simulator_of
 from torchrl_l2c2.experiment.algorithms.networks import action_bounds
 from torchrl_l2c2.experiment.collection import play_episodes
 from torchrl_l2c2.experiment.environments import control_rate, untransformed
@@ -250,7 +251,7 @@ def _describe_image(env: EnvBase) -> dict[str, Any]:
 
 def _wrapper(env: EnvBase, kind: type) -> Any:
     """The outermost wrapper of a kind around the simulator; ``None`` without one."""
-    wrapped = untransformed(env)._env
+    wrapped = simulator_of(untransformed(env))
     while isinstance(wrapped, gymnasium.Wrapper):
         if isinstance(wrapped, kind):
             return wrapped

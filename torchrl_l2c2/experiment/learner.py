@@ -12,9 +12,9 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import TensorDictReplayBuffer
 
+from torchrl_l2c2.experiment._torchrl_internals import RowWriter
 from torchrl_l2c2.experiment.algorithms.agent import Agent
 from torchrl_l2c2.experiment.frames import Frame
-from torchrl_l2c2.experiment.row_writer import RowWriter
 from torchrl_l2c2.experiment.update import ReplayUpdate
 from torchrl_l2c2.gains import gradient_shares, is_loss
 

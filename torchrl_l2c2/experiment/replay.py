@@ -1,9 +1,8 @@
-"""The replay buffers that a run can choose from, and their state."""
+"""The replay buffers that a run can choose from."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pydantic import Field
 
@@ -125,39 +124,3 @@ REPLAYS: dict[str, ReplayConfig] = {
     "uniform": UniformReplayConfig(),
     "rollout": RolloutReplayConfig(),
 }
-
-
-def replay_state(replay: TensorDictReplayBuffer) -> dict[str, Any]:
-    """A replay buffer's ``state_dict`` with the priorities as tensors instead of C++ objects."""
-    import torch
-    from torchrl.data import TensorDictPrioritizedReplayBuffer
-
-    state = dict(replay.state_dict())
-    if isinstance(replay, TensorDictPrioritizedReplayBuffer):
-        sampler = dict(state["_sampler"])
-        index = torch.arange(len(replay))
-        for tree in ("_sum_tree", "_min_tree"):
-            sampler[tree] = torch.as_tensor(sampler[tree][index])
-        state["_sampler"] = sampler
-    return state
-
-
-def load_replay_state(replay: TensorDictReplayBuffer, state: Mapping[str, Any]) -> None:
-    """Restores what :func:`replay_state` gave into a buffer made with the same settings."""
-    import torch
-    from torchrl.data import TensorDictPrioritizedReplayBuffer
-
-    state = dict(state)
-    if isinstance(replay, TensorDictPrioritizedReplayBuffer):
-        sampler = dict(state["_sampler"])
-        empty = replay.sampler.state_dict()
-        for tree in ("_sum_tree", "_min_tree"):
-            values = sampler[tree]
-            sampler[tree] = empty[tree]
-            if len(values):
-                sampler[tree][torch.arange(len(values))] = values
-        state["_sampler"] = sampler
-    replay.load_state_dict(state)
-    storage = replay.storage
-    if storage._storage is not None:  # Where it was empty, it is what was loaded.
-        storage._storage = storage._storage.to(storage.device)

@@ -13,6 +13,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
+from torchrl_l2c2.experiment._torchrl_internals import simulator_of
 from torchrl_l2c2.experiment.acting import on_tensors
 from torchrl_l2c2.experiment.collection import (
     generator_states,
@@ -143,7 +144,7 @@ class _Stream:
 
     def __init__(self, env: EnvBase, keep_previous: bool) -> None:
         simulator, self._noise = simulator_and_noise(env)
-        self._env, self._gymnasium = env, simulator._env
+        self._env, self._gymnasium = env, simulator_of(simulator)
         self._keep_previous = keep_previous
         self._dtype = simulator.observation_spec["observation"].dtype
         space: Any = self._gymnasium.action_space

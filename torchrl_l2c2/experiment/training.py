@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from torchrl_l2c2.experiment._torchrl_internals import load_replay_state, replay_state
 from torchrl_l2c2.experiment.best_policy import BestPolicy
 from torchrl_l2c2.experiment.checkpoints import save_checkpoint
 from torchrl_l2c2.experiment.compilation import compiler_available
@@ -34,7 +35,6 @@ from torchrl_l2c2.experiment.optimizers import anneal
 from torchrl_l2c2.experiment.player import Episode, Player
 from torchrl_l2c2.experiment.process import ProcessState
 from torchrl_l2c2.experiment.progress import Progress, say
-from torchrl_l2c2.experiment.replay import load_replay_state, replay_state
 from torchrl_l2c2.experiment.schedules import SCHEDULES
 from torchrl_l2c2.experiment.signals import Interrupted, stop_on_signals
 from torchrl_l2c2.experiment.tasks import Budget

@@ -14,8 +14,8 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import TensorDictPrioritizedReplayBuffer, TensorDictReplayBuffer
-from torchrl.objectives import LossModule
 
+from torchrl_l2c2.experiment._torchrl_internals import forget_traced, stored_tensors
 from torchrl_l2c2.experiment.algorithms.agent import Agent
 from torchrl_l2c2.experiment.compilation import compiled
 from torchrl_l2c2.experiment.tracing import traceable_step, traceable_targets
@@ -66,7 +66,7 @@ def make_update(
         batch = drawn[0].copy() if read is None else read(*drawn)
         terms = agent.loss(batch)
         if torch.compiler.is_compiling():
-            _forget_stand_ins(agent.loss)
+            forget_traced(agent.loss)
         priority = batch.get("td_error", None)
         total = sum(
             terms[key]
@@ -117,13 +117,6 @@ def make_update(
         return values, priority
 
     return checked_update
-
-
-def _forget_stand_ins(loss: LossModule) -> None:
-    """Has TorchRL's losses detach their parameters anew: they keep what came of it while traced."""
-    for module in loss.modules():
-        if isinstance(module, LossModule):
-            module._erase_cache()
 
 
 class Draw(NamedTuple):
@@ -212,8 +205,9 @@ class ReplayUpdate:
 
     def draw(self) -> Draw:
         """Draws the rows of a batch, and the random numbers for their neighbors."""
-        if self._storage._storage is not self._source:
-            self._source = self._storage._storage
+        source = stored_tensors(self._storage)
+        if source is not None and source is not self._source:
+            self._source = source
             self._names, self._stored = zip(*self._source.items(True, True), strict=True)
         rows, weight = self._rows()
         rows = rows.to(self._device)

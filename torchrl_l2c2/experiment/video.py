@@ -11,11 +11,13 @@ import os
 from collections.abc import Iterable, Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
+from torchrl_l2c2.experiment._torchrl_internals import simulator_of
 from torchrl_l2c2.experiment.collection import play_episodes
 from torchrl_l2c2.experiment.environments import control_rate, make_env, untransformed
 from torchrl_l2c2.experiment.errors import MissingPackageError, UserError, told_in_a_line
@@ -127,7 +129,7 @@ def play_pictures(
             policy, env, max_steps = load_policy(
                 run, seed=seed, noise_scale=noise_scale, best=best, render=True
             )
-            simulator = untransformed(env)._env
+            simulator: Any = simulator_of(untransformed(env))
             played = [
                 (episode, list(simulator.render()), control_rate(env))
                 for episode in play_episodes(policy, env, episodes, max_steps=max_steps)

@@ -21,6 +21,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.collectors import MultiSyncCollector
 from torchrl.envs import EnvBase, ExplorationType
 
+from torchrl_l2c2.experiment._torchrl_internals import end_weight_senders, keep_no_buffers
 from torchrl_l2c2.experiment.algorithms.agent import Agent
 from torchrl_l2c2.experiment.collection import EpisodeCollector
 from torchrl_l2c2.experiment.config import ExperimentConfig
@@ -156,9 +157,7 @@ class MultiEpisodeCollector(MultiSyncCollector):
         """Ends the processes; nothing can be collected any more."""
         atexit.unregister(self._at_exit)
         super().shutdown(*args, **kwargs)
-        # Left to their __del__ they would start a thread where Python ends, and wait for it.
-        for scheme in (getattr(self, "_weight_sync_schemes", None) or {}).values():
-            scheme.shutdown()
+        end_weight_senders(self)
 
     def rollout(self) -> list[TensorDictBase]:
         """One episode of every process, as :meth:`EpisodeCollector.rollout` gives them."""
@@ -207,7 +206,7 @@ class _EpisodeWorker(EpisodeCollector):
             exploration_type=exploration_type,
             keep_previous=keep_previous,
         )
-        self._use_buffers = False
+        keep_no_buffers(self)
 
     def rollout(self) -> TensorDictBase:
         # The parent sets it for a round that is to be random, all of it or nothing.

@@ -109,8 +109,8 @@ class PPOConfig(AlgorithmConfig):
         from torchrl.modules import ValueOperator
         from torchrl.objectives.value import GAE
 
+        from torchrl_l2c2.experiment._torchrl_internals import TraceableClipPPOLoss
         from torchrl_l2c2.experiment.algorithms.agent import Agent
-        from torchrl_l2c2.experiment.algorithms.clip_ppo import TraceableClipPPOLoss
         from torchrl_l2c2.experiment.algorithms.networks import (
             check_actions,
             normal_actor,
