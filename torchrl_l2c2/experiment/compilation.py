@@ -33,7 +33,6 @@ from torchrl_l2c2.experiment._torch_internals import (
     tree_map_only,
     tree_unflatten,
 )
-
 from torchrl_l2c2.experiment.errors import ChildFailedError
 
 
