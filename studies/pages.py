@@ -28,10 +28,11 @@ from studies.paper import (
 from studies.targets import gain_targets_table
 from torchrl_l2c2.experiment.files import write_atomically
 from torchrl_l2c2.experiment.finished import Record
-from torchrl_l2c2.experiment.reports.comparison import COMPARED, improvement_cell
+from torchrl_l2c2.experiment.reports.comparison import COMPARED, Estimate, improvement_cell
 from torchrl_l2c2.experiment.reports.figures import draw_plane
 from torchrl_l2c2.experiment.reports.groups import Group, group_records
 from torchrl_l2c2.experiment.reports.records import digest, merge, read_records
+from torchrl_l2c2.experiment.reports.statistics import mean
 from torchrl_l2c2.experiment.reports.tables import number_range, settings_notes
 
 ROOT = Path(__file__).parents[1]
@@ -95,8 +96,8 @@ class Page(NamedTuple):
 def pages() -> dict[str, Page]:
     """Every page with generated parts, by its path from the root."""
     runs, one, caps = records("runs"), records("one_gain"), records("caps_gains")
-    mean = [r for r in runs if r.other_settings.get("algorithm.reduction") == "mean"]
-    summed = [r for r in runs if r not in mean]
+    averaged = [r for r in runs if r.other_settings.get("algorithm.reduction") == "mean"]
+    summed = [r for r in runs if r not in averaged]
     short = [r for r in summed if (r.task, r.length) == ("reacher", "3000 episodes")]
     caps += [r for r in one if r.method == "none" and r.task != "walker2d_v5"]
     chosen = [choice_table(each).markdown() for each in (records("field_gains"), one, caps)]
@@ -112,9 +113,10 @@ def pages() -> dict[str, Page]:
         "results/paper.md": _paper_page(runs),
         **{f"results/{name}.md": _field_page(name, records(name)) for name in FIELD_PAGES},
         "results/one_setting.md": _field_page("one_setting", one_setting()),
-        "results/batch_mean.md": Page({"results": paper_table(group_records(mean)).markdown()}),
+        "results/batch_mean.md": Page({"results": paper_table(group_records(averaged)).markdown()}),
         "results/reacher_3000.md": Page({"results": paper_table(group_records(short)).markdown()}),
         "results/parts.md": Page({"parts": parts()}),
+        "results/td3.md": Page({"test": td3_test(), "choice": td3_choice()}),
         "results/field_gains.md": Page(dict(zip(("rivals", "one", "caps"), chosen, strict=True))),
         "results/targets.md": Page(dict(zip(("all", "swingup", "hopper"), targets, strict=True))),
         "docs/protocol.md": Page({"reacher": reacher_by_seed(runs)}),
@@ -192,6 +194,46 @@ def parts() -> str:
         for method, setting in PARTS.items():
             if row := shown.get((task, method)):
                 rows.append([task, setting, *(row[column] for column in kept)])
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+TD3_TESTED = {
+    "none": "baseline",
+    "l2c2_ramp": "L2C2, `lambda_min=10`, ramp",
+    "cats": "CATS, `lambda_temporal=3`",
+}
+
+
+def td3_test() -> str:
+    """The table of TD3's presets on seeds 0 to 9, of the policies of the last 10% of training."""
+    found = [r for r in records("td3") if r.seed < 10 and r.method in TD3_TESTED]
+    groups = {group.first.method: group for group in group_records(found)}
+    columns = ["setting", "return", "action variation", "P(returns more)", "P(smoother)"]
+    rows = [columns, ["---"] * len(columns)]
+    for method, name in TD3_TESTED.items():
+        group, test = groups[method], "late_mean"
+        scores = [group.scores(test, quantity) for quantity in ("return", "action_variation")]
+        means = [Estimate.of(mean, each) for each in scores]
+        cells = [
+            "" if found is None else found.text(f"{{:.{digits}f}}".format)
+            for found, digits in zip(means, (1, 3), strict=True)
+        ]
+        better = ("return", "action_variation")
+        compared = [improvement_cell([group], [groups["none"]], test, each) for each in better]
+        rows.append([name, *cells, *(compared if method != "none" else ["", ""])])
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def td3_choice() -> str:
+    """The table of TD3's candidates on seeds 100 to 102."""
+    rows = [["setting", "return by seed", "action variation by seed", "mean return"]]
+    rows[0].append("mean action variation")
+    rows.append(["---"] * 5)
+    for group in group_records([r for r in records("td3") if r.seed >= 100]):
+        both = [group.scores("late_mean", q) for q in ("return", "action_variation")]
+        each = [", ".join(f"{v:.{d}f}" for v in s.flat) for s, d in zip(both, (0, 3), strict=True)]
+        means = [f"{both[0].mean():.1f}", f"{both[1].mean():.3f}"]
+        rows.append([group.name, *each, *means])
     return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
 
