@@ -40,7 +40,7 @@ def smooth(
     penalty is part of its own terms (``loss_actor`` or ``loss_objective``), so that loops that sum
     terms by name, or all ``loss_*`` keys, need no change. It is reported as ``penalty_*``.
 
-    Settings come from one table, :data:`torchrl_l2c2.presets.PRESETS`, by the class of the loss.
+    Settings come from one table, ``torchrl_l2c2.presets.PRESETS``, by the class of the loss.
     The gains for PPO and TD3 rise with the progress of training: call
     ``loss.set_progress(frames / total_frames)`` after every rollout. Without that they stay at
     their last value.
