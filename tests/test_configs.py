@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import fields
 from pathlib import Path
+from typing import get_type_hints
 
 import pytest
 import torch
@@ -25,6 +26,7 @@ from torchrl_l2c2 import (
     AdaTerm,
     ASAPLoss,
     CAPSLoss,
+    CATSLoss,
     GradCAPSLoss,
     L2C2Loss,
     Neighborhood,
@@ -38,6 +40,7 @@ from torchrl_l2c2 import (
 )
 
 OURS = {
+    ("loss", "smooth"): trainers.SmoothLossConfig,
     ("loss", "l2c2"): trainers.L2C2LossConfig,
     ("loss", "caps"): trainers.CAPSLossConfig,
     ("loss", "cats"): trainers.CATSLossConfig,
@@ -379,18 +382,50 @@ def test_trainer_composes():
     assert len(trainer._log_dict["loss_l2c2_qvalue"]) == 2
 
 
-def test_documentation_composes(tmp_path):
-    """The page's YAML is a regularized SAC loss and a buffer with the same neighborhood."""
+def documented(number: int, folder: Path, *overrides: str) -> DictConfig:
+    """A YAML block of the documentation's page, composed, with networks."""
     page = (Path(__file__).parents[1] / "docs" / "trainers.md").read_text()
-    (block,) = re.findall(r"```yaml\n(.*?)```", page, flags=re.DOTALL)
-    (tmp_path / "config.yaml").write_text(block)
-    with initialize_config_dir(str(tmp_path), version_base=None):
-        cfg = compose("config", overrides=["near.lambda_max=0.5", "+networks={}"])
+    block = re.findall(r"```yaml\n(.*?)```", page, flags=re.DOTALL)[number]
+    (folder / "config.yaml").write_text(block)
+    with initialize_config_dir(str(folder), version_base=None):
+        cfg = compose("config", overrides=[*overrides, "+networks={}"])
     OmegaConf.set_struct(cfg, False)
     cfg.networks = NETWORKS
+    return cfg
+
+
+def test_documented_smooth_composes(tmp_path):
+    """The page's first YAML is SAC's preset, with what its shell command changes."""
+    changes = ["loss.strength=2", "+loss.overrides.lambda_max=500"]
+    loss = instantiate(documented(0, tmp_path, *changes).loss)
+    assert isinstance(loss, SACLoss) and isinstance(loss, L2C2Loss)
+    assert loss.l2c2_neighborhood == Neighborhood(lambda_min=10, lambda_max=500, shared=True)
+    assert loss.regularizer_gain == 2.0 and loss.folded
+
+
+def test_documented_components_compose(tmp_path):
+    """The page's second YAML is a loss and a buffer with the same neighborhood: SAC's preset."""
+    cfg = documented(1, tmp_path, "near.lambda_max=500")
     loss, transform = instantiate(cfg.loss), instantiate(cfg.replay_buffer.transform)
     assert isinstance(loss, SACLoss) and isinstance(loss, L2C2Loss)
-    assert loss.l2c2_neighborhood == transform.neighborhood == Neighborhood(lambda_max=0.5)
+    near = Neighborhood(lambda_min=10.0, lambda_max=500.0, shared=True)
+    assert loss.l2c2_neighborhood == transform.neighborhood == near
+    assert loss.l2c2_policy_distance == "mean" and loss.policy_terms == loss.added_terms
+
+
+def test_smooth_reads_methods_and_nested_keys():
+    """``loss: smooth`` has the table of presets; lists are names of entries."""
+    settings = ["loss.method=cats", "loss.fold=false", "+loss.overrides.lambda_temporal=3"]
+    loss = instantiate(with_networks(composed("+loss=smooth", *SAC, *settings)).loss)
+    assert isinstance(loss, CATSLoss) and loss.cats_lambda_temporal == 3.0
+    assert "loss_cats" in loss(transitions()).keys()
+    keys = [
+        "+loss.overrides.neighbor_key=[replay,near]",
+        "+loss.overrides.moved_keys=[observation]",
+    ]
+    loss = instantiate(with_networks(composed("+loss=smooth", *SAC, *keys)).loss)
+    assert loss.l2c2_neighbor_key == ("replay", "near")
+    assert loss.l2c2_moved_keys == ["observation"]
 
 
 @pytest.mark.parametrize(
@@ -401,6 +436,8 @@ def test_documentation_composes(tmp_path):
         (["+loss=l2c2", *SAC, "loss.num_samples=0"], "num_samples must be at least 1"),
         (["+loss=caps", *SAC, "loss.sigma=-0.2"], "sigma must be finite and greater"),
         (["+loss=caps", *SAC, "loss.mean=median"], "mean must be 'loc' or 'action'"),
+        (["+loss=smooth", *SAC, "loss.method=l2c3"], "one of .*'l2c2', .* got 'l2c3'"),
+        (["+loss=smooth", *SAC, "+loss.overrides.bett=1"], r"Expected settings of l2c2, .*'bett'"),
     ],
 )
 def test_wrong_loss_settings_give_the_loss_errors(overrides, message):
@@ -448,7 +485,8 @@ def test_unknown_settings_are_refused(node):
 def test_values_of_another_type_are_refused(node):
     """Numbers are checked where they are composed, before anything is built."""
     group, name = node
-    numbers = [f.name for f in fields(OURS[node]) if f.type in (float, int, int | None)]
+    kinds = get_type_hints(OURS[node])
+    numbers = [f.name for f in fields(OURS[node]) if kinds[f.name] in (float, int, int | None)]
     made = composed(f"+{group}@node={name}").node
     for number in numbers:
         with pytest.raises(ValidationError, match="many"):
@@ -489,5 +527,5 @@ def test_targets_are_the_package_own():
     assert len(nodes) == len(OURS)
     for node in OmegaConf.to_container(nodes).values():
         targets = [node["_target_"]]
-        targets += [v["_target_"] for v in node.values() if isinstance(v, dict)]
+        targets += [v["_target_"] for v in node.values() if isinstance(v, dict) and v]
         assert all(target.startswith("torchrl_l2c2.") for target in targets)

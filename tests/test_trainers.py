@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -38,6 +39,7 @@ from torchrl.trainers.algorithms import (
     SACTrainer,
     TD3Trainer,
 )
+from torchrl.trainers.algorithms.td3 import TD3OptimizationStepper
 
 from torchrl_l2c2 import (
     AdaTerm,
@@ -46,6 +48,7 @@ from torchrl_l2c2 import (
     NeighborTransform,
     TSoftUpdate,
     make_actor,
+    smooth,
 )
 
 pytestmark = [
@@ -300,78 +303,90 @@ def test_checkpoint_restores_updater_and_neighbors(tmp_path):
         assert torch.equal(*(batch[key] for batch in batches)), key
 
 
-def td3() -> L2C2Loss:
-    """TD3 on the pendulum, regularized."""
+def test_documentation_runs():
+    """The page's Python trains, and its hook is called; the penalty is logged."""
+    page = (Path(__file__).parents[1] / "docs" / "trainers.md").read_text()
+    names: dict[str, Any] = {}
+    for block in re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL):
+        exec(block, names)
+        if "loss" in names and "moved" not in names:
+            names["moved"] = mock = Mock(wraps=names["loss"].set_progress)
+            object.__setattr__(names["loss"], "set_progress", mock)
+    assert [call.args[0] for call in names["moved"].call_args_list] == [0.0, 0.64, 1.28]
+    first, second = names["trainer"]._log_dict["penalty_l2c2_actor"]
+    assert first > 0.0 and second > 0.0
+
+
+def test_a_hook_moves_the_ramp(tmp_path):
+    """In TorchRL's PPOTrainer, with the page's hook: no penalty at first, all of it in the end."""
+    logger = CSVLogger("run", log_dir=str(tmp_path))
+    critic = ValueOperator(MLP(in_features=3, out_features=1, num_cells=[8]))
+    loss = smooth(ClipPPOLoss(pendulum_actor(), critic), strength=2.0)
+    trainer = PPOTrainer(
+        **{**common(loss, 4), "optim_steps_per_batch": 1},
+        collector=collector(loss.actor_network, 4),
+        optimizer=torch.optim.Adam(loss.parameters()),
+        enable_logging=False,
+        logger=logger,
+        num_epochs=1,
+    )
+    seen = []
+
+    def set_progress():
+        loss.set_progress(trainer.collected_frames / trainer.total_frames)
+        seen.append(loss.regularizer_gain.item())
+
+    loss.set_progress(0.0)
+    trainer.register_op("post_steps", set_progress)
+    trainer.train()
+    assert seen == [0.5, 1.0, 1.5, 2.0]
+    penalties = logged(logger)["penalty_l2c2_actor"]
+    assert penalties[0] == 0.0 and all(penalty > 0.0 for penalty in penalties[1:])
+
+
+def td3_trained(strength: float) -> list[torch.Tensor]:
+    """Parameters of actor and critic after one step of TorchRL's TD3Trainer as it stands."""
+    torch.manual_seed(0)
     actor = Actor(MLP(in_features=3, out_features=1, num_cells=[8]))
     base = TD3Loss(actor, qvalue(), action_spec=GymEnv("Pendulum-v1").action_spec)
-    return L2C2Loss(base, NEAR, beta=0.5)
+    loss = smooth(base, strength=strength)
+    groups = [
+        list(params.values(True, True))
+        for params in (loss.actor_network_params, loss.qvalue_network_params)
+    ]
+    stepper = TD3OptimizationStepper(
+        optimizer_actor=torch.optim.SGD(groups[0], lr=1.0),
+        optimizer_critic=torch.optim.SGD(groups[1], lr=1.0),
+        policy_update_delay=1,
+    )
+    TD3Trainer(
+        **{**common(loss, 1), "optim_steps_per_batch": 1},
+        collector=collector(loss.actor_network, 1),
+        optimization_stepper=stepper,
+        target_net_updater=TSoftUpdate(loss),
+        replay_buffer=replay(),
+        enable_logging=False,
+    ).train()
+    return [torch.cat([p.detach().flatten() for p in group]) for group in groups]
 
 
-def documented() -> dict[str, Any]:
-    """What the Python of the documentation's page defines."""
-    page = (Path(__file__).parents[1] / "docs" / "trainers.md").read_text()
-    namespace: dict[str, Any] = {}
-    for block in re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL):
-        exec(block, namespace)
-    return namespace
+def test_td3_trainer_trains_with_the_penalty():
+    """The actor's gradient has the penalty's, by its strength; the critic's has not."""
+    (plain, critic), (once, same), (twice, _) = map(td3_trained, (0.0, 1.0, 2.0))
+    assert torch.equal(critic, same)
+    assert (once - plain).norm() > 1e-3
+    torch.testing.assert_close(twice - plain, 2 * (once - plain), rtol=1e-3, atol=1e-6)
 
 
-def test_documentation_runs():
-    """The page's Python trains, and its hook has raised the gain from 0 to 1."""
-    names = documented()
-    history = names["trainer"]._log_dict
-    assert len(history["loss_l2c2_actor"]) == 2
-    assert "loss_l2c2_qvalue" not in history  # beta is 0: the policy alone is regularized
-    assert names["loss"].l2c2_coeff == 1.0
-    # Of the first batch, which the gain of 0 leaves alone, and of the second, at 64 of 100 frames.
-    first, second = history["loss_l2c2_actor"]
-    assert first == 0.0 < second
+def test_cql_trainer_trains_with_the_penalty():
+    """CQLTrainer sums the terms that it names, and the penalty is part of one of them."""
 
-
-def test_td3_trainer_with_the_documented_stepper():
-    """TD3Trainer calls the loss's parts; the documented stepper trains both networks with ours."""
-    stepper_class = documented()["RegularizedTD3Stepper"]
-
-    def trained(coeff):
-        torch.manual_seed(0)
-        loss = td3()
-        loss.l2c2_coeff = coeff
-        networks = [loss.actor_network_params, loss.qvalue_network_params]
-        actor, critic = (list(network.values(True, True)) for network in networks)
-        stepper = stepper_class(
-            optimizer_actor=torch.optim.SGD(actor, lr=0.1),
-            optimizer_critic=torch.optim.SGD(critic, lr=0.1),
-        )
-        trainer = TD3Trainer(
-            **common(loss, 1),
-            collector=collector(loss.actor_network, 1),
-            optimization_stepper=stepper,
-            target_net_updater=TSoftUpdate(loss),
-            replay_buffer=replay(),
-            enable_logging=False,
-        )
-        trainer.train()
-        assert len(trainer._log_dict["loss_l2c2_qvalue"]) == 1
-        return [torch.cat([p.detach().flatten() for p in group]) for group in (actor, critic)]
-
-    plain, again, ours = trained(0.0), trained(0.0), trained(1.0)
-    assert all(map(torch.equal, plain, again))
-    assert not any(map(torch.equal, plain, ours))
-
-
-def test_cql_trainer_with_the_regularizers_terms_named():
-    """CQLTrainer sums the terms it names; with the documented stepper it trains ours as well.
-
-    And nothing else: at a gain of 0 it does what it did.
-    """
-
-    name_added_terms = documented()["name_added_terms"]
-
-    def trained(coeff, named=True):
+    def trained(strength):
         torch.manual_seed(0)
         spec = GymEnv("Pendulum-v1").action_spec
         base = CQLLoss(pendulum_actor(), qvalue(), action_spec=spec, num_random=2)
-        loss = L2C2Loss(base, NEAR, beta=0.5, coeff=coeff)
+        with pytest.warns(UserWarning, match="CQLLoss takes the preset of SACLoss"):
+            loss = smooth(base, strength=strength)
         trainer = CQLTrainer(
             **common(loss, 1),
             collector=collector(loss.actor_network, 1),
@@ -380,12 +395,10 @@ def test_cql_trainer_with_the_regularizers_terms_named():
             replay_buffer=replay(),
             enable_logging=False,
         )
-        if named:
-            name_added_terms(trainer)
         trainer.train()
         return torch.cat([p.detach().flatten() for p in loss.parameters()])
 
-    assert torch.equal(trained(0.0), trained(0.0, named=False))
+    assert torch.equal(trained(0.0), trained(0.0))
     assert not torch.equal(trained(0.0), trained(1.0))
 
 

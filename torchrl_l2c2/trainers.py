@@ -7,8 +7,8 @@ module.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
-from dataclasses import field, fields, make_dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, make_dataclass
 from typing import Any, Literal, Optional, get_args, get_origin, get_type_hints
 
 import torch
@@ -32,11 +32,22 @@ from torchrl_l2c2.objectives import (
     L2C2Loss,
     LCPLoss,
     PPORPELoss,
+    RegularizedLoss,
     SR2LLoss,
 )
 from torchrl_l2c2.optim import AdaTerm
+from torchrl_l2c2.smoothing import smooth
 from torchrl_l2c2.transforms import NeighborTransform, ObservationNoise
 from torchrl_l2c2.updaters import TSoftUpdate
+
+
+def _make_smooth_loss(
+    base_loss: LossModule, method: str, strength: float, fold: bool, overrides: Mapping[str, Any]
+) -> RegularizedLoss:
+    normalized = {key: _normalize_hydra_key(value) for key, value in overrides.items()}
+    if "moved_keys" in normalized:
+        normalized["moved_keys"] = _listed(overrides["moved_keys"])
+    return smooth(base_loss, method, strength, fold, **normalized)
 
 
 def _make_l2c2_loss(
@@ -169,6 +180,29 @@ def _checkable(hint: Any) -> Any:
     return Optional[simple[0]] if type(None) in members else simple[0]  # noqa: UP045
 
 
+@dataclass
+class SmoothLossConfig(LossConfig):
+    """Hydra configuration of :func:`~torchrl_l2c2.smooth`.
+
+    Attributes:
+        base_loss: the configuration of the loss.
+        method: as for ``smooth``, like the others.
+        strength: as for ``smooth``.
+        fold: as for ``smooth``.
+        overrides: settings that replace the preset's, by name.
+    """
+
+    base_loss: Any = MISSING
+    method: str = "l2c2"
+    strength: float = 1.0
+    fold: bool = True
+    overrides: dict[str, Any] = field(default_factory=dict)
+    _target_: str = "torchrl_l2c2.trainers._make_smooth_loss"
+
+    def __post_init__(self) -> None:
+        pass
+
+
 NeighborhoodConfig = _node(Neighborhood, ConfigBase)
 L2C2LossConfig = _node(L2C2Loss, LossConfig, builder=_make_l2c2_loss)
 CAPSLossConfig = _node(CAPSLoss, LossConfig)
@@ -199,19 +233,20 @@ def register() -> None:
     ====================== ===================================
     group                  names
     ====================== ===================================
-    ``loss``               ``l2c2``, ``caps``, ``cats``,
-                           ``grad_caps``, ``asap``, ``sr2l``,
-                           ``lcp``, ``ppo_rpe``
+    ``loss``               ``smooth``; ``l2c2``, ``caps``,
+                           ``cats``, ``grad_caps``, ``asap``,
+                           ``sr2l``, ``lcp``, ``ppo_rpe``
     ``transform``          ``neighbor``, ``observation_noise``
     ``optimizer``          ``adaterm``
     ``target_net_updater`` ``tsoft``
     ``neighborhood``       ``l2c2``
     ====================== ===================================
 
-    A node has the parameters of its component, with their defaults. Beside them, ``base_loss`` is
-    the configuration of another loss, such as TorchRL's ``loss: sac``; ``neighborhood`` one of the
-    group of that name, or nothing for the paper's; and a transform's ``seed`` gives it a generator
-    of its own, on its ``device``, which is that of the batches (``cuda:0``; default ``cpu``).
+    ``loss: smooth`` is :func:`~torchrl_l2c2.smooth`, with the presets of its table. The other nodes
+    have the parameters of their components, with their defaults. ``base_loss`` is the configuration
+    of another loss, such as TorchRL's ``loss: sac``; ``neighborhood`` one of the group of that
+    name, or nothing for the paper's; and a transform's ``seed`` gives it a generator of its own, on
+    its ``device``, which is the device of the batches (``cuda:0``; default ``cpu``).
 
     Examples:
         >>> from hydra import compose, initialize
@@ -220,16 +255,17 @@ def register() -> None:
         >>> with initialize(version_base=None, config_path=None):
         ...     cfg = compose(
         ...         overrides=[
-        ...             "+loss=l2c2",
+        ...             "+loss=smooth",
         ...             "+loss@loss.base_loss=sac",
-        ...             "+neighborhood@loss.neighborhood=l2c2",
-        ...             "loss.neighborhood.lambda_max=0.5",
+        ...             "loss.strength=2",
+        ...             "+loss.overrides.lambda_max=500",
         ...         ]
         ...     )
-        >>> cfg.loss.beta, cfg.loss.neighborhood.lambda_max, cfg.loss.base_loss.num_qvalue_nets
-        (0.1, 0.5, 2)
+        >>> cfg.loss.method, cfg.loss.strength, cfg.loss.base_loss.num_qvalue_nets
+        ('l2c2', 2.0, 2)
     """
     store = ConfigStore.instance()
+    store.store(group="loss", name="smooth", node=SmoothLossConfig)
     store.store(group="loss", name="l2c2", node=L2C2LossConfig)
     store.store(group="loss", name="caps", node=CAPSLossConfig)
     store.store(group="loss", name="cats", node=CATSLossConfig)
