@@ -92,6 +92,32 @@ def test_help_may_have_no_reader():
     assert (ended.returncode, ended.stderr) == (1, b"")
 
 
+@pytest.mark.parametrize(
+    ("setting", "told"),
+    [
+        ("task.env_id=Nowhere-v0", "'Nowhere-v0' is not a task that Gymnasium can make here"),
+        ("task.env_id=my_robot:Robot-v0", "No module named 'my_robot'"),
+        ("resume=nowhere", "resume='nowhere' holds no checkpoint"),
+    ],
+)
+def test_what_is_not_there_is_told_before_torch_is_imported(tmp_path, setting, told):
+    """Which takes many seconds."""
+    program = (
+        "import sys\nfrom torchrl_l2c2.experiment.command import main\n"
+        "try:\n    main()\nfinally:\n    print('torch' in sys.modules)"
+    )
+    settings = ("task=gymnasium", "task.env_id=Pendulum-v1", setting)
+    ended = subprocess.run(
+        [sys.executable, "-c", program, *settings],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
+    assert ended.returncode == 1 and told in ended.stderr and "Traceback" not in ended.stderr
+    assert ended.stdout.splitlines()[-1] == "False" and not [*tmp_path.iterdir()]
+
+
 # A regularizer and an algorithm of a user's own, which a line each makes known to the command.
 OWN = """
 import sys

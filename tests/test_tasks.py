@@ -306,7 +306,7 @@ def test_a_task_without_pictures_is_not_trained_for_a_video(monkeypatch, tmp_pat
     """It would be found out at the end."""
     still(monkeypatch)
     with pytest.raises(ValueError, match="Still-v0 draws no pictures"):
-        run(ExperimentConfig(task=task(), record=True), tmp_path / "run", {})
+        run(ExperimentConfig(task=task(), record=True), tmp_path / "run", {"resume": None})
     assert not (tmp_path / "run").exists()
 
 

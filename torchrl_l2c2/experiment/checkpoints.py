@@ -19,8 +19,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.files import write_atomically
 
@@ -46,6 +44,8 @@ def save_checkpoint(folder: str | Path, episode: int, state: Mapping[str, Any], 
     Raises:
         OSError: it could not be written, or reads back differently; older ones are untouched.
     """
+    import torch
+
     content = io.BytesIO()
     torch.save(dict(state), content)
     payload = content.getvalue()
@@ -69,6 +69,8 @@ def load_checkpoint(path: str | Path) -> dict[str, Any]:
     Raises:
         CheckpointError: missing, empty, cut short, changed, or of another format version.
     """
+    import torch
+
     path = Path(path)
     payload = _payload(path)
     try:

@@ -42,6 +42,7 @@ from torchrl_l2c2.experiment.errors import (
     warnings_told,
 )
 from torchrl_l2c2.experiment.files import make_folder
+from torchrl_l2c2.experiment.loggers import check_installed
 from torchrl_l2c2.experiment.progress import log, say
 from torchrl_l2c2.experiment.settings import SettingError
 from torchrl_l2c2.experiment.signals import (
@@ -235,6 +236,15 @@ def run(
     """
     # Here, as settings are checked before anything waits for torch.
     from torchrl_l2c2.experiment.continuation import check_elsewhere, tell_past
+
+    check_elsewhere(values["resume"])
+    if not (folder / "evaluation.json").exists():
+        check_installed(config.logger.name)
+        config.task.check_known()
+        if config.device != "cpu":
+            from torchrl_l2c2.experiment.process import check_device_found
+
+            check_device_found(config.device)
     from torchrl_l2c2.experiment.finished import finished_run
     from torchrl_l2c2.experiment.lock import wait_for_folder
     from torchrl_l2c2.experiment.video import check_pictures, check_video, record_video
@@ -251,7 +261,6 @@ def run(
     if (told := preset_used(config)) is not None:
         print(told, flush=True)
     wait_for_folder(folder, patience)
-    check_elsewhere(values["resume"])
     with _end_logged(folder):
         finished = finished_run(folder, config.to_dict())
         if finished is None:

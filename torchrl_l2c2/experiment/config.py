@@ -191,13 +191,10 @@ class ExperimentConfig:
         """
         import torch
 
+        from torchrl_l2c2.experiment.process import check_device_found
+
+        check_device_found(self.device)
         device = torch.device(self.device)
-        if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
-            raise SettingError(
-                "device",
-                f"must be one that PyTorch finds; it finds {torch.cuda.device_count()} CUDA "
-                f"devices, got {self.device!r}: use device=cpu.",
-            )
         with device, warnings.catch_warnings():
             # Target networks get updaters of this package's.
             warnings.filterwarnings("ignore", "No target network updater")

@@ -17,7 +17,13 @@ from torchrl.envs import EnvBase, GymWrapper, TransformedEnv
 
 from torchrl_l2c2.experiment.compilation import CompilerError
 from torchrl_l2c2.experiment.errors import SimulatorError, UserError
-from torchrl_l2c2.experiment.spaces import Env, observing_image, observing_vector, taking_vector
+from torchrl_l2c2.experiment.spaces import (
+    Env,
+    observing_image,
+    observing_vector,
+    taking_vector,
+    unknown_task,
+)
 from torchrl_l2c2.transforms import ObservationNoise
 
 if TYPE_CHECKING:
@@ -171,12 +177,7 @@ def _explained(task: TaskConfig) -> Iterator[None]:
         cause = error.__cause__
         if not isinstance(cause, gymnasium.error.Error | ImportError):
             raise
-        raise UserError(
-            f"task.env_id={task.env_id!r} is not a task that Gymnasium can make here ({cause}). "
-            "Use one of this package's (train.py --help names them), or task=gymnasium with a "
-            "registered id; `module:id` imports the module that registers it, from the current "
-            "folder or PYTHONPATH."
-        ) from cause
+        raise unknown_task(task.env_id, cause) from cause
 
 
 @contextlib.contextmanager

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from torchrl_l2c2.experiment.settings import SettingError
+
 # Of glibc's mallopt: what is larger is mapped anew at every allocation, and how much may be free at
 # the heap's end before it is given back; both are bytes, up to the largest int.
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
@@ -123,3 +125,18 @@ def _set_states(states: _States) -> None:
     torch.set_rng_state(states[2])
     if torch.cuda.is_available():  # Of a machine with more devices there are more states.
         torch.cuda.set_rng_state_all(states[3][: torch.cuda.device_count()])
+
+
+def check_device_found(device: str) -> None:
+    """Refuses a device that PyTorch does not find.
+
+    Raises:
+        SettingError: with the number of those that it finds.
+    """
+    found = torch.cuda.device_count()
+    if device != "cpu" and (torch.device(device).index or 0) >= found:
+        raise SettingError(
+            "device",
+            f"must be one that PyTorch finds; it finds {found} CUDA devices, got {device!r}: use "
+            "device=cpu.",
+        )

@@ -164,3 +164,13 @@ def _kind(space: Any) -> str:
     """Gymnasium's own representation of bounds takes many lines."""
     name = type(space).__name__
     return f"{name} of {space.dtype} {space.shape}" if isinstance(space, spaces.Box) else name
+
+
+def unknown_task(env_id: str, cause: Exception) -> UserError:
+    """The error for an id that Gymnasium cannot make."""
+    return UserError(
+        f"task.env_id={env_id!r} is not a task that Gymnasium can make here ({cause}). "
+        "Use one of this package's (train.py --help names them), or task=gymnasium with a "
+        "registered id; `module:id` imports the module that registers it, from the current "
+        "folder or PYTHONPATH."
+    )

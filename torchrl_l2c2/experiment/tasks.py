@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field, model_validator
@@ -111,6 +112,25 @@ class TaskConfig:
         if self.noise_scale is None:
             # Frozen: this is how a default that depends on another field is set.
             object.__setattr__(self, "noise_scale", 0.01 if self.env_id == SWINGUP else 0.0)
+
+    def check_known(self) -> None:
+        """Refuses an id that Gymnasium does not know, without importing the simulator or torch.
+
+        Raises:
+            UserError: with what to write instead.
+        """
+        import gymnasium
+
+        from torchrl_l2c2.experiment.spaces import unknown_task
+
+        module, _, name = self.env_id.rpartition(":")
+        try:
+            if not module:
+                gymnasium.spec(name)
+            elif find_spec(module.partition(".")[0]) is None:
+                raise ModuleNotFoundError(f"No module named {module!r}")
+        except (gymnasium.error.Error, ImportError) as error:
+            raise unknown_task(self.env_id, error) from error
 
     @property
     def time_limit(self) -> int:
