@@ -376,7 +376,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             terms.set(penalty_key(key), value.detach())
 
     def _folded_value(self, key: str, term: Tensor) -> Tensor:
-        """A term as it is added: the gradient alone, if it trains the regularizer's own network."""
+        """A term as it is added: only its gradient, if it trains the regularizer's own network."""
         return term - term.detach() if key in self.auxiliary_terms else term
 
     def __setattr__(self, name: str, value: Any) -> None:
