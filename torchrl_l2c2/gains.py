@@ -238,7 +238,7 @@ def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]
     if not added:
         return {}
     check_takes_gradients("gradient_shares")
-    if unused := getattr(getattr(loss, "_watch", None), "pending", None):
+    if hasattr(loss, "_watch") and (unused := loss._watch.unused()):
         warnings.warn(
             f"{sorted(unused)} were never differentiated: the training loop does not add them to "
             "the loss that is minimized. Add them, or call loss.fold() after making it.",

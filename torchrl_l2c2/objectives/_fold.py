@@ -185,6 +185,10 @@ class TermWatch:
                 stacklevel=4,
             )
 
+    def unused(self) -> set[str]:
+        """Terms that were not differentiated in several calls."""
+        return self.pending or set() if self._forwards > 1 else set()
+
     def see_regularizer(self, loss: Any) -> None:
         """Notices that a loop computes the terms itself."""
         if not is_compiling() and loss._evaluation.forward_pass is None:
