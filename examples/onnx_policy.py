@@ -1,4 +1,4 @@
-"""An exported policy in its simulator: ONNX Runtime, Gymnasium and NumPy, nothing of this package.
+"""An exported policy in its simulator, with ONNX Runtime, Gymnasium and NumPy only.
 
 ``python -m torchrl_l2c2.experiment.export RUN`` writes the folder; ``python examples/onnx_policy.py
 RUN/export 10`` plays ten episodes with it.
@@ -18,7 +18,7 @@ from gymnasium import spaces
 
 
 def observed(space: spaces.Space[Any], seen: Any, contract: dict[str, Any]) -> Any:
-    """What the policy reads: a vector, of several in the order of their names, or an image."""
+    """The policy's input: a vector (entries of a dict in the order of their names) or an image."""
     if image := contract.get("image"):
         scaled = (seen - image["low"]) / (image["high"] - image["low"])
         return scaled.transpose(image["axes"]).reshape(contract["shape"][1:])
@@ -40,7 +40,7 @@ def play(folder: Path, episodes: int) -> None:
         rewards, actions, over = [], [], False
         while not over:
             seen = observed(env.observation_space, seen, contract["observation"])
-            # What the policy was trained on: float32, with the task's noise.
+            # As in training: float32, with the task's noise.
             seen = seen + contract["noise_scale"] * noise.standard_normal(seen.shape)
             batch = seen.astype(np.float32)[None]
             (action,) = session.run(["action"], {"observation": batch})[0]
@@ -49,14 +49,14 @@ def play(folder: Path, episodes: int) -> None:
             actions.append(action)
             over = terminated or truncated
         returns.append(sum(rewards))
-        if "choices" in contract["action"]:  # labels, whose order says nothing: one-hot
+        if "choices" in contract["action"]:  # labels without an order: one-hot
             kinds = np.eye(contract["action"]["choices"])
             actions = kinds[np.array(actions) - contract["action"]["first"]]
         changes.append(np.linalg.norm(np.diff(actions, axis=0), axis=-1).mean())
     env.close()
     print(f"return {np.mean(returns):.1f}")
     print(f"action variation {np.mean(changes):.3f}")
-    # On seeds of its own, so that they agree but for chance.
+    # Other seeds: the two returns differ by chance.
     if "test" in contract:
         print(f"return in the run's own test {contract['test']['return_mean']:.1f}")
 

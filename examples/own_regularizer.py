@@ -1,6 +1,6 @@
-"""A regularizer of one's own around a TorchRL loss: it charges action steps beyond a tolerance.
+"""A custom regularizer around a TorchRL loss: it penalizes action steps beyond a tolerance.
 
-``python examples/own_regularizer.py`` shows in seconds that it runs;
+``python examples/own_regularizer.py`` takes seconds and learns nothing yet.
 ``python examples/own_regularizer.py 10000`` swings the pendulum up.
 """
 
@@ -24,7 +24,7 @@ FRAMES_PER_BATCH = 50
 
 
 class ActionStepLoss(RegularizedLoss):
-    """Half the squared part of the mean action's step from s to s' that exceeds a tolerance."""
+    """Half the squared excess of the mean action's step from s to s' over a tolerance."""
 
     def __init__(self, base_loss: LossModule, tolerance: float) -> None:
         self.step_tolerance = tolerance
@@ -33,7 +33,7 @@ class ActionStepLoss(RegularizedLoss):
 
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
         terms = super().policy_regularizer(tensordict)
-        # States to compare with the batch's have one more dimension in front: [1, *B].
+        # Other states have one more dimension in front: [1, *B].
         later = tensordict["next"].select("observation").unsqueeze(0)
         policies = self.policies_at(tensordict, later)
         here, there = (policy_mean(policy, squashed=True) for policy in policies)
@@ -50,9 +50,9 @@ def main(frames: int) -> None:
     qvalue = ValueOperator(
         MLP(in_features=4, out_features=1, num_cells=[64, 64]), in_keys=["observation", "action"]
     )
-    base = SACLoss(actor, qvalue, target_entropy=-1.0)
-    base.make_value_estimator(gamma=0.95)
-    loss = ActionStepLoss(base, tolerance=0.05)  # still a SACLoss
+    loss = SACLoss(actor, qvalue, target_entropy=-1.0)
+    loss.make_value_estimator(gamma=0.95)
+    loss = ActionStepLoss(loss, tolerance=0.05).fold()  # still a SACLoss
     updater = SoftUpdate(loss, tau=0.005)
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
     replay = TensorDictReplayBuffer(storage=LazyTensorStorage(100_000), batch_size=64)
@@ -61,7 +61,7 @@ def main(frames: int) -> None:
         replay.extend(collected)
         for _ in range(FRAMES_PER_BATCH):
             terms = loss(replay.sample())
-            sum(term for key, term in terms.items() if key.startswith("loss")).backward()
+            (terms["loss_actor"] + terms["loss_qvalue"] + terms["loss_alpha"]).backward()
             optimizer.step()
             optimizer.zero_grad()
             updater.step()
@@ -72,7 +72,7 @@ def main(frames: int) -> None:
         episode = test_env.rollout(200, actor)
     print(f"return {episode['next', 'reward'].sum().item():.1f}")
     print(f"action variation {action_variation(episode['action']).item():.3f}")
-    print(f"loss_action_step {terms['loss_action_step'].item():.5f}")
+    print(f"penalty_action_step {terms['penalty_action_step'].item():.5f}")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""SAC with L2C2 in a plain loop, on the pendulum.
+"""SAC with L2C2 in a TorchRL loop, on the pendulum.
 
-``python examples/sac_loop.py`` shows in seconds that it runs; ``python examples/sac_loop.py 10000``
-swings the pendulum up, and with ``plain`` behind it does so without L2C2.
+``python examples/sac_loop.py`` takes seconds and learns nothing yet. ``python examples/sac_loop.py
+10000`` swings the pendulum up; add ``baseline`` to train without L2C2.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from torchrl.envs import ExplorationType, GymEnv, set_exploration_type
 from torchrl.modules import MLP, ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
 
-from torchrl_l2c2 import L2C2Loss, Neighborhood, NeighborTransform, action_variation, make_actor
+from torchrl_l2c2 import action_variation, make_actor, smooth
 
 FRAMES = 300
 FRAMES_PER_BATCH = 50
@@ -23,7 +23,7 @@ RANDOM_FRAMES = 200
 UPDATES_PER_BATCH = 50
 
 
-def main(frames: int, plain: bool = False) -> None:
+def main(frames: int, baseline: bool = False) -> None:
     torch.manual_seed(0)
     env = GymEnv("Pendulum-v1")
     env.set_seed(0)
@@ -32,10 +32,10 @@ def main(frames: int, plain: bool = False) -> None:
         MLP(in_features=4, out_features=1, num_cells=[64, 64]), in_keys=["observation", "action"]
     )
 
-    near = Neighborhood(lambda_min=10.0, lambda_max=1000.0, shared=True)
-    base = SACLoss(actor, qvalue, target_entropy=-1.0)
-    base.make_value_estimator(gamma=0.95)
-    loss = base if plain else L2C2Loss(base, near, beta=0.0, policy_distance="mean")
+    loss = SACLoss(actor, qvalue, target_entropy=-1.0)
+    loss.make_value_estimator(gamma=0.95)
+    if not baseline:
+        loss = smooth(loss)
     updater = SoftUpdate(loss, tau=0.005)
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
     replay = TensorDictPrioritizedReplayBuffer(
@@ -43,7 +43,6 @@ def main(frames: int, plain: bool = False) -> None:
         beta=0.5,
         storage=LazyTensorStorage(100_000),
         batch_size=64,
-        transform=NeighborTransform(near),
     )
     collector = Collector(
         env,
@@ -60,7 +59,7 @@ def main(frames: int, plain: bool = False) -> None:
         for _ in range(UPDATES_PER_BATCH):
             batch = replay.sample()
             terms = loss(batch)
-            sum(term for key, term in terms.items() if key.startswith("loss")).backward()
+            (terms["loss_actor"] + terms["loss_qvalue"] + terms["loss_alpha"]).backward()
             optimizer.step()
             optimizer.zero_grad()
             updater.step()
@@ -75,4 +74,4 @@ def main(frames: int, plain: bool = False) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else FRAMES, "plain" in sys.argv)
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else FRAMES, "baseline" in sys.argv)

@@ -1,8 +1,7 @@
-"""PPO with L2C2 on several devices: every process plays by itself, gradients are averaged.
+"""PPO with L2C2 on several devices: each process plays its own episodes, gradients are averaged.
 
-``torchrun --nproc-per-node=2 examples/several_devices.py`` shows in seconds that it runs, on the
-CPU; ``200000`` behind it are the frames to learn for. Where there are GPUs, each process has
-one.
+``torchrun --nproc-per-node=2 examples/several_devices.py`` takes seconds on the CPU and learns
+nothing yet; append the number of frames, such as ``200000``. With GPUs each process uses one.
 """
 
 from __future__ import annotations
@@ -18,10 +17,10 @@ from torchrl.envs import ExplorationType, GymEnv, set_exploration_type
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from torchrl_l2c2 import L2C2Loss, Neighborhood, action_variation, make_actor, make_critic
+from torchrl_l2c2 import action_variation, make_actor, make_critic, smooth
 
-FRAMES = 2000  # of all processes
-FRAMES_PER_BATCH = 500  # of each
+FRAMES = 2000  # all processes together
+FRAMES_PER_BATCH = 500  # per process
 EPOCHS, PARTS = 5, 5
 
 
@@ -36,26 +35,24 @@ def main(frames: int) -> None:
     env.set_seed(rank)
     actor = make_actor(3, env.action_spec, hidden=(64, 64)).to(device)
     critic = make_critic(3, num_heads=1, hidden=(64, 64)).to(device)
-    # The advantages are normalized by each process: the mean over processes is not that of all.
-    base = ClipPPOLoss(actor, critic, entropy_coeff=0.0, normalize_advantage=True)
-    near = Neighborhood(lambda_min=1.0, lambda_max=100.0, shared=True)
-    loss = L2C2Loss(base, near, beta=0.0, policy_distance="mean")
-    # A LossModule like any: what it returns is averaged over processes where it is differentiated.
+    # Each process normalizes its own advantages.
+    loss = smooth(ClipPPOLoss(actor, critic, entropy_coeff=0.0, normalize_advantage=True))
     parallel = DistributedDataParallel(loss)
     advantage = GAE(gamma=0.9, lmbda=0.95, value_network=critic)
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
-    torch.manual_seed(rank)  # From here on every process draws its own numbers.
+    torch.manual_seed(rank)  # From here on each process draws its own numbers.
     collector = Collector(
         env, actor, frames_per_batch=FRAMES_PER_BATCH, total_frames=frames // size, device=device
     )
-    for collected in collector:
+    for number, collected in enumerate(collector):
+        loss.set_progress(number * FRAMES_PER_BATCH * size / frames)
         collected["next", "reward"] *= 0.1
         for _ in range(EPOCHS):
             with torch.no_grad():
                 advantage(collected)
             for batch in collected[torch.randperm(FRAMES_PER_BATCH)].chunk(PARTS):
                 terms = parallel(batch)
-                sum(term for key, term in terms.items() if key.startswith("loss")).backward()
+                (terms["loss_objective"] + terms["loss_critic"]).backward()
                 torch.nn.utils.clip_grad_norm_(loss.parameters(), 1.0)
                 optimizer.step()
                 optimizer.zero_grad()
@@ -65,7 +62,7 @@ def main(frames: int) -> None:
     mine = torch.cat([parameter.detach().flatten() for parameter in loss.parameters()])
     first = mine.clone()
     dist.broadcast(first, 0)
-    # In one piece, as processes write at once.
+    # One string, as all processes write at once.
     told = f"process {rank} of {size}: return {episode['next', 'reward'].sum().item():.1f}"
     told += f", action variation {action_variation(episode['action']).item():.3f}"
     print(f"{told}, apart from the first {(mine - first).abs().max().item()}\n", end="", flush=True)

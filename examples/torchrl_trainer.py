@@ -1,6 +1,6 @@
 """L2C2 inside TorchRL's own SAC trainer, on the pendulum.
 
-``python examples/torchrl_trainer.py`` shows in seconds that it runs;
+``python examples/torchrl_trainer.py`` takes seconds and learns nothing yet.
 ``python examples/torchrl_trainer.py 10000`` swings the pendulum up.
 """
 
@@ -16,14 +16,7 @@ from torchrl.modules import MLP, ValueOperator
 from torchrl.objectives import SACLoss
 from torchrl.trainers.algorithms import SACTrainer
 
-from torchrl_l2c2 import (
-    L2C2Loss,
-    Neighborhood,
-    NeighborTransform,
-    TSoftUpdate,
-    action_variation,
-    make_actor,
-)
+from torchrl_l2c2 import TSoftUpdate, action_variation, make_actor, smooth
 
 FRAMES = 200
 FRAMES_PER_BATCH = 50
@@ -38,16 +31,15 @@ def main(frames: int) -> None:
         MLP(in_features=4, out_features=1, num_cells=[64, 64]), in_keys=["observation", "action"]
     )
 
-    near = Neighborhood(lambda_min=10.0, lambda_max=1000.0, shared=True)
-    base = SACLoss(actor, qvalue, target_entropy=-1.0)
-    base.make_value_estimator(gamma=0.95)
-    loss = L2C2Loss(base, near, beta=0.0, policy_distance="mean")
+    loss = SACLoss(actor, qvalue, target_entropy=-1.0)
+    loss.make_value_estimator(gamma=0.95)
+    loss = smooth(loss)
     replay = TensorDictPrioritizedReplayBuffer(
         alpha=0.6,
         beta=0.5,
         storage=LazyTensorStorage(100_000),
         batch_size=64,
-        transform=NeighborTransform(near),
+        transform=loss.neighbor_transform(),  # optional: draws neighbors where batches are drawn
     )
     trainer = SACTrainer(
         collector=Collector(env, actor, frames_per_batch=FRAMES_PER_BATCH, total_frames=frames),

@@ -61,7 +61,7 @@ def test_what_is_summed_is_every_loss() -> None:
     written = [*FOLDER.glob("*.md"), *ROOT.glob("examples/*.py"), ROOT / "README.md"]
     sums = [line for path in written for line in path.read_text().splitlines() if "sum(" in line]
     found = [line for line in sums if "startswith(" in line]
-    assert len(found) > 5 and all('startswith("loss")' in line for line in found)
+    assert found and all('startswith("loss")' in line for line in found)
 
 
 def test_the_readmes_code_does_what_it_says() -> None:
