@@ -495,7 +495,7 @@ def test_a_run_from_the_command_line_leaves_everything_behind(tmp_path):
     finished = subprocess.run(command, capture_output=True, text=True, check=True)
     assert finished.stdout.count("2 test episodes, seed 0") == 2  # mean and sampled actions
     (run,) = read_runs(tmp_path)
-    assert "regularizer=l2c2: the paper's gains" in (run.folder / "train.log").read_text()
+    assert "(the preset for ppo_rpe: results/paper.md" in (run.folder / "train.log").read_text()
     assert run.regularizer == "l2c2" and len(run.evaluation["episodes"]["returns"]) == 2
     with open(run.folder / "metrics.csv", newline="") as file:
         rows = list(csv.DictReader(file))

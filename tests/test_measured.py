@@ -157,7 +157,7 @@ def test_a_run_that_skips_every_update_stops_and_names_the_reward():
     """After a hundred in a row; one update that is made begins the count anew."""
     run = Experiment(small(task=replace(PENDULUM, max_steps=150), on_nonfinite="skip"))
     run.train()
-    updates, replay = run.learner.updates, run.learner.replay
+    updates = run.learner.updates
     trained = next(p for p in run.agent.loss.parameters() if p.requires_grad)
     for skipped in (MOST_SKIPPED - 1, MOST_SKIPPED):
         hook = trained.register_hook(lambda gradient: gradient * math.nan)
@@ -167,7 +167,6 @@ def test_a_run_that_skips_every_update_stops_and_names_the_reward():
             run.learner.report(80)
             run.learner.learn(1)
     row, reward = run.learner.update.culprit
-    assert reward == replay.storage._storage["next", "reward"][row].item()
     reward /= run.config.algorithm.reward_factor
     told = rf"^100 updates .* after update {updates + 1} \(frame 80\), .* Row {row} .*{reward:g}:"
     with pytest.raises(FloatingPointError, match=told):

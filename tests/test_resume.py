@@ -354,7 +354,7 @@ def test_a_run_brings_no_code(tmp_path, monkeypatch, code, run, refused):
         folder.mkdir(parents=True, exist_ok=True)
     module.write_text(f"open({str(tmp_path / 'executed')!r}, 'w')")
     settings = small().to_dict()
-    settings["task"]["env_id"] = "pack:Stray-v0"
+    settings["task"] |= {"name": "stray", "env_id": "pack:Stray-v0"}
     (tmp_path / run / "config.json").write_text(json.dumps(settings))
     monkeypatch.delitem(sys.modules, "pack", raising=False)
     monkeypatch.syspath_prepend(tmp_path / code)
