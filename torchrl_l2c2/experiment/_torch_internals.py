@@ -52,7 +52,7 @@ def marked_as_compiling() -> Iterator[None]:
 def compile_graph(
     module: GraphModule, inputs: list[Any], mode: FakeTensorMode, options: Mapping[str, Any]
 ) -> Callable[..., Sequence[Tensor]]:
-    """Compiles a traced graph by inductor; ``torch.compile`` takes functions alone."""
+    """Compiles a traced graph by inductor; ``torch.compile`` takes only functions."""
     # Takes a second to import, which those who compile nothing need not wait.
     from torch._inductor.compile_fx import compile_fx
 

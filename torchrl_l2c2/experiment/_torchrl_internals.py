@@ -68,7 +68,7 @@ def end_weight_senders(collector: MultiSyncCollector) -> None:
 
 
 def forget_traced(loss: LossModule) -> None:
-    """Has TorchRL's losses detach their parameters anew: they keep what they detached if traced."""
+    """Has TorchRL's losses detach their parameters anew: they keep detached ones if traced."""
     for module in loss.modules():
         if isinstance(module, LossModule):
             module._erase_cache()
@@ -124,7 +124,7 @@ class RowWriter:
                 batch.set(key, value.unsqueeze(0).to(self._storage.device))
             self._replay.extend(batch)
             return
-        if self._storage._storage is not self._source:  # The first time, or what was loaded.
+        if self._storage._storage is not self._source:  # The first time, or after loading.
             self._source = self._storage._storage
             self._stored = list(self._source.items(True, True))
         cursor, length = self._writer._cursor, self._storage._len
@@ -165,7 +165,7 @@ def load_replay_state(replay: TensorDictReplayBuffer, state: Mapping[str, Any]) 
         state["_sampler"] = sampler
     replay.load_state_dict(state)
     storage = replay.storage
-    if storage._storage is not None:  # Where it was empty, it is what was loaded.
+    if storage._storage is not None:  # It is on the saved state's device if it was empty.
         storage._storage = storage._storage.to(storage.device)
 
 
@@ -173,7 +173,7 @@ class TraceableClipPPOLoss(ClipPPOLoss):
     """TorchRL's clipped PPO, with an entropy bonus that can be a part of a graph.
 
     TorchRL's loss looks whether an entropy is finite, and otherwise estimates it: what a graph
-    computes may not depend on that. That of a normal with a positive scale is finite.
+    computes may not depend on that. The entropy of a normal with a positive scale is finite.
     """
 
     def _get_entropy(self, dist: Distribution, adv_shape: torch.Size) -> Tensor:

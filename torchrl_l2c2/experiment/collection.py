@@ -33,8 +33,8 @@ from torchrl_l2c2.transforms import ObservationNoise
 class EpisodeCollector(Collector):
     """A TorchRL :class:`~torchrl.collectors.Collector`, fast with one Gymnasium simulator.
 
-    It gives the collector's batches, bit for bit, without the ``collector`` entry. What it leaves
-    out is the work around every step: specs, nested TensorDicts and their copies. An episode's
+    It gives the collector's batches, bit for bit, without the ``collector`` entry. It leaves
+    out the work around every step: specs, nested TensorDicts and their copies. An episode's
     frames are stacked once.
 
     Args:

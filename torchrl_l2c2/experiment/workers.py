@@ -146,7 +146,7 @@ class MultiEpisodeCollector(MultiSyncCollector):
         self._rounds_played = 0
 
     def generator_state(self) -> dict[str, Any]:
-        """What the following episodes depend on, but for the policy."""
+        """The state that the following episodes depend on, without the policy."""
         return {"rounds_played": self._rounds_played, "frames": self._frames}
 
     def set_generator_state(self, state: dict[str, Any]) -> None:
