@@ -12,9 +12,9 @@ import pytest
 import torch
 
 ROOT = Path(__file__).parents[1]
-# One plays what a run has exported, test_export.py; others are for rsl_rl, test_rsl_rl.py, and for
-# several processes, test_several_devices.py.
-ELSEWHERE = ("onnx_policy", "rsl_rl_l2c2", "rsl_rl_points", "several_devices")
+# One plays what a run has exported, test_export.py; others are for rsl_rl, test_rsl_rl.py, for
+# mjlab, test_hosts.py, and for several processes, test_several_devices.py.
+ELSEWHERE = ("mjlab_cartpole", "onnx_policy", "rsl_rl_l2c2", "rsl_rl_points", "several_devices")
 EXAMPLES = sorted(p for p in (ROOT / "examples").glob("*.py") if p.stem not in ELSEWHERE)
 
 # Of those that make an update for every frame fewer than by themselves; one of them random ones.

@@ -1,7 +1,11 @@
-"""Training loops of other packages: a PPO loop in the form of Isaac Lab's."""
+"""Training loops of other packages: a PPO loop in the form of Isaac Lab's, and mjlab itself."""
 
 from __future__ import annotations
 
+import os
+import re
+import subprocess
+import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -307,3 +311,62 @@ def test_bounded_actions() -> None:
     """Isaac Lab has a squashed normal for them; the distance is that of the means before."""
     trained = train(Points(bounded=True), smooth, iterations=2)
     assert trained.logged[-1]["penalty_l2c2_actor"] > 0
+
+
+MJLAB = ["--agent.logger", "tensorboard", "--agent.save-interval", "1"]
+
+
+def run_mjlab(folder: Path, *command: str) -> str:
+    """Trains on the CPU in a process of its own; returns its log."""
+    env = os.environ | {"CUDA_VISIBLE_DEVICES": "", "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, *command, *MJLAB], cwd=folder, env=env, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def last_actor(folder: Path) -> dict[str, Tensor]:
+    """The actor's weights in the last checkpoint."""
+    path = max(folder.rglob("model_*.pt"), key=lambda path: path.stat().st_mtime)
+    return torch.load(path, weights_only=False)["actor_state_dict"]
+
+
+def gains(log: str) -> list[float]:
+    """The mean gain of each iteration."""
+    return [float(gain) for gain in re.findall(r"l2c2_gain loss: (\S+)", log)]
+
+
+@pytest.mark.slow
+def test_mjlab_trains_its_cartpole_with_and_without(tmp_path: Path) -> None:
+    """By the example, whose command sets the strength; checkpoints have the baseline's networks."""
+    pytest.importorskip("mjlab")
+    actors = {}
+    for task in ("Mjlab-Cartpole-Balance", "Mjlab-Cartpole-Balance-L2C2"):
+        (tmp_path / task).mkdir()
+        small = ["--env.scene.num-envs", "64", "--agent.max-iterations", "3"]
+        with_l2c2 = task.endswith("L2C2")
+        strength = ["--agent.algorithm.regularizer-cfg.strength", "2"] if with_l2c2 else []
+        example = str(ROOT / "examples" / "mjlab_cartpole.py")
+        log = run_mjlab(tmp_path / task, example, task, *small, *strength)
+        assert ("strength=2.0. The gain rises over 3 updates." in log) == with_l2c2
+        assert len(gains(log)) == (3 if with_l2c2 else 0)
+        if with_l2c2:
+            first, *later = gains(log)
+            assert first == 0.0 and later == sorted(later) and later[0] > 0
+        actors[task] = {key: weight.shape for key, weight in last_actor(tmp_path / task).items()}
+    baseline, regularized = actors.values()
+    assert baseline == regularized
+
+
+@pytest.mark.slow
+def test_mjlab_trains_a_walking_robot_by_the_class_name(tmp_path: Path) -> None:
+    """Two iterations of 16 robots: the command of the page, with the preset's settings."""
+    pytest.importorskip("mjlab")
+    robot = "Mjlab-Velocity-Flat-Unitree-Go1"
+    small = ["--env.scene.num-envs", "16", "--agent.max-iterations", "2"]
+    name = ["--agent.algorithm.class-name", "torchrl_l2c2.rsl_rl:L2C2PPO"]
+    log = run_mjlab(tmp_path, "-m", "mjlab.scripts.train", robot, *small, *name)
+    assert "there is no regularizer_cfg). The gain rises over 2 updates." in log
+    assert gains(log)[0] == 0.0 < gains(log)[1]
+    assert all(weight.isfinite().all() for weight in last_actor(tmp_path).values())
