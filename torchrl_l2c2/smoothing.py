@@ -1,4 +1,4 @@
-"""The front door: :func:`smooth` adds a regularizer to a loss, with the preset of such losses."""
+"""The main entry point: :func:`smooth` adds a regularizer to a loss, with a preset."""
 
 from __future__ import annotations
 
@@ -34,43 +34,42 @@ def smooth(
     fold: bool = True,
     **overrides: Any,
 ) -> RegularizedLoss:
-    """Adds a smoothness regularizer to a loss, with settings that worked for such losses.
+    """Adds a smoothness regularizer to a loss, with the preset for its class.
 
-    The result is still a loss of the same class, with the same parameters; train it as before. The
-    penalty is part of its own terms (``loss_actor`` or ``loss_objective``), so that loops that sum
-    terms by name, or all ``loss_*`` keys, need no change. It is reported as ``penalty_*``.
+    The result is a loss of the same class with the same parameters. Train it as before: the penalty
+    is added to ``loss_actor`` or ``loss_objective``, so loops that sum terms by name, or all
+    ``loss_*`` keys, need no change. The penalty is reported as ``penalty_*``.
 
-    Settings come from one table, ``torchrl_l2c2.presets.PRESETS``, by the class of the loss.
-    The gains for PPO and TD3 rise with the progress of training: call
-    ``loss.set_progress(frames / total_frames)`` after every rollout. Without that they stay at
-    their last value.
+    The presets are in ``torchrl_l2c2.presets.PRESETS``. The gains for PPO and TD3 rise with the
+    progress of training: call ``loss.set_progress(frames / total_frames)`` after every rollout.
+    Without this call the gains stay at their final value.
 
     Args:
         loss (LossModule): a loss with a policy that is trained on transitions.
         method (str): the regularizer: ``"l2c2"``, ``"caps"``, ``"cats"``, ``"grad_caps"``,
             ``"asap"``, ``"lcp"`` or ``"sr2l"``. ``grad_caps`` and ``asap`` need the observation
             before each state in the batch. Defaults to ``"l2c2"``.
-        strength (float): multiplies the penalty, at least 0. Larger values smooth more, at some
-            point at the cost of return; 0 leaves the loss's values and gradients. Defaults to
+        strength (float): factor of the penalty, at least 0. Larger values smooth more; too large
+            values lower the return. 0 leaves the loss's values and gradients unchanged. Defaults to
             ``1.0``, the preset.
-        fold (bool): whether the penalty is part of the loss's own terms. ``False`` returns it as
-            ``loss_*`` terms of its own, for loops that weigh or log them; the loss's own terms are
-            then unchanged, bit for bit. Defaults to ``True``.
-        **overrides: settings that replace the preset's: keyword arguments of the regularizer's
+        fold (bool): whether to add the penalty to the loss's own terms. ``False`` returns separate
+            ``loss_*`` terms, for loops that weigh or log them; the loss's own terms are then
+            unchanged, bit for bit. Defaults to ``True``.
+        **overrides: settings that replace the preset: keyword arguments of the regularizer's
             class, fields of its :class:`~torchrl_l2c2.Neighborhood`, and ``ramp``, the share of
-            training over which the gain rises, or ``None`` for a constant one.
+            training over which the gain rises, or ``None`` for a constant gain.
 
     Returns:
         RegularizedLoss: an instance of the regularizer and of the loss's class.
 
     Raises:
-        TypeError: the loss cannot be regularized, already is, or has no preset and no gain is
-            given; or an override is not a setting of the method.
-        ValueError: the method is not known, or a value is out of its range.
+        TypeError: the loss cannot be regularized, is already regularized, or has no preset and no
+            gain is given; or an override is not a setting of the method.
+        ValueError: the method is unknown, or a value is out of its range.
 
     Warns:
-        UserWarning: the preset was found with a similar loss; or it is the settings of the method's
-            authors, without runs here.
+        UserWarning: the preset was tuned with a similar loss, or consists of the settings of the
+            method's authors, not tuned here.
 
     Examples:
         >>> import torch
@@ -108,7 +107,7 @@ def smooth(
 
 
 def _chosen(loss: LossModule, method: str, overrides: Mapping[str, Any]) -> Preset:
-    """The preset of a loss with what replaces its settings; warns if it is none of this loss."""
+    """The preset of a loss with overrides; warns if it was not tuned with this loss."""
     name = type(loss).__name__
     kind, exact = kind_of(type(loss))
     if kind is None:
@@ -155,7 +154,7 @@ def _shown(settings: Mapping[str, Any]) -> str:
 
 
 def _arguments(method: str, make: type, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The arguments of a regularizer's class, with its neighborhood made of its fields."""
+    """The arguments of a regularizer's class; fields of a neighborhood become a neighborhood."""
     arguments = dict(settings)
     known = list(inspect.signature(make).parameters)
     known.remove("base_loss")

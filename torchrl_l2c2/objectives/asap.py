@@ -1,4 +1,4 @@
-"""ASAP: policies whose mean is what could be predicted from the state before."""
+"""ASAP: policies whose mean is predictable from the previous state."""
 
 from __future__ import annotations
 
@@ -20,49 +20,50 @@ class ASAPLoss(GradCAPSLoss):
     Predictions from Preceding States*).
 
     Adds to any TorchRL loss with a policy a network :math:`\pi_P` that predicts the next action,
-    and
+    and the terms
 
     .. math::
         \lambda_S\, \mathbb E\left[\lVert \mu(s_t) - \bar\pi_P(s_{t-1}) \rVert_2^2\right]
         + \lambda_P\, \mathbb E\left[\lVert \pi_P(s_{t-1}) - \bar\mu(s_t) \rVert_2^2\right],
 
-    the spatial and the temporal term, as ``loss_asap_spatial``, which trains the policy, and
-    ``loss_asap_temporal``, which trains the predictor; a bar stops the gradient. With them comes
-    the term of :class:`GradCAPSLoss`, as ``loss_grad_caps``, whose batches this loss needs.
+    as ``loss_asap_spatial``, the spatial term, which trains the policy, and
+    ``loss_asap_temporal``, the temporal term, which trains the predictor. A bar stops the gradient.
+    The loss also adds ``loss_grad_caps``, the term of :class:`GradCAPSLoss`, and needs the same
+    batches.
 
-    States that may follow one state share one prediction, so that actions in them come near one
-    another: that is what makes the first term spatial. In the first step of an episode, where the
-    state before is the state itself, the policy is compared with a prediction for that one.
+    All states that may follow a state share one prediction, so the first term draws their actions
+    together: it is spatial. In the first step of an episode the state stands in for the previous
+    state.
 
-    [inferred] The authors' predictor is a second head on the hidden layers of the policy. A loss of
-    any kind does not say where these end: here it is a network of its own, ``asap_predictor``, that
-    begins as a copy of the policy. It is among the loss's parameters, and in its ``state_dict``,
-    which other regularizers leave as the plain loss's. Make the optimizer of the regularized loss.
+    [inferred] The authors' predictor is a second head on the policy's hidden layers. A general loss
+    has no known hidden layers, so the predictor here is a separate network, ``asap_predictor``,
+    initialized as a copy of the policy. Its parameters are part of the loss's parameters and
+    ``state_dict``: create the optimizer from the regularized loss.
 
     Args:
         base_loss (LossModule): as for :class:`GradCAPSLoss`.
-        lambda_spatial (float): :math:`\lambda_S`, at least 0. Larger values pull actions to the
-            predicted ones. Scheduled as ``asap_lambda_spatial``. Defaults to ``0.3``, the authors'
-            for MuJoCo; theirs for LunarLander and Pendulum is ``0.03``.
+        lambda_spatial (float): :math:`\lambda_S`, at least 0. Larger values pull the actions toward
+            the predictions. Scheduled as ``asap_lambda_spatial``. Defaults to ``0.3``, the authors'
+            value for MuJoCo; their value for LunarLander and Pendulum is ``0.03``.
         lambda_temporal (float): :math:`\lambda_P`, at least 0. Larger values let the predictor
-            follow the policy sooner, with optimizers that are not free of scale. Scheduled as
+            follow the policy faster, unless the optimizer is scale-free. Scheduled as
             ``asap_lambda_temporal``. Defaults to ``2.0``.
-        lambda_grad (float): gain of Grad-CAPS's term, at least 0. Scheduled as
-            ``grad_caps_lambda_temporal``. Defaults to ``0.05``; the authors' for LunarLander and
-            Pendulum is ``0.005``.
+        lambda_grad (float): gain of the Grad-CAPS term, at least 0. Scheduled as
+            ``grad_caps_lambda_temporal``. Defaults to ``0.05``; the authors' value for LunarLander
+            and Pendulum is ``0.005``.
         epsilon (float): as for :class:`GradCAPSLoss`.
 
     Keyword Args:
         frames_key (NestedKey): as for :class:`GradCAPSLoss`.
-        previous_key (NestedKey, optional): likewise.
-        mean (str): likewise.
-        fraction (float): likewise.
-        skip_ends (bool): likewise; leaves these transitions out of Grad-CAPS's term.
+        previous_key (NestedKey, optional): as for :class:`GradCAPSLoss`.
+        mean (str): as for :class:`GradCAPSLoss`.
+        fraction (float): as for :class:`GradCAPSLoss`.
+        skip_ends (bool): as for :class:`GradCAPSLoss`; applies to the Grad-CAPS term only.
 
     Raises:
         TypeError: as for :class:`GradCAPSLoss`.
-        ValueError: likewise.
-        KeyError: likewise.
+        ValueError: as for :class:`GradCAPSLoss`.
+        KeyError: as for :class:`GradCAPSLoss`.
 
     Examples:
         >>> import torch
@@ -123,7 +124,7 @@ class ASAPLoss(GradCAPSLoss):
 
 
 def _copy_of_policy(loss: LossModule) -> TensorDictModuleBase:
-    """The policy with parameters of its own, also where the loss keeps them beside it."""
+    """Copies the policy with its parameters, also if the loss stores them separately."""
     policy: TensorDictModuleBase = getattr(loss, POLICY_NETWORK)
     if not loss.functional:
         return copy.deepcopy(policy)

@@ -20,50 +20,52 @@ from torchrl_l2c2.policy_distances import policy_mean
 class CAPSLoss(RegularizedLoss):
     r"""A loss with conditioning for action policy smoothness (Mysore et al., 2021).
 
-    Adds to any TorchRL loss with a policy, in the form of Kobayashi, L2C2, 2022,
+    Adds these terms to any TorchRL loss with a policy, in the form of Kobayashi, L2C2, 2022:
 
     .. math::
         \lambda_T\, \mathbb E\left[\tfrac12 \lVert\mu(s) - \mu(s')\rVert_2^2\right]
         + \lambda_S\, \mathbb E\left[\tfrac12 \lVert\mu(s) - \mu(\bar s)\rVert_2^2\right],
         \qquad \bar s \sim \mathcal N(s, \sigma),
 
-    the temporal and the spatial term, as ``loss_caps_temporal`` and ``loss_caps_spatial``.
-    Gradients flow into the policy's parameters alone, through both states.
+    the temporal and the spatial term, as ``loss_caps_temporal`` and ``loss_caps_spatial``. They
+    train the policy only, with gradients through both states.
 
-    The mean :math:`\mu` is that of the normal distribution. [inferred] The paper's policy is a
-    plain normal; of a squashed or truncated one, ``mean`` says which side of that is compared. Of
-    discrete policies the probabilities are compared, the mean of an action written as one-hot
-    vector; the heads of composite ones add up.
-    The next state is that of the batch, with its masks and labels, several steps away behind
-    ``MultiStepTransform``; the noisy one has those of the state. Coordinates of the next
-    observation that are not finite count as not having moved; transitions without a finite one, as
-    at the ends of some episodes, do not count in the temporal term, and ``caps_counted`` is the
-    share of the batch that does.
+    :math:`\mu` is the mean of the normal distribution. [inferred] The paper's policy is a normal
+    distribution. For squashed or truncated distributions, ``mean`` chooses whether means are
+    compared before or after the squashing. Discrete policies are compared by their probabilities,
+    the mean of the one-hot action. For composite policies the distances of the heads add up.
 
-    .. note:: The noise is drawn with torch's global generator. The gains are buffers that can be
-        assigned to, as in ``loss.caps_lambda_spatial = 0.1``, also between calls of a compiled
-        loss. They are not part of the ``state_dict``.
+    The next state and its masks and labels come from the batch; behind ``MultiStepTransform`` it is
+    several steps away. The noisy state keeps the masks and labels of the state. Coordinates of the
+    next observation that are not finite are replaced by the state's coordinates. Transitions
+    without any finite coordinate, such as the ends of some episodes, do not count in the temporal
+    term. ``caps_counted`` is the share of the batch that counts.
+
+    .. note:: The noise is drawn with torch's global generator. Gains are buffers: assign to them at
+        any time, as in ``loss.caps_lambda_spatial = 0.1``, also between calls of a compiled loss.
+        They are not part of the ``state_dict``.
 
     Args:
         base_loss (LossModule): the loss; see :class:`RegularizedLoss` for how it is wrapped.
         sigma (float): standard deviation of the noise on every coordinate, in the observation's
             units, greater than 0. Larger values smooth over larger distances. Defaults to ``0.2``.
-        lambda_temporal (float): gain of the temporal term, at least 0. Larger values slow the
-            actions down. Scheduled as ``caps_lambda_temporal``. Defaults to ``0.01``.
+        lambda_temporal (float): gain of the temporal term, at least 0. Larger values slow down the
+            actions. Scheduled as ``caps_lambda_temporal``. Defaults to ``0.01``.
         lambda_spatial (float): gain of the spatial term, at least 0. Larger values make actions
             less sensitive to the state. Scheduled as ``caps_lambda_spatial``. Defaults to ``0.05``.
 
     Keyword Args:
-        mean (str): ``"loc"`` compares means before the squashing, and so restrains saturated
-            policies as well; ``"action"`` compares deterministic actions, which hardly move once
-            they are saturated. The same for policies that are not squashed, and for deterministic
-            ones, which give their action alone. [inferred] Defaults to ``"loc"``.
-        fraction (float): share of the batch, in (0, 1], whose states are compared, drawn anew each
-            time with torch's global generator. Smaller ones cost less time and memory, pay in large
-            batches, and are noisier; the terms' expectation stays. Defaults to ``1.0``.
-        skip_ends (bool): whether transitions at which an episode ends are left out of the temporal
-            term: for environments whose next observation is the reset state there. Defaults to
-            ``False``.
+        mean (str): ``"loc"`` compares means before the squashing and also restrains saturated
+            policies; ``"action"`` compares mean actions, which hardly change once they are
+            saturated. The two are equal for deterministic policies and policies without squashing.
+            [inferred] Defaults to ``"loc"``.
+        fraction (float): share of the batch, in (0, 1], whose states are compared. Each call draws
+            new rows with torch's global generator. Smaller values save time and memory in large
+            batches and make the terms noisier; their expectation does not change. Defaults to
+            ``1.0``.
+        skip_ends (bool): whether to leave transitions that end an episode out of the temporal term.
+            Use it for environments that store the reset state as the last next observation.
+            Defaults to ``False``.
 
     Raises:
         TypeError: the loss has no policy or cannot be regularized, or an argument has the wrong
@@ -161,7 +163,7 @@ def caps_terms(
 
     Args:
         mean: the policy's means at the states.
-        moved: those at the next states, then those at noisy copies of the states.
+        moved: the means at the next states, then at noisy copies of the states.
 
     Raises:
         ValueError: their last dimensions differ.

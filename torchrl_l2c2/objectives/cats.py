@@ -1,4 +1,4 @@
-"""CATS: policies whose mean changes little from a state to the next, ever less in training."""
+"""CATS: policies whose mean changes little between successive states, with a growing gain."""
 
 from __future__ import annotations
 
@@ -18,35 +18,35 @@ from torchrl_l2c2.policy_distances import policy_mean
 class CATSLoss(RegularizedLoss):
     r"""A loss with CATS's temporal term (arXiv 2610.07910).
 
-    Adds to any TorchRL loss with a policy
+    Adds this term, ``loss_cats``, to any TorchRL loss with a policy:
 
     .. math::
         \frac kK\, \lambda\, \mathbb E\left[\lVert \mu(s) - \mu(s') \rVert_2^2\right]
 
-    as ``loss_cats``, in update :math:`k` of :math:`K`. The ramp is that of
-    :meth:`~RegularizedLoss.ramp` and :meth:`~RegularizedLoss.set_progress`. There is no spatial
-    term: its authors bound it by twice the temporal one. Gradients flow into the policy
-    alone, through both states.
+    in update :math:`k` of :math:`K`. For the factor :math:`k / K`, call
+    :meth:`~RegularizedLoss.ramp` once and :meth:`~RegularizedLoss.set_progress` during training.
+    There is no spatial term: the authors bound it by twice the temporal term. The term trains the
+    policy only, with gradients through both states.
 
-    [inferred] Which side of a squashing is compared and the value of :math:`\lambda` could not be
-    read. The next state is that of the batch, with its masks and labels, several steps away behind
-    ``MultiStepTransform``. Its coordinates that are not finite count as not having moved;
-    transitions without a finite one do not count, and ``cats_counted`` is the share of the batch
-    that does.
+    [inferred] The side of the squashing on which means are compared, and the value of
+    :math:`\lambda`, are not known from the paper. The next state and its masks and labels come from
+    the batch; behind ``MultiStepTransform`` it is several steps away. Its coordinates that are not
+    finite are replaced by the state's coordinates. Transitions without any finite coordinate do not
+    count. ``cats_counted`` is the share of the batch that counts.
 
     Args:
         base_loss (LossModule): the loss; see :class:`RegularizedLoss` for how it is wrapped.
-        lambda_temporal (float): :math:`\lambda k / K`, at least 0. Larger values slow the actions
-            down. Scheduled as ``cats_lambda_temporal``. Defaults to ``0.1``.
+        lambda_temporal (float): :math:`\lambda k / K`, at least 0. Larger values slow down the
+            actions. Scheduled as ``cats_lambda_temporal``. Defaults to ``0.1``.
 
     Keyword Args:
-        mean (str): ``"loc"`` compares means before the squashing, ``"action"`` deterministic
-            actions. Defaults to ``"loc"``.
-        fraction (float): share of the batch, in (0, 1], whose states are compared, drawn anew each
-            time with torch's global generator. Smaller ones cost less time and memory, pay in large
-            batches, and are noisier; the terms' expectation stays. Defaults to ``1.0``.
-        skip_ends (bool): whether transitions at which an episode ends are left out of the temporal
-            term: for environments whose next observation is the reset state there. Defaults to
+        mean (str): ``"loc"`` compares means before the squashing, ``"action"`` mean actions.
+            Defaults to ``"loc"``.
+        fraction (float): share of the batch, in (0, 1], whose states are compared. Each call draws
+            new rows with torch's global generator. Smaller values save time and memory in large
+            batches and make the term noisier; its expectation does not change. Defaults to ``1.0``.
+        skip_ends (bool): whether to leave out transitions that end an episode. Use it for
+            environments that store the reset state as the last next observation. Defaults to
             ``False``.
 
     Raises:
@@ -117,7 +117,7 @@ def cats_term(
 
     Args:
         mean: the policy's means at the states.
-        later: those at the next states.
+        later: the policy's means at the next states.
 
     Raises:
         ValueError: their last dimensions differ.

@@ -44,17 +44,16 @@ def l2c2_penalty(
     .. math::
         \frac1K \sum_k \frac{\lambda}{d(s, \tilde s_k; s')}\, d_f(f(s), f(\tilde s_k))
 
-    of a policy, equation (10), or a value function, equation (11), :math:`f` (Kobayashi, L2C2,
+    where :math:`f` is a policy, equation (10), or a value function, equation (11) (Kobayashi, L2C2,
     2022).
 
     Args:
-        difference: :math:`d_f`, at least 0; it may have more dimensions, those of agents.
-        gain: :math:`\lambda / d`, as :meth:`Neighborhood.gain <torchrl_l2c2.Neighborhood.gain>`
-            gives it.
-        over_neighbors: ``"max"`` takes the largest of the ``K`` instead of their mean.
+        difference: :math:`d_f`, at least 0. Trailing dimensions, such as agents, are allowed.
+        gain: :math:`\lambda / d`, from :meth:`Neighborhood.gain <torchrl_l2c2.Neighborhood.gain>`.
+        over_neighbors: ``"max"`` takes the largest of the ``K`` penalties instead of their mean.
 
     Raises:
-        ValueError: the differences are not of each transition.
+        ValueError: the leading dimensions of the two differ.
 
     Examples:
         >>> import torch
@@ -66,18 +65,18 @@ def l2c2_penalty(
     check_of_each(difference.shape, gain.shape)
     gain = gain[(...,) + (None,) * (difference.ndim - gain.ndim)]
     penalty = gain * difference
-    # Not amax: of some of PPO-RPE's graphs inductor makes no program with it.
+    # Not amax: inductor fails to compile some of PPO-RPE's graphs with it.
     return penalty.mean(0) if over_neighbors == "mean" else penalty.max(0).values
 
 
 class Neighbors(NamedTuple):
-    """The neighbors of the states in a batch ``[*B]``, or of ``M`` of them.
+    """The neighbors of the states in a batch ``[*B]``, or of ``M`` of its states.
 
     Attributes:
-        states: the neighbors, ``[K, *B]``, or ``[K, M]``.
-        distance: how far away they count, of the same shape; infinite if they do not count.
-        counts: which transitions count, ``[*B]`` or ``[M]``.
-        rows: whose neighbors they are, ``[M]``, in the batch written as one row; ``None``: all.
+        states: the neighbors, ``[K, *B]`` or ``[K, M]``.
+        distance: their distances, same shape; infinite for transitions that do not count.
+        counts: mask of the transitions that count, ``[*B]`` or ``[M]``.
+        rows: indices of the states in the flattened batch, ``[M]``; ``None`` for all states.
     """
 
     states: TensorDictBase
@@ -87,9 +86,9 @@ class Neighbors(NamedTuple):
 
 
 class L2C2Loss(RegularizedLoss):
-    r"""A loss under the locally Lipschitz continuous constraint (Kobayashi, L2C2, 2022).
+    r"""A loss with the locally Lipschitz continuous constraint (Kobayashi, L2C2, 2022).
 
-    Adds to any TorchRL loss with a policy, a value function or both
+    Adds these terms to any TorchRL loss with a policy, a value function or both:
 
     .. math::
         \lambda_\pi\, \mathbb E\left[\frac{d_\pi(\pi(\cdot|s), \pi(\cdot|\tilde s))}
@@ -97,83 +96,90 @@ class L2C2Loss(RegularizedLoss):
         + \lambda_V\, \mathbb E\left[\frac{d_V(V(s), V(\tilde s))}{d(s, \tilde s; s')}\right],
         \qquad \lambda_V = \beta\lambda_\pi,
 
-    with the neighbors :math:`\tilde s`, their distances :math:`d` and :math:`\lambda_\pi` of a
-    :class:`~torchrl_l2c2.Neighborhood`. :math:`d_\pi` is the squared Hellinger distance
-    (:func:`~torchrl_l2c2.squared_hellinger`) or what ``policy_distance`` says; for deterministic
-    policies half the squared distance of the actions.
-    :math:`d_V = \tfrac12\lVert V(s) - V(\tilde s)\rVert_2^2` is taken over all heads or members of
-    an ensemble; of action values over all (discrete) actions, or at the batch's action; of the
-    value distributions of :class:`~torchrl.objectives.DistributionalDQNLoss`
-    it is the squared Hellinger distance, summed over the actions.
+    where a :class:`~torchrl_l2c2.Neighborhood` defines the neighbors :math:`\tilde s`, their
+    distances :math:`d` and :math:`\lambda_\pi`.
 
-    Gradients flow into the policy's parameters from the one term, into the value function's from
-    the other, through both :math:`s` and :math:`\tilde s`, and nowhere else: not into targets, nor
-    from a value into the policy except through a trunk that the plain loss trains so as well.
-    Both terms are reduced as the loss reduces its own: with its ``reduction``, its masks and, where
-    it uses them, the weights of prioritized replay, in TorchRL's weighted mean or sum. Beside
-    :class:`PPORPELoss`, which scales its own terms down by the weights, theirs have a mean of 1, so
-    that the terms keep their full gain [inferred: the paper weights neither or both].
+    * :math:`d_\pi` is the squared Hellinger distance (:func:`~torchrl_l2c2.squared_hellinger`) or
+      ``policy_distance``. For deterministic policies it is half the squared distance of the
+      actions.
+    * :math:`d_V = \tfrac12\lVert V(s) - V(\tilde s)\rVert_2^2` sums over all heads or members of an
+      ensemble. Action values are compared for all discrete actions, or at the batch's action. For
+      :class:`~torchrl.objectives.DistributionalDQNLoss` it is the squared Hellinger distance of the
+      value distributions, summed over the actions.
 
-    Neighbors are read from the batch where a transform has written them, such as
-    :meth:`neighbor_transform` makes, and otherwise drawn from the observations and next
-    observations with torch's global generator. Drawn here, those floating-point inputs of the
-    regularized networks are moved that have a successor in the batch, or ``moved_keys``; the
-    distance is their largest. A transition whose next observation is not finite, or which is longer
-    than the neighborhood's ``max_step``, does not count: means are over the others.
+    The policy term trains the policy only, the value terms train the value functions only, through
+    both :math:`s` and :math:`\tilde s`. Target networks get no gradient. A value term reaches the
+    policy only through a shared trunk that the value loss of the base loss also trains.
 
-    ``forward`` adds these entries to the loss's own:
+    The terms are reduced like the loss's own terms: same ``reduction``, same masks and, if the loss
+    uses them, the weights of prioritized replay in TorchRL's weighted mean or sum.
+    :class:`PPORPELoss` scales its own terms down by the weights; the terms added here use weights
+    with a mean of 1 and keep their full gain [inferred: the paper weights neither or both].
+
+    If a transform such as :meth:`neighbor_transform` has written neighbors into the batch, they are
+    used. Otherwise the loss draws them from the observations and next observations with torch's
+    global generator. It then moves ``moved_keys`` or, by default, every floating-point input of the
+    regularized networks that has a successor in the batch; the distance is the largest over these
+    inputs. Transitions whose next observation is not finite, or whose step exceeds the
+    neighborhood's ``max_step``, do not count: means are over the other transitions.
+
+    ``forward`` adds these entries:
 
     * ``loss_l2c2_actor``, the policy term, and one value term for each value function, named after
       its network: ``loss_l2c2_critic``, ``loss_l2c2_qvalue``, ``loss_l2c2_value``, ...
     * ``l2c2_distance``, the mean :math:`d`, and ``l2c2_gain``, the mean gain
       :math:`\lambda_\pi / d` times the coefficients;
-    * ``l2c2_counted``, the share of the batch that counts, 1 unless next observations are not
-      known or steps are too long;
+    * ``l2c2_counted``, the share of the batch that counts;
     * the mean :math:`d_\pi`, named after the distance: ``l2c2_hellinger``,
-      ``l2c2_mean_distance``, ``l2c2_mse``, ``l2c2_kl``, ``l2c2_policy_distance`` for a function of
-      one's own, ``l2c2_action_distance`` for deterministic policies;
-    * ``l2c2_value_distance``, the mean :math:`d_V`, summed over the value functions. With
-      ``reduction="none"`` diagnostics are not averaged either.
+      ``l2c2_mean_distance``, ``l2c2_mse``, ``l2c2_kl``, ``l2c2_policy_distance`` (a function) or
+      ``l2c2_action_distance`` (deterministic policies);
+    * ``l2c2_value_distance``, the mean :math:`d_V`, summed over the value functions.
 
-    .. note:: The gains are buffers that can be assigned to, as in ``loss.l2c2_coeff = 0.5``, also
+    With ``reduction="none"`` these diagnostics are not averaged.
+
+    .. note:: Gains are buffers: assign to them at any time, as in ``loss.l2c2_coeff = 0.5``, also
         between calls of a compiled loss. They are not part of the ``state_dict``.
 
     Args:
         base_loss (LossModule): the loss; see :class:`RegularizedLoss` for how it is wrapped.
-        neighborhood (Neighborhood, optional): where neighbors are drawn and what they count.
-            Defaults to the paper's, ``Neighborhood()``.
+        neighborhood (Neighborhood, optional): region in which neighbors are drawn, and their
+            distance and gain. Defaults to ``Neighborhood()``, the paper's settings.
         beta (float): gain of the value terms relative to the policy term, at least 0. Larger values
-            smooth the value functions more; 0 leaves their terms out altogether (the paper's
-            ablation). Scheduled as ``l2c2_beta``. Defaults to ``0.1``.
+            smooth the value functions more; 0 omits their terms (the paper's ablation). Scheduled
+            as ``l2c2_beta``. Defaults to ``0.1``.
 
     Keyword Args:
-        coeff (float): multiplies all terms, at least 0; 0 leaves the plain loss's values and
-            gradients. Scheduled as ``l2c2_coeff``. Defaults to ``1.0``.
-        num_samples (int): neighbors per state, drawn here or by the transform, at least 1. More
-            give a less noisy estimate at so many times the network evaluations. Defaults to ``1``.
-        over_neighbors (str): ``"mean"``, the paper's, or ``"max"``: the largest penalty alone, an
-            adversary of ``num_samples`` choices, larger at the same gain. Defaults to ``"mean"``.
-        fraction (float): share of the batch, in (0, 1], whose states have neighbors, drawn anew
-            each time with torch's global generator. Smaller ones cost less, pay in large batches,
-            and are noisier; the terms' expectation stays: a drawn transition counts
-            ``1 / fraction`` times and the others 0, also with ``reduction="none"``. Defaults to 1.
-        moved_keys (str or sequence of NestedKey, optional): which observations neighbors drawn here
-            differ in, such as those that carry noise. Defaults to ``None``, all that can.
-        policy_distance (str or callable): :math:`d_\pi`. ``"hellinger"``, the paper's, is in [0, 1]
-            and relative to how wide the policies are; ``"mean"``
-            (:func:`~torchrl_l2c2.policy_distances.mean_distance`) is neither; nor is ``"mse"``
-            (:func:`~torchrl_l2c2.policy_distances.mean_squared_error`), a mean over the action's
-            dimensions; ``"kl"`` (:func:`~torchrl_l2c2.divergences.kl_divergence`), of the
-            policy at :math:`s` from the other, is relative and unbounded. Each wants its own gains.
-            A function takes two distributions ``[K, *B]`` and returns ``[K, *B]``; neither it nor
-            ``"kl"`` takes deterministic policies. A module's parameters are not the loss's.
-            Defaults to ``"hellinger"``.
+        coeff (float): factor of all terms, at least 0. Larger values smooth more; 0 leaves the base
+            loss's values and gradients unchanged. Scheduled as ``l2c2_coeff``. Defaults to ``1.0``.
+        num_samples (int): neighbors per state, at least 1. Larger values reduce the noise of the
+            terms; the number of network evaluations grows in proportion. Defaults to ``1``.
+        over_neighbors (str): ``"mean"`` (the paper) averages the penalty over the neighbors;
+            ``"max"`` takes the largest penalty, which is larger at the same gain. Defaults to
+            ``"mean"``.
+        fraction (float): share of the batch, in (0, 1], for which neighbors are drawn. Each call
+            draws new rows with torch's global generator. Smaller values save time in large batches
+            and make the terms noisier. Their expectation does not change: a drawn transition counts
+            ``1 / fraction`` times, the others 0, also with ``reduction="none"``. Defaults to 1.
+        moved_keys (str or sequence of NestedKey, optional): observations in which neighbors differ
+            from the state, such as noisy sensors. Applies to neighbors that the loss draws itself.
+            Defaults to ``None``, all observations with a successor.
+        policy_distance (str or callable): :math:`d_\pi`. Each choice needs its own gains.
+            ``"hellinger"`` (the paper) is in [0, 1] and relative to the width of the policies.
+            ``"mean"`` (:func:`~torchrl_l2c2.policy_distances.mean_distance`) and ``"mse"``
+            (:func:`~torchrl_l2c2.policy_distances.mean_squared_error`, a mean over the action's
+            dimensions) are absolute and unbounded. ``"kl"``
+            (:func:`~torchrl_l2c2.divergences.kl_divergence`, of the policy at :math:`s` from the
+            neighbor's policy) is relative and unbounded. A function takes two distributions
+            ``[K, *B]`` and returns ``[K, *B]``; if it is a module, the loss does not own its
+            parameters. ``"kl"`` and functions need a stochastic policy. Defaults to
+            ``"hellinger"``.
         hellinger_samples (int, optional): actions drawn from each policy for the paper's Monte
-            Carlo estimate of :math:`d_\pi`, at least 1. Defaults to ``None``, its closed form.
-        neighbor_key (NestedKey): the entry that ``NeighborTransform`` writes. Defaults to
+            Carlo estimate of :math:`d_\pi`, at least 1. Defaults to ``None``, the closed form.
+        neighbor_key (NestedKey): entry that ``NeighborTransform`` writes. Defaults to
             ``"neighbor"``.
-        skip_ends (bool): whether transitions at which an episode ends are left out: for
-            environments whose next observation is the reset state there. Defaults to ``False``.
+        skip_ends (bool): whether to leave out transitions that end an episode. Use it for
+            environments that store the reset state as the last next observation. Defaults to
+            ``False``.
 
     Raises:
         TypeError: the loss has neither a policy nor a value function, cannot be regularized, has no
@@ -182,9 +188,9 @@ class L2C2Loss(RegularizedLoss):
             ``"distance"``.
 
     Warns:
-        UserWarning: the loss lacks a policy or a trained value function, so that one term is left
-            out; not with ``beta=0``. The gains are the paper's or smaller, around a loss with which
-            these had no measurable effect.
+        UserWarning: the loss has no policy, or no trained value function while ``beta`` is above 0,
+            and one term is left out; or the gains are at most those of the paper, which had no
+            measurable effect with such losses.
 
     Examples:
         >>> import torch
@@ -312,25 +318,25 @@ class L2C2Loss(RegularizedLoss):
         generator: torch.Generator | None = None,
         in_keys: str | Sequence[NestedKey] | None = None,
     ) -> NeighborTransform:
-        """The transform that draws this loss's neighbors where the batch is drawn.
+        """Makes a transform that draws this loss's neighbors in the replay buffer.
 
         Append it to a replay buffer, after transforms that change observations::
 
             replay.append_transform(loss.neighbor_transform())
 
-        It has the loss's neighborhood, ``num_samples`` and ``neighbor_key``. Without it the loss
-        draws neighbors itself; with it they are drawn where the batch is, with a generator of its
-        own, such as in a process that prefetches.
+        It uses the loss's neighborhood, ``num_samples`` and ``neighbor_key``. Without it the loss
+        draws neighbors itself. With it they are drawn together with the batch, for example in a
+        process that prefetches, and may have their own generator.
 
         Args:
             generator (torch.Generator, optional): source of the randomness, as for
                 :class:`~torchrl_l2c2.NeighborTransform`. Defaults to torch's global generator.
-            in_keys (str or sequence of NestedKey, optional): the observations that move. Defaults
-                to ``moved_keys`` of the loss or else all that the regularized networks read; name
-                them if one of these has no successor in the batch, such as a goal.
+            in_keys (str or sequence of NestedKey, optional): observations to move. Defaults to the
+                loss's ``moved_keys``, or else every observation that the regularized networks read.
+                Pass it if one of these, such as a goal, has no successor in the batch.
 
         Returns:
-            NeighborTransform: of this loss.
+            NeighborTransform: the transform.
         """
         if in_keys is None:
             networks = [*self._l2c2_policies, *self._l2c2_values]
@@ -384,7 +390,7 @@ class L2C2Loss(RegularizedLoss):
         return Neighbors(states, distance, counts, rows)
 
     def _draw(self, tensordict: TensorDictBase, rows: Tensor | None) -> TensorDictBase:
-        """What NeighborTransform would have written."""
+        """Draws the entry that NeighborTransform would have written."""
         networks = [*self._l2c2_policies, *self._l2c2_values]
         keys = self.l2c2_moved_keys or list(self.transitions(tensordict, networks))
         states = tensordict.select(*keys, *map(next_key, keys)).detach()
@@ -420,7 +426,7 @@ def _value_term(network: str) -> str:
 
 
 def _read_neighbors(neighbor: TensorDictBase, key: NestedKey) -> tuple[TensorDictBase, Tensor]:
-    """The neighbors, ``[K, *B]``, and their distances, of an entry ``[*B]`` of a batch."""
+    """Splits a batch's entry ``[*B]`` into neighbors and distances, ``[K, *B]``."""
     if not isinstance(neighbor, TensorDictBase):
         raise KeyError(
             f"{key!r} is a tensor of the batch's own, and no neighbors of NeighborTransform: name "
@@ -442,15 +448,16 @@ def _read_neighbors(neighbor: TensorDictBase, key: NestedKey) -> tuple[TensorDic
 def _read_moved_keys(
     moved_keys: str | Sequence[NestedKey], read: Mapping[str, Sequence[NestedKey]]
 ) -> list[NestedKey]:
-    """The entries that neighbors differ in; a string is one, as TorchRL's transforms have it.
+    """The observations in which neighbors differ from the state.
 
     Args:
-        moved_keys (str or sequence of NestedKey): their names.
-        read (Mapping): those that each network reads, by its name.
+        moved_keys (str or sequence of NestedKey): the names; a string is a single name, as in
+            TorchRL's transforms.
+        read (Mapping): the inputs of each network, by the network's name.
 
     Raises:
-        TypeError: they are no names.
-        ValueError: there is none, one that no network reads, or a network reads none of them.
+        TypeError: an entry is not a name.
+        ValueError: the list is empty, no network reads a name, or a network reads no name at all.
     """
     if not isinstance(moved_keys, Sequence):
         raise TypeError(f"moved_keys must be a list of entries, got {moved_keys!r}.")

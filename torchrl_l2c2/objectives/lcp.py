@@ -22,26 +22,26 @@ from torchrl_l2c2.policy_distances import policy_mean
 class LCPLoss(RegularizedLoss):
     r"""A loss with the gradient penalty of Lipschitz-constrained policies (Chen et al., 2024).
 
-    Adds to any TorchRL loss with a stochastic policy, as ``loss_lcp``,
+    Adds this term, ``loss_lcp``, to any TorchRL loss with a stochastic policy:
 
     .. math::
         \lambda\, \mathbb E\left[\lVert \nabla_s \ln\pi(a|s) \rVert_2^2\right]
 
     at the states and actions of the batch ("Learning Smooth Humanoid Locomotion through
-    Lipschitz-Constrained Policies", arXiv 2410.11825). No next state is needed. Gradients flow into
-    the policy alone. With ``of="mean"`` it is the squared norm of the Jacobian of the mean instead,
+    Lipschitz-Constrained Policies", arXiv 2410.11825). It trains the policy only and needs no next
+    state. With ``of="mean"`` the term is the squared norm of the Jacobian of the mean:
 
     .. math::
         \lambda\, \mathbb E\left[\lVert \nabla_s \mu(s) \rVert_F^2\right]
         = \lambda\, \mathbb E\left[\lVert \nabla_s\, v^\top \mu(s) \rVert_2^2\right],
         \qquad v_i = \pm 1,
 
-    which does not depend on how wide the policy is, and which deterministic policies have as well.
-    One random sign vector :math:`v` for each state estimates it without bias.
+    It does not depend on the width of the policy, and works for deterministic policies. One random
+    sign vector :math:`v` for each state gives an unbiased estimate.
 
-    .. note:: ``torch.compile`` does not take it, as it differentiates twice (the experiment's
-        updates are compiled otherwise, and are). A narrow policy has a steep likelihood: as the
-        policy's scale falls, the same slope of its mean costs more.
+    .. note:: The loss cannot be passed to ``torch.compile``, because it differentiates twice. (The
+        experiment compiles its updates in another way, and supports it.) A narrow policy has a
+        steep likelihood: as the policy's scale falls, the same slope of its mean costs more.
 
     Args:
         base_loss (LossModule): the loss; see :class:`RegularizedLoss` for how it is wrapped.
@@ -49,14 +49,15 @@ class LCPLoss(RegularizedLoss):
             ``lcp_coeff``. Defaults to ``0.002``.
 
     Keyword Args:
-        of (str): ``"log_prob"``, the method's, or ``"mean"``. Defaults to ``"log_prob"``.
-        fraction (float): share of the batch, in (0, 1], whose states are compared, drawn anew each
-            time with torch's global generator. Smaller ones cost less time and memory, pay in large
-            batches, and are noisier; the terms' expectation stays. Defaults to ``1.0``.
+        of (str): function to differentiate: ``"log_prob"`` (the paper) or ``"mean"``. Defaults to
+            ``"log_prob"``.
+        fraction (float): share of the batch, in (0, 1], whose states are used. Each call draws new
+            rows with torch's global generator. Smaller values save time and memory in large batches
+            and make the term noisier; its expectation does not change. Defaults to ``1.0``.
 
     Raises:
-        TypeError: the loss has no policy, or no stochastic one for ``of="log_prob"``, or cannot be
-            regularized, or an argument has the wrong type.
+        TypeError: the loss has no policy, has a deterministic policy with ``of="log_prob"``, or
+            cannot be regularized; or an argument has the wrong type.
         ValueError: an argument is out of its range.
 
     Examples:
@@ -132,18 +133,18 @@ def lcp_term(
     log_prob: Tensor,  # shape: [*B, ...]
     states: list[Tensor],  # shape: [*B, *F] each
     batch_dims: int,
-) -> Tensor:  # shape: [*B] or, of agents with a state each, [*B, agents]
+) -> Tensor:  # shape: [*B] or, for agents with separate states, [*B, agents]
     r"""The gradient penalty of LCP, before its gain and its reduction.
 
     .. math::
         \lVert \nabla_s \ln\pi(a|s) \rVert_2^2
 
-    over all parts of the state. Its gradient is that of a second derivative.
+    over all parts of the state. Its gradient is a second derivative.
 
     Args:
-        log_prob: :math:`\ln\pi(a|s)`, made of the states; it may have the dimension of agents.
+        log_prob: :math:`\ln\pi(a|s)`, computed from the states; it may have a dimension of agents.
         states: the parts of the state, which require a gradient.
-        batch_dims: how many dimensions ``[*B]`` are.
+        batch_dims: number of dimensions of ``[*B]``.
 
     Examples:
         >>> import torch
@@ -156,7 +157,7 @@ def lcp_term(
     gradients = torch.autograd.grad(
         log_prob.sum(), states, create_graph=True, materialize_grads=True
     )
-    # Agents that have a state each are as the rows of a batch, and are not summed over either.
+    # Agents with separate states are treated as rows of the batch: no sum over agents.
     agents = log_prob.ndim
     if all(s.ndim > agents and s.shape[:agents] == log_prob.shape for s in states):
         batch_dims = agents
