@@ -1,4 +1,4 @@
-"""Losses: L2C2, its rivals, what they are built on, and PPO-RPE."""
+"""Losses: L2C2 and other regularizers, their base class, and PPO-RPE."""
 
 from torchrl_l2c2.objectives._networks import SharedEvaluation
 from torchrl_l2c2.objectives.asap import ASAPLoss

@@ -1,4 +1,4 @@
-"""The transitions of a batch: which losses have them, and where they are."""
+"""The states and transitions of a batch, and checks of losses that lack them."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ def check_evaluates_states(loss: LossModule) -> None:
         loss (LossModule): the loss.
 
     Raises:
-        TypeError: it is of another kind; the message says which.
+        TypeError: the loss is of another kind; the message names it.
     """
-    # Here, as it takes a while to import and few have a use for it.
+    # Imported here: the import is slow and rarely needed.
     from torchrl.objectives.llm import DistillationLoss, GRPOLoss, SFTLoss
 
     name = type(loss).__name__
@@ -71,11 +71,11 @@ def check_reads_next(loss: LossModule) -> None:
         loss (LossModule): the loss.
 
     Raises:
-        TypeError: it reads nothing that follows.
+        TypeError: the loss reads no next state.
     """
     in_keys = getattr(loss, "in_keys", [])
     name = getattr(loss, "_parts", (type(loss),))[-1].__name__  # without its regularizers
-    # Demonstrations have next states, which behavior cloning alone does not read.
+    # Demonstrations have next states, although behavior cloning does not read them.
     reads_next = any(isinstance(key, tuple) and key[0] == "next" for key in in_keys)
     if in_keys and not (reads_next or isinstance(loss, BCLoss)):
         raise TypeError(
@@ -91,21 +91,21 @@ def find_transitions(
     *,
     labels: bool = False,
 ) -> dict[NestedKey, tuple[Tensor, Tensor]]:
-    """The states that networks read, with their successors; both without a gradient.
+    """Finds the states that networks read and their successors, detached.
 
-    Inputs without a successor (goals) are not among them.
+    Inputs without a successor, such as goals, are left out.
 
     Args:
         tensordict (TensorDictBase): the batch, ``[*B]``.
-        states (Mapping): the keys of the states that each network reads, by its name.
-        labels (bool): also inputs that are not floating point, such as masks and labels.
+        states (Mapping): keys of the states that each network reads, by the network's name.
+        labels (bool): whether to include inputs that are not floating point, such as masks.
 
     Returns:
-        dict: by their keys, states and successors, each ``[*B, *F]``.
+        dict: pairs of state and successor by key, ``[*B, *F]`` each.
 
     Raises:
-        TypeError: a network reads no floating-point state, or its successor is none.
-        ValueError: a successor has another shape than its state.
+        TypeError: a network reads no floating-point state, or a successor is not floating point.
+        ValueError: a successor and its state have different shapes.
         KeyError: no state that a network reads has a successor.
     """
     keys = dict.fromkeys(key for read in states.values() for key in read)
@@ -133,18 +133,18 @@ def find_transitions(
 def find_states(
     tensordict: TensorDictBase, keys: Iterable[NestedKey], network: str
 ) -> dict[NestedKey, Tensor]:
-    """The floating-point states that a network reads, without a gradient, whatever follows them.
+    """Finds the floating-point states that a network reads, detached.
 
     Args:
         tensordict (TensorDictBase): the batch, ``[*B]``.
-        keys: of the states that it reads.
-        network (str): its name.
+        keys: keys of the states that the network reads.
+        network (str): name of the network.
 
     Returns:
-        dict: by their keys, ``[*B, *F]``.
+        dict: states by key, ``[*B, *F]``.
 
     Raises:
-        TypeError: none of them is floating point.
+        TypeError: no state is floating point.
     """
     keys = list(keys)
     if not keys:
@@ -165,22 +165,22 @@ def find_states(
 
 
 def finite_successor(state: Tensor, successor: Tensor) -> Tensor:
-    """The successor, with the state's own coordinates where it is not finite, as at some ends.
+    """Replaces coordinates of a successor that are not finite by the state's coordinates.
 
-    In the state's precision, which the network takes.
+    The result has the state's precision, which the network expects.
     """
     successor = successor.to(state.dtype)
     return torch.where(successor.isfinite(), successor, state)
 
 
 def as_masked(value: Tensor, tensordict: TensorDictBase, mask_keys: Iterable[NestedKey]) -> Tensor:
-    """A number of each transition, ``[*B]``, as one of each agent where a mask is of agents.
+    """Expands numbers per transition, ``[*B]``, to numbers per agent if a mask has agents.
 
     Args:
-        value (Tensor): ``[*B, ...]``.
+        value (Tensor): the numbers, ``[*B, ...]``.
         tensordict (TensorDictBase): the batch, ``[*B]``.
-        mask_keys (Iterable of NestedKey): where masks may lie in it, ``[*B, ...]`` or with a last
-            dimension of 1 behind.
+        mask_keys (Iterable of NestedKey): possible keys of masks, ``[*B, ...]`` or
+            ``[*B, ..., 1]``.
     """
     for mask in (tensordict.get(key, None) for key in mask_keys):
         if mask is not None:
@@ -192,8 +192,8 @@ def as_masked(value: Tensor, tensordict: TensorDictBase, mask_keys: Iterable[Nes
 
 
 def next_key(key: NestedKey) -> NestedKey:
-    """Where the successor of an entry lies."""
-    # Not by unravel_key, which Dynamo leaves out.
+    """The key of an entry's successor."""
+    # Not unravel_key: Dynamo does not support it.
     return ("next", *key) if isinstance(key, tuple) else ("next", key)
 
 
@@ -211,23 +211,23 @@ def _check_successor(key: NestedKey, state: Tensor, successor: Tensor) -> None:
 
 
 def is_floating_point(value: object) -> bool:
-    """Whether an entry of a batch is a tensor of floating-point numbers."""
+    """Checks whether an entry of a batch is a floating-point tensor."""
     return isinstance(value, Tensor) and value.is_floating_point()
 
 
 def read_taken(tensordict: TensorDictBase, key: NestedKey, otherwise: str = "") -> Tensor:
-    """What was done, or how likely it was, as it is in a batch: without a gradient.
+    """Reads actions, or their log-likelihoods, from a batch, detached.
 
-    A rollout may have kept that of the policy which made it. In a likelihood ratio it would cancel
-    the gradient of the policy that is trained.
+    A rollout may have kept the gradient of the behavior policy. In a likelihood ratio it would
+    cancel the gradient of the trained policy.
 
     Args:
         tensordict: the batch.
-        key: of the entry.
-        otherwise: what else can be done where there is none.
+        key: key of the entry.
+        otherwise: another remedy, for the error message.
 
     Raises:
-        KeyError: there is none.
+        KeyError: the batch has no such entry.
     """
     if (entry := tensordict.get(key, None)) is None:
         raise KeyError(f"the batch has no {key!r}: keep it{otherwise}.")
@@ -237,15 +237,15 @@ def read_taken(tensordict: TensorDictBase, key: NestedKey, otherwise: str = "") 
 def draw_rows(
     tensordict: TensorDictBase, fraction: float, device: torch.device | None = None
 ) -> Tensor | None:
-    """A random share of a batch, with torch's global generator: no row twice, each as likely.
+    """Draws rows of a batch uniformly without replacement, with torch's global generator.
 
     Args:
         tensordict (TensorDictBase): the batch, ``[*B]``.
-        fraction (float): its share, in (0, 1]; rounded to whole rows, at least one.
-        device (torch.device, optional): of the batch's tensors.
+        fraction (float): share of the rows, in (0, 1]; rounded to whole rows, at least one.
+        device (torch.device, optional): device of the result.
 
     Returns:
-        Tensor: ``[M]``, in the batch written as one row; ``None`` stands for all of them.
+        Tensor: indices in the flattened batch, ``[M]``; ``None`` for all rows.
     """
     count = tensordict.numel()
     drawn = max(1, round(fraction * count))
@@ -255,18 +255,18 @@ def draw_rows(
 
 
 def spread_rows(value: Tensor, rows: Tensor, shape: torch.Size) -> Tensor:
-    """Numbers of some rows, as numbers of the whole batch with the same expectation.
+    """Spreads numbers of drawn rows over the whole batch, with the same expectation.
 
-    Drawn rows stand for the others: they count ``B / M`` times, the others 0. That leaves the
-    expectation of every sum and mean over the batch as it is, with weights and masks or without.
+    Drawn rows are multiplied by ``B / M``, the others are 0. The expectation of every sum and mean
+    over the batch stays the same, with or without weights and masks.
 
     Args:
-        value (Tensor): ``[M, ...]``.
-        rows (Tensor): ``[M]``, in the batch written as one row.
-        shape (torch.Size): of the batch, ``[*B]``.
+        value (Tensor): numbers of the drawn rows, ``[M, ...]``.
+        rows (Tensor): indices in the flattened batch, ``[M]``.
+        shape (torch.Size): shape of the batch, ``[*B]``.
 
     Returns:
-        Tensor: ``[*B, ...]``.
+        Tensor: numbers of all rows, ``[*B, ...]``.
     """
     count, rest = shape.numel(), value.shape[1:]
     spread = value.new_zeros(count, *rest)
@@ -275,7 +275,7 @@ def spread_rows(value: Tensor, rows: Tensor, shape: torch.Size) -> Tensor:
 
 
 def at_rows(tensordict: TensorDictBase, rows: Tensor, dim: int = 0) -> TensorDictBase:
-    """Some rows of a batch ``[*B]``, behind ``dim`` other dimensions, written as one row."""
+    """Selects rows of a batch by indices in the flattened batch, behind ``dim`` dimensions."""
     if tensordict.ndim > dim + 1:
         tensordict = tensordict.flatten(dim, tensordict.ndim - 1)
     return tensordict[:, rows] if dim else tensordict[rows]

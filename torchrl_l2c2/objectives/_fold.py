@@ -1,4 +1,4 @@
-"""Where penalties belong among a loss's own terms, and checks that a training loop uses them."""
+"""Folding of penalties into a loss's own terms, and checks that a training loop uses them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ POLICY_LOSSES = ("loss_actor", "loss_objective", "loss_bc")
 """Keys of the term that trains the policy."""
 
 ALTERNATIVE_LOSSES = ("loss_actor_bc",)
-"""Keys of a term that loops use instead of the policy's: cloning in the first steps of CQL."""
+"""Keys of terms that loops use instead of the policy's term, such as CQL's cloning phase."""
 
 # The loss of a value function, by the name of its network; longer names first.
 VALUE_LOSSES = {
@@ -26,7 +26,7 @@ VALUE_LOSSES = {
     "value": ("loss_value", "loss", "loss_qvalue"),
 }
 
-# Methods that loops call instead of forward: what they train, and the key of what they return.
+# Methods that loops call instead of forward: the network they train, and the key of their result.
 PARTS: dict[str, tuple[str, tuple[str, ...]]] = {
     "actor_loss": ("policy", POLICY_LOSSES),
     "loss_actor": ("policy", POLICY_LOSSES),
@@ -41,19 +41,19 @@ PARTS: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 
 PATIENCE = 50
-"""Calls of a loss after which what is missing in its training loop is reported."""
+"""Calls of a loss before it warns of mistakes in the training loop."""
 
 
 def fold_targets(term: str, trains_policy: bool, own: Iterable[str]) -> list[str]:
-    """The terms of a loss that a penalty is added to.
+    """Finds the loss's own terms to which a penalty is added.
 
     Args:
-        term: the penalty's key, such as ``"loss_l2c2_qvalue"``, which ends with its network.
-        trains_policy: whether it trains the policy.
-        own: the keys of the loss's own output.
+        term: key of the penalty, such as ``"loss_l2c2_qvalue"``, which ends with its network.
+        trains_policy: whether the penalty trains the policy.
+        own: keys of the loss's own output.
 
     Raises:
-        TypeError: there is none, or it is not known which.
+        TypeError: there is no such term, or the choice is ambiguous.
 
     Examples:
         >>> fold_targets("loss_caps_spatial", True, ["loss_objective", "loss_critic"])
@@ -86,10 +86,10 @@ def fold_targets(term: str, trains_policy: bool, own: Iterable[str]) -> list[str
 
 
 def add_penalty(own: Tensor, penalty: Tensor, key: str) -> Tensor:
-    """The sum of a loss's own term and a penalty, which have one shape or can be made to.
+    """Adds a penalty to a loss's own term.
 
     Raises:
-        ValueError: without a reduction, they have different shapes.
+        ValueError: without a reduction, the shapes differ.
     """
     if own.ndim == penalty.ndim + 1 and own.shape[-1] == 1 and penalty.ndim:
         penalty = penalty.unsqueeze(-1)
@@ -104,13 +104,13 @@ def add_penalty(own: Tensor, penalty: Tensor, key: str) -> Tensor:
 def make_part(
     method: Callable[..., Any], kind: str, targets: tuple[str, ...]
 ) -> Callable[..., Any]:
-    """A method such as ``actor_loss`` that includes the penalty where this is folded.
+    """Wraps a method such as ``actor_loss`` so that it includes a folded penalty.
 
     Args:
-        method: of the class of the loss.
+        method: method of the loss's class.
         kind: ``"policy"`` or ``"value"``.
-        targets: keys of the loss's own output that it may return the term of; the first counts
-            that the loss has.
+        targets: possible keys of the term that the method returns; the first key that the loss has
+            is used.
     """
 
     @functools.wraps(method)
@@ -132,7 +132,7 @@ def make_part(
                 metadata[key] = term
             elif returned in fold_targets(key, kind == "policy", own):
                 if value.ndim and not term.ndim and self._term_reduction == "sum":
-                    term = term / value.numel()  # The loop sums what this method did not reduce.
+                    term = term / value.numel()  # The loop sums the unreduced values.
                 value = add_penalty(value, self._folded_value(key, term), str(returned))
                 metadata["penalty_" + key.removeprefix("loss_")] = term.detach()
         return (value, *rest) if isinstance(out, tuple) else value
@@ -141,10 +141,10 @@ def make_part(
 
 
 class TermWatch:
-    """Notices, in eager calls, what a training loop leaves out; warns once of each.
+    """Warns, once each and in eager calls, of mistakes in a training loop.
 
     Attributes:
-        progress_set: whether a ramp was moved.
+        progress_set: whether the progress of a ramp was set.
         pending: added terms that were never differentiated; ``None`` before the first call.
     """
 
@@ -190,12 +190,12 @@ class TermWatch:
         return self.pending or set() if self._forwards > 1 else set()
 
     def see_regularizer(self, loss: Any) -> None:
-        """Notices that a loop computes the terms itself."""
+        """Records that a loop computes the terms itself."""
         if not is_compiling() and loss._evaluation.forward_pass is None:
             self._warned.add("parts")
 
     def see_part(self, loss: Any, kind: str) -> None:
-        """Counts a call of ``actor_loss`` or ``value_loss``, which lack separate terms."""
+        """Counts a call of ``actor_loss`` or ``value_loss`` without the added terms."""
         policy = bool(loss.policy_terms)
         has_terms = policy if kind == "policy" else bool(loss.added_terms - loss._policy_side)
         if is_compiling() or not has_terms or "parts" in self._warned:
@@ -211,7 +211,7 @@ class TermWatch:
             )
 
     def see_counts(self, name: str, counts: Tensor) -> None:
-        """Looks for next observations that are not finite."""
+        """Warns of next observations that are not finite."""
         self._counted += 1
         if "counts" in self._warned or (counts.is_cuda and self._counted % 100 != 1):
             return

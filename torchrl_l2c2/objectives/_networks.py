@@ -25,14 +25,14 @@ from torchrl_l2c2.objectives._batch import at_rows
 from torchrl_l2c2.objectives._specialize import LossMixin
 
 POLICY_NETWORK = "actor_network"
-"""The name under which losses hold their policy."""
+"""Name of a loss's attribute with the policy."""
 
 VALUE_NETWORKS = ("critic_network", "qvalue_network", "value_network", "local_value_network")
-"""The names under which losses hold their value functions."""
+"""Names of a loss's attributes with value functions."""
 
 RECURRENT = (LSTMModule, GRUModule, nn.RNNBase, nn.RNNCellBase)
 
-# The vector of an ensemble, or of all actions, comes before the one number made of it.
+# The vector of an ensemble, or of all actions, comes before the scalar computed from it.
 _VALUE_KEYS = ("value_heads", "state_action_value", "action_value", "value")
 
 
@@ -44,13 +44,14 @@ class NetworkSpec:
         inputs: entries of the batch that the evaluation reads.
         states: the inputs that are observations.
         trunk: inputs that are hidden outputs of the policy network.
-        trains_trunk: whether gradients of the network's own term reach the policy through these.
-        output: the value of a value function, or the action of a policy.
+        trains_trunk: whether gradients of the network's own term reach the policy through the
+            trunk.
+        output: key of the value, or of a policy's action.
         stochastic: whether the policy is a distribution.
-        has_buffers: whether it keeps running statistics.
-        rowwise: whether a row of the output depends on the same row of the input only, and on no
+        has_buffers: whether the network keeps running statistics.
+        rowwise: whether a row of the output depends only on the same row of the input, and on no
             random numbers.
-        has_dropout: whether it has dropout layers.
+        has_dropout: whether the network has dropout layers.
     """
 
     inputs: tuple[NestedKey, ...]
@@ -69,10 +70,11 @@ def inspect_network(loss: LossModule, network: str) -> NetworkSpec:
 
     Args:
         loss (LossModule): the loss.
-        network (str): its name, such as ``"actor_network"``.
+        network (str): name of the network, such as ``"actor_network"``.
 
     Raises:
-        TypeError: it is recurrent, does not declare its keys, or has several distributions.
+        TypeError: the network is recurrent, does not declare its keys, or has several
+            distributions.
     """
     net, actor = getattr(loss, network), getattr(loss, POLICY_NETWORK, None)
     _check_declares_keys(net, network)
@@ -105,20 +107,20 @@ def inspect_network(loss: LossModule, network: str) -> NetworkSpec:
 
 
 def _unnamed_action(loss: LossModule, actor: Any, made: set[NestedKey]) -> NestedKey:
-    """What a deterministic policy acts with, by a loss that does not name it."""
+    """Guesses the action key of a deterministic policy whose loss does not name it."""
     networks: list[Any] = [getattr(loss, name, None) for name in VALUE_NETWORKS]
     read = {key for network in networks if network is not None for key in network.in_keys}
     written: list[NestedKey] = list(actor.out_keys)
-    # What a policy hands on to the values beside its action, such as a trunk, it writes before.
+    # Other outputs that value functions read, such as a trunk, come before the action.
     found = [key for key in written if key in made & read]
     return "action" if "action" in found else (found or written)[-1]
 
 
 def _trains_trunk(loss: LossModule, network: str) -> bool:
-    """Whether a value function trains the policy by its hidden outputs in the plain loss.
+    """Checks whether the base loss trains the policy through hidden outputs that a value reads.
 
-    That is where the loss evaluates the policy before, in the same batch; others read what the
-    batch holds.
+    This is the case if the loss evaluates the policy first. Other losses read the hidden outputs
+    from the batch.
     """
     of_values = isinstance(loss, IQLLoss) and network == "value_network"
     whole = not getattr(loss, "separate_losses", False)
@@ -126,7 +128,7 @@ def _trains_trunk(loss: LossModule, network: str) -> bool:
 
 
 def _is_private(key: NestedKey) -> bool:
-    """Whether it is TorchRL's own bookkeeping, such as the noise matrix of gSDE."""
+    """Checks whether a key is internal to TorchRL, such as the noise matrix of gSDE."""
     return (key if isinstance(key, str) else key[-1]).startswith("_")
 
 
@@ -136,7 +138,7 @@ def _action_keys(loss: LossModule) -> list[NestedKey]:
 
 
 def _value_key(loss: LossModule, network: str) -> NestedKey | None:
-    # A network's name does not tell what it is: a value_network is V, Q or a vector of Q.
+    # The attribute's name is ambiguous: a value_network is V, Q or a vector of Q.
     keys = (getattr(loss.tensor_keys, name, None) for name in _VALUE_KEYS)
     written = getattr(loss, network).out_keys
     return next((key for key in keys if key and unravel_key(key) in written), None)
@@ -176,7 +178,7 @@ def _check_declares_keys(net: nn.Module, name: str) -> None:
 
 def _check_not_recurrent(net: Any, name: str) -> None:
     recurrent = any(isinstance(module, RECURRENT) for module in net.modules())
-    # What it hands on to the next step.
+    # A network that writes its own next input is recurrent, too.
     written = {unravel_key(key) for key in net.out_keys}
     handed_on = any(unravel_key(("next", key)) in written for key in net.in_keys)
     if recurrent or handed_on or "is_init" in net.in_keys:
@@ -188,37 +190,38 @@ def _check_not_recurrent(net: Any, name: str) -> None:
 
 
 def parameters_of(loss: LossModule, network: str) -> TensorDictBase | None:
-    """The parameters that a loss keeps beside a network; ``None``: in it."""
+    """The parameters that a loss stores separately from a network; ``None`` if in the network."""
     return getattr(loss, f"{network}_params", None) if loss.functional else None
 
 
 Policy = Distribution | Tensor
-"""A policy at some states: a distribution or, where it is deterministic, its actions."""
+"""A policy at some states: a distribution or, for a deterministic policy, its actions."""
 
 ONE_PASS_STATES = 256
-"""Up to so many states, a batch and the other states share a pass over a network when compiled.
+"""Largest batch that a compiled loss evaluates in one pass with the other states.
 
-There a pass through a small network costs what calling it costs; in larger batches arithmetic
-decides, and two passes stay nearer to the caches.
+In small batches the cost of a pass is the cost of the call. In larger batches arithmetic dominates,
+and two passes use the caches better.
 """
 
 
 @dataclass
 class ForwardPass:
-    """What one forward pass of a loss has evaluated and made so far."""
+    """Cache of one forward pass of a loss."""
 
     at_batch: dict[str, TensorDictBase] = field(default_factory=dict)
-    """A network's outputs at the batch's states, ``[*B]``."""
+    """Outputs at the batch's states, ``[*B]``, by network."""
     at_others: dict[str, tuple[TensorDictBase, TensorDictBase]] = field(default_factory=dict)
-    """Other states, ``[K, *B]``, and a network's outputs there, with an ensemble's dimension."""
+    """Other states, ``[K, *B]``, and outputs there, by network."""
     made: dict[str, Any] = field(default_factory=dict)
-    """What regularizers make once for all their terms."""
+    """Results that the terms of a regularizer share, by name."""
 
 
 class EvaluatedNetworks:
-    """The networks of a loss that are evaluated, and what a forward pass shares of it.
+    """Evaluates the networks of a loss, with a cache for each forward pass.
 
-    Methods take the loss itself, so that this object, one of its attributes, does not refer back.
+    Methods take the loss as an argument: this object is an attribute of the loss and must not refer
+    back to it.
 
     Args:
         specs (dict, optional): specs of networks that were inspected before.
@@ -231,17 +234,17 @@ class EvaluatedNetworks:
 
     @property
     def forward_pass(self) -> ForwardPass | None:
-        """What this thread's forward pass shares; ``None`` outside of one."""
+        """The cache of this thread's forward pass; ``None`` outside of a forward pass."""
         return self._forward_passes.get(_thread())
 
     def begin_forward_pass(self) -> ForwardPass | None:
-        """From here on evaluations are shared; the pass that this one lies in, to end it with."""
+        """Starts sharing evaluations; returns the outer pass, for :meth:`end_forward_pass`."""
         outer = self.forward_pass
         self._forward_passes[_thread()] = ForwardPass()
         return outer
 
     def end_forward_pass(self, outer: ForwardPass | None) -> None:
-        """What was shared is forgotten; the outer pass goes on, if a loss called itself."""
+        """Clears the cache, and restores the outer pass if a loss called itself."""
         if outer is None:
             del self._forward_passes[_thread()]
         else:
@@ -260,10 +263,10 @@ class EvaluatedNetworks:
         states: TensorDictBase,
         rows: Tensor | None = None,
     ) -> tuple[Policy, Policy]:
-        """The policy at the batch's states and at others, both ``[K, *B]``.
+        """Evaluates the policy at the batch's states and at other states, both ``[K, *B]``.
 
-        With ``rows``, ``[M]``, at these of the batch's states, written as one row, and at others in
-        their place, ``[K, M]``; likewise for the values.
+        With ``rows``, indices ``[M]`` in the flattened batch, it evaluates only these states and
+        the other states, ``[K, M]``. The same holds for :meth:`values_at`.
         """
         actor, spec = getattr(loss, POLICY_NETWORK), self.specs[POLICY_NETWORK]
         keys = actor.dist_params_keys if spec.stochastic else [spec.output]
@@ -278,10 +281,7 @@ class EvaluatedNetworks:
         states: TensorDictBase,
         network: str = POLICY_NETWORK,
     ) -> Policy:
-        """The policy at other states alone, ``[K, *B]``, by a pass that nothing else shares.
-
-        Or a network that was copied from it, by its name: a regularizer's own.
-        """
+        """Evaluates the policy, or a copy, at other states only, ``[K, *B]``, without the cache."""
         rows = self._rows(POLICY_NETWORK, tensordict, states, with_batch=False)
         if network == POLICY_NETWORK:
             self._check_repeatable(loss, network, rows)
@@ -297,10 +297,10 @@ class EvaluatedNetworks:
         states: TensorDictBase,
         rows: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """A value function at the batch's states, ``[1, *B, ...]``, and at others, ``[K, ...]``."""
+        """A value function at the batch's states, ``[1, *B, ...]`` and at others, ``[K, *B, ...]``."""
         key = self.specs[network].output
         if key is None:
-            # Not earlier: set_keys may come after the wrapping, as after the making of any loss.
+            # Not earlier: set_keys may be called after the wrapping.
             raise ValueError(
                 f"{network} writes {list(getattr(loss, network).out_keys)}, and none of it is a "
                 f"value to this loss, whose keys are {loss.tensor_keys}: name it with set_keys."
@@ -316,11 +316,11 @@ class EvaluatedNetworks:
         evaluate: Callable[[str, TensorDictBase], TensorDictBase],
         known_states: Callable[[TensorDictBase], TensorDictBase | None],
     ) -> TensorDictBase:
-        """Evaluates a network as the loss does, and keeps the result for the forward pass.
+        """Evaluates a network as the loss does, and caches the result for the forward pass.
 
-        Not of inputs that hang on an encoder, which a regularizer does not train. Compiled, small
-        batches are evaluated together with the other states, where these are known by now: that
-        differs by rounding, and so it is left to where compiling does anyway.
+        Results are not cached if the inputs have a gradient: a regularizer does not train encoders.
+        Compiled losses evaluate small batches together with the other states, if these are known.
+        This changes the rounding, as compiling does; eager losses do not do it.
         """
         spec = self.specs.get(network)
         if self.forward_pass is None or spec is None or _requires_grad(tensordict, spec.inputs):
@@ -349,7 +349,7 @@ class EvaluatedNetworks:
         policy: Distribution = getattr(loss, POLICY_NETWORK).build_dist_from_params(outputs)
         separate = len(policy.batch_shape) > outputs.batch_dims and not policy.event_shape
         if separate and not policy.has_enumerate_support:
-            return Independent(policy, 1)  # Its actions' dimensions, as of torch's plain Normal.
+            return Independent(policy, 1)  # The action's dimensions, as with torch's Normal.
         return policy
 
     def _fits_one_pass(self, network: str, tensordict: TensorDictBase) -> bool:
@@ -370,7 +370,7 @@ class EvaluatedNetworks:
         """A network's outputs at the batch's states, ``[1, *B]``, and at others, ``[K, *B]``."""
         shared = self.forward_pass
         if shared is None or autocast_at(states):
-            shared = ForwardPass()  # What the loss has evaluated is rounded.
+            shared = ForwardPass()  # The loss's own evaluation is rounded.
         spec, known = self.specs[network], shared.at_batch.get(network)
         dim, num = int(is_ensemble(loss, network)), len(states)
         if chosen is not None:
@@ -390,10 +390,10 @@ class EvaluatedNetworks:
         return known.select(*keys).unsqueeze(dim), _split(out, dim, [num], tensordict)[0]
 
     def _check_repeatable(self, loss: LossModule, network: str, rows: TensorDictBase) -> None:
-        """Refuses a network that draws random numbers: once, at the first eager evaluation.
+        """Refuses a network that draws random numbers; checks the first eager evaluation only.
 
-        The distance of two evaluations would measure these numbers, also where the states are
-        equal. Dropout is off by now; noise that a layer keeps between calls does no harm.
+        The distance between two evaluations would measure these numbers, even at equal states.
+        Dropout is off here. Noise that a layer keeps between calls is harmless.
 
         Raises:
             TypeError: two evaluations of the same states differ.
@@ -424,9 +424,9 @@ class EvaluatedNetworks:
     def _rows(
         self, network: str, tensordict: TensorDictBase, states: TensorDictBase, with_batch: bool
     ) -> TensorDictBase:
-        """A network's inputs at the batch's states and at the others: ``[(1 + K) * B0, ...]``."""
+        """A network's inputs at the batch's and the other states, ``[(1 + K) * B0, ...]``."""
         spec, batch = self.specs[network], tensordict.batch_size
-        # The batch's action may still hang on the policy that made it.
+        # The batch's action may have a gradient of the behavior policy.
         inputs = tensordict.select(*spec.inputs, strict=False).detach()
         moved = {key: states.get(key, None) for key in spec.inputs}
         moved = {key: state for key, state in moved.items() if state is not None}
@@ -448,10 +448,10 @@ class EvaluatedNetworks:
         parameters = net.parameters() if params is None else params.values(True, True)
         rows = as_parameters(rows.select(*net.in_keys, strict=False), parameters)
         if spec is not None and spec.has_buffers:
-            # Running statistics are the loss's own: spare copies take the update.
+            # Copies take the update of running statistics, which belong to the loss.
             params = TensorDict.from_module(net) if params is None else params
             params = params.apply(lambda p: p if p.requires_grad else p.clone())
-        policy = spec is None or network == POLICY_NETWORK  # or a copy of it, which has no spec
+        policy = spec is None or network == POLICY_NETWORK  # a copy of the policy has no spec
         run = net.get_dist_params if policy and self.specs[POLICY_NETWORK].stochastic else net
         dropout_off = without_dropout(net) if spec is None or spec.has_dropout else nullcontext()
         exploration = set_exploration_type(loss.deterministic_sampling_mode)
@@ -475,7 +475,7 @@ def _requires_grad(tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> boo
 
 
 def is_ensemble(loss: LossModule, network: str) -> bool:
-    """Whether the loss has expanded a network's parameters to those of several."""
+    """Checks whether the loss has expanded a network to an ensemble."""
     params = parameters_of(loss, network)
     return params is not None and params.ndim > 0
 
@@ -483,7 +483,7 @@ def is_ensemble(loss: LossModule, network: str) -> bool:
 def _split(
     out: TensorDictBase, dim: int, parts: list[int], tensordict: TensorDictBase
 ) -> tuple[TensorDictBase, ...]:
-    """Outputs at rows, by what the rows are: ``[part, *B]``, behind ``dim`` other dimensions."""
+    """Splits outputs into parts ``[part, *B]``, behind ``dim`` other dimensions."""
     if tensordict.batch_size:
         # Explicit sizes: an inferred one does not compile.
         out = out.unflatten(dim, (sum(parts), tensordict.batch_size[0]))
@@ -491,19 +491,17 @@ def _split(
 
 
 def _thread() -> int:
-    # get_ident does not compile, and need not: a pass begins and ends while it is traced.
+    # get_ident does not compile; it is not needed, as a pass begins and ends within a trace.
     return 0 if is_compiling() else get_ident()
 
 
 class SharedEvaluation(LossMixin):
     """A loss that evaluates its networks at the batch's states through one method.
 
-    A loss that inherits from this class, and evaluates its networks with
-    :meth:`evaluate_at_batch`, is spared a second evaluation by every regularizer around it:
-    :class:`RegularizedLoss` overrides the method, keeps what it returns until the forward pass is
-    done, and evaluates the network at the other states alone. :class:`PPORPELoss` is such a loss.
-
-    A loss that does not inherit from it works as well; its networks are evaluated once more.
+    It saves time: :class:`RegularizedLoss` overrides :meth:`evaluate_at_batch`, caches the result
+    for the forward pass, and evaluates the network at the other states only. To use it, inherit
+    from this class and evaluate the networks with :meth:`evaluate_at_batch`, as :class:`PPORPELoss`
+    does. Other losses also work, with one more evaluation of their networks.
 
     Examples:
         >>> from torchrl.objectives import DDPGLoss
@@ -520,34 +518,33 @@ class SharedEvaluation(LossMixin):
     """
 
     def evaluate_at_batch(self, network: str, tensordict: TensorDictBase) -> TensorDictBase:
-        """What a network writes, or the parameters of its distribution, at the batch's states.
+        """Evaluates a network at the batch's states.
 
-        Must depend on the given tensordict alone: compiled, it may be called with the rows of
-        other states beside those of the batch.
+        The result must depend only on the given tensordict: when compiled, the method may be called
+        with rows of the batch and of other states together.
 
         Args:
-            network (str): its name, such as ``"actor_network"``.
+            network (str): name of the network, such as ``"actor_network"``.
             tensordict (TensorDictBase): the batch, ``[*B]``.
 
         Returns:
-            TensorDictBase: the outputs, ``[*B]``; for a stochastic policy what
-            ``get_dist_params`` returns.
+            TensorDictBase: the outputs, ``[*B]``; for a stochastic policy, the result of
+            ``get_dist_params``.
         """
         raise NotImplementedError
 
 
 def autocast_at(tensordict: TensorDictBase) -> str | None:
-    """The kind of device of these entries, such as ``"cuda"``, if autocast is on there."""
+    """The device type of the entries, such as ``"cuda"``, if autocast is on; else ``None``."""
     kinds = {value.device.type for value in tensordict.values(True, True)}
     return next((kind for kind in kinds if torch.is_autocast_enabled(kind)), None)
 
 
 def in_full_precision(tensordict: TensorDictBase) -> AbstractContextManager[object]:
-    """A context without autocast on the device of these entries.
+    """A context without autocast on the device of the entries.
 
-    A regularizer compares outputs at states that lie close together. bfloat16 keeps 8 bits of
-    each, so that of a difference of 1 % little is left and of one of 0.1 % nothing but rounding,
-    whose square is larger than that of the difference.
+    A regularizer compares outputs at states that are close together. bfloat16 has 8 bits: a
+    difference of 1% is mostly lost, and a difference of 0.1% is smaller than the rounding error.
     """
     kind = autocast_at(tensordict)
     return nullcontext() if kind is None else torch.autocast(kind, enabled=False)
@@ -555,9 +552,9 @@ def in_full_precision(tensordict: TensorDictBase) -> AbstractContextManager[obje
 
 @contextmanager
 def without_dropout(net: nn.Module) -> Iterator[None]:
-    """A context in which the dropout layers of a network pass everything on.
+    """A context in which the dropout layers of a network are off.
 
-    With dropout, two evaluations of one state differ, and a distance would measure that.
+    With dropout, two evaluations of one state differ, and a distance would measure the difference.
     """
     layers = [m for m in net.modules() if isinstance(m, _DropoutNd) and m.training]
     for layer in layers:
@@ -570,11 +567,11 @@ def without_dropout(net: nn.Module) -> Iterator[None]:
 
 
 def as_parameters(rows: TensorDictBase, parameters: Iterable[Tensor]) -> TensorDictBase:
-    """Inputs in the precision of the parameters, where autocast would have brought both to one."""
+    """Casts inputs to the precision of the parameters, if autocast would have done so."""
     if autocast_at(rows) is None:
         return rows
-    # A list: a generator that is left halfway does not compile.
+    # A list: a partly consumed generator does not compile.
     dtypes = [p.dtype for p in parameters if p.is_floating_point()]
-    # Autocast leaves double precision alone, too.
+    # Autocast does not change double precision either.
     wanted = {torch.float16, torch.bfloat16, torch.float32}
     return rows.apply(lambda v: v.to(dtypes[0]) if dtypes and v.dtype in wanted else v)

@@ -34,7 +34,7 @@ class _WithoutCopies(type(LossModule)):  # type: ignore[misc]
 
 
 class LossMixin(LossModule, metaclass=_WithoutCopies):
-    """A part of losses: ``forward`` is that of the first class that defines one."""
+    """A mixin for losses: ``forward`` comes from the first class that defines it."""
 
 
 class SpecializedLoss(LossMixin):
@@ -44,7 +44,7 @@ class SpecializedLoss(LossMixin):
     ``Extension[type(loss)]``, a subclass of both classes that is made once for each pair. The
     object holds the networks, parameters and buffers of ``loss`` themselves, not copies, and
     ``loss`` stays as it was. When the ``__init__`` of ``Extension`` runs, the object already is the
-    loss: no other constructor is to be called. ``Extension`` defines a ``forward``.
+    loss; do not call another constructor. ``Extension`` defines a ``forward``.
 
     Args:
         base_loss (LossModule): the loss.

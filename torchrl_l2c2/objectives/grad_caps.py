@@ -19,13 +19,13 @@ class SuccessiveMeans(NamedTuple):
     """A policy's means in three successive states of a batch ``[*B]``, or of ``M`` of its rows.
 
     Attributes:
-        before: the means at the states before, ``[*B, A]`` or ``[M, A]``.
+        before: the means at the previous states, ``[*B, A]`` or ``[M, A]``.
         mean: the means at the states.
         later: the means at the next states.
-        batch: the batch, or these rows of it.
-        states_before: the states before, ``[1, *B]`` or ``[1, M]``.
-        counts: which transitions count, ``[*B]`` or ``[M]``.
-        rows: ``[M]``, in the batch written as one row; ``None``: all.
+        batch: the batch, or its chosen rows.
+        states_before: the previous states, ``[1, *B]`` or ``[1, M]``.
+        counts: mask of the transitions that count, ``[*B]`` or ``[M]``.
+        rows: indices of the chosen rows in the flattened batch, ``[M]``; ``None`` for all rows.
     """
 
     before: Tensor
@@ -40,56 +40,57 @@ class SuccessiveMeans(NamedTuple):
 class GradCAPSLoss(RegularizedLoss):
     r"""A loss with the second-order temporal term of Grad-CAPS (arXiv 2407.04315).
 
-    Adds to any TorchRL loss with a policy, as ``loss_grad_caps``,
+    Adds this term, ``loss_grad_caps``, to any TorchRL loss with a policy:
 
     .. math::
         \lambda\, \mathbb E\left[\left\lVert \frac{\mu(s_{t+1}) - 2 \mu(s_t) + \mu(s_{t-1})}
             {\tanh\lvert\mu(s_{t+1}) - \mu(s_{t-1})\rvert + \epsilon} \right\rVert_2^2\right],
 
-    the change of the action's change, by coordinates relative to what the action moved over both
-    steps: a steady motion is free, a zigzag is not. [inferred] The absolute value, which keeps the
-    denominator positive, and that it has a gradient as well.
+    the second difference of the mean action, relative in each coordinate to the change over both
+    steps. A steady motion costs nothing, a zigzag does. [inferred] The denominator has an absolute
+    value, which keeps it positive, and a gradient.
 
-    Batches need the observation before each state, which
-    :class:`~torchrl.envs.transforms.CatFrames` writes::
+    Batches need the observation before each state. Append
+    :class:`~torchrl.envs.transforms.CatFrames` to the environment, after transforms that normalize
+    the observation::
 
         CatFrames(N=2, dim=-1, in_keys=["observation"], out_keys=["frames"])
 
-    appended to the environment, behind what normalizes the observation: the first half of
-    ``frames`` is that observation, in the first step of an episode the state itself (with
-    ``padding="constant"`` zeros, which are taken for it). Or it is an entry of its own, such as the
-    ``"previous_observation"`` that the collectors of this package's experiment keep, named by
-    ``previous_key``. Masks and labels are each state's own; those of the state before, which are
-    not known, are taken to be the state's.
+    The first half of ``frames`` is then the previous observation; in the first step of an episode
+    it is the state itself (or zeros with ``padding="constant"``, which are used as they are). If
+    the batch has the previous observation as a separate entry, such as the
+    ``"previous_observation"`` of this package's experiment, pass its name as ``previous_key``.
+    The previous state is evaluated with the masks and labels of the state, because its own are not
+    in the batch.
 
     Args:
         base_loss (LossModule): the loss; see :class:`RegularizedLoss` for how it is wrapped. Its
-            policy reads one observation, a vector.
+            policy must read a single observation, a vector.
         lambda_temporal (float): :math:`\lambda`, at least 0. Larger values straighten the actions.
             Scheduled as ``grad_caps_lambda_temporal``. Defaults to ``0.01``.
-        epsilon (float): :math:`\epsilon`, greater than 0. Smaller values punish zigzags around one
-            place more. Defaults to ``0.1``.
+        epsilon (float): :math:`\epsilon`, greater than 0. Smaller values penalize zigzags around a
+            constant action more. Defaults to ``0.1``.
 
     Keyword Args:
-        frames_key (NestedKey): the entry that ``CatFrames`` writes. Defaults to ``"frames"``.
-        previous_key (NestedKey, optional): the entry that is the observation before, which is read
-            in the place of frames. Defaults to ``None``.
-        mean (str): ``"loc"`` compares means before the squashing, ``"action"`` deterministic
-            actions. Defaults to ``"loc"``.
-        fraction (float): share of the batch, in (0, 1], whose states are compared, drawn anew each
-            time with torch's global generator. Smaller ones cost less time and memory, pay in large
-            batches, and are noisier; the terms' expectation stays. Defaults to ``1.0``.
-        skip_ends (bool): whether transitions at which an episode ends are left out of the
-            term: for environments whose next observation is the reset state there. Defaults to
+        frames_key (NestedKey): entry that ``CatFrames`` writes. Defaults to ``"frames"``.
+        previous_key (NestedKey, optional): entry with the previous observation, read instead of
+            ``frames_key``. Defaults to ``None``.
+        mean (str): ``"loc"`` compares means before the squashing, ``"action"`` mean actions.
+            Defaults to ``"loc"``.
+        fraction (float): share of the batch, in (0, 1], whose states are compared. Each call draws
+            new rows with torch's global generator. Smaller values save time and memory in large
+            batches and make the term noisier; its expectation does not change. Defaults to ``1.0``.
+        skip_ends (bool): whether to leave out transitions that end an episode. Use it for
+            environments that store the reset state as the last next observation. Defaults to
             ``False``.
 
     Raises:
         TypeError: the loss has no policy or cannot be regularized, or an argument has the wrong
             type.
         ValueError: an argument is out of its range; in use, the policy reads several observations,
-            or the frames are not two of them; in the first batch that is not compiled, the second
-            of them is not the state, or the next states are several steps away.
-        KeyError: in use, if the batch has no frames.
+            or the frames are not two observations; in the first eager call, the second frame is not
+            the state, or the next states are several steps away.
+        KeyError: in use, the batch has no previous observation.
 
     Examples:
         >>> import torch
@@ -153,7 +154,7 @@ class GradCAPSLoss(RegularizedLoss):
         return terms.set("grad_caps_counted", counted)
 
     def successive_means(self, tensordict: TensorDictBase) -> SuccessiveMeans:
-        """The policy's means at the states before, the states and the next ones.
+        """The policy's means at the previous states, the states and the next states.
 
         Args:
             tensordict: the batch, ``[*B]``.
@@ -171,7 +172,7 @@ class GradCAPSLoss(RegularizedLoss):
         return SuccessiveMeans(there[0], here[0], there[1], batch, states[:1], counts, rows)
 
     def _states_around(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The state before and the next one, ``[2, *B]``."""
+        """The previous and the next states, ``[2, *B]``."""
         transitions = self.transitions(tensordict, self.policy_networks(), labels=True)
         observations = [key for key, (s, _) in transitions.items() if is_floating_point(s)]
         if len(observations) != 1:
@@ -184,8 +185,8 @@ class GradCAPSLoss(RegularizedLoss):
         before = self._before(tensordict, key, state).detach().to(state.dtype)
         if not (self._grad_caps_checked or torch.compiler.is_compiling()):
             self._check_successive(tensordict, key, state)
-            self._grad_caps_checked = True  # Once, as a GPU would have to be waited for.
-        # Labels of the state before are not known: it has those of the state.
+            self._grad_caps_checked = True  # Once: the check synchronizes with a GPU.
+        # Labels of the previous state are unknown: use the labels of the state.
         states = {
             k: torch.stack((before if k == key else s, finite_successor(s, successor)))
             for k, (s, successor) in transitions.items()
@@ -211,7 +212,7 @@ class GradCAPSLoss(RegularizedLoss):
         return frames[..., : state.shape[-1]]
 
     def _check_successive(self, tensordict: TensorDictBase, key: NestedKey, state: Tensor) -> None:
-        """Refuses states that are not a step apart, or not in the same units."""
+        """Refuses states that are not one step apart or have different units."""
         steps = tensordict.get("steps_to_next_obs", None)
         if steps is not None and (steps > 1).any():
             raise ValueError(
@@ -257,9 +258,9 @@ def grad_caps_term(
         \right\rVert_2^2
 
     Args:
-        before: the policy's means :math:`\mu_-` at the states before.
-        mean: those at the states.
-        later: those at the next states, :math:`\mu_+`.
+        before: the policy's means at the previous states, :math:`\mu_-`.
+        mean: the policy's means at the states, :math:`\mu`.
+        later: the policy's means at the next states, :math:`\mu_+`.
         epsilon: :math:`\epsilon`, greater than 0.
 
     Examples:

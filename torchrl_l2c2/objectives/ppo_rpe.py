@@ -46,15 +46,15 @@ def penalty_gain(
     threshold: Tensor,  # shape: [] or [*B]
     beta: float,
 ) -> Tensor:  # shape: [*B]
-    r"""The gain at which the loss is stationary just where the ratio meets the threshold.
+    r"""The gain that makes the loss stationary exactly at the threshold.
 
     .. math::
         C = |A| / \big(\epsilon\,((1-\beta) - \mathrm{sgn}(A)\,\beta\epsilon/2)\big)
 
     Args:
         advantage: :math:`A`.
-        threshold: :math:`\epsilon`, allowed :math:`|\rho_R - 1|`, in :math:`(0, 2(1/\beta - 1))`:
-            beyond, the gain is negative. Larger values penalize less.
+        threshold: :math:`\epsilon`, allowed :math:`|\rho_R - 1|`, in :math:`(0, 2(1/\beta - 1))`;
+            outside, the gain is negative. Larger values penalize less.
         beta: as in :func:`relative_density_ratio`.
 
     Examples:
@@ -81,7 +81,7 @@ def actor_loss(
         advantage: :math:`A`, without a gradient.
         ratio: :math:`\rho`, as in :func:`relative_density_ratio`.
         threshold: as in :func:`penalty_gain`.
-        beta: likewise.
+        beta: as in :func:`relative_density_ratio`.
 
     Examples:
         >>> import torch
@@ -121,24 +121,24 @@ def update_deviation(
     reading: Literal["max", "ema"],
     mask: Tensor | None = None,  # shape: [*B]
 ) -> tuple[Tensor, Tensor]:  # shape: [], []
-    r"""The batch's deviation of the ratio, and :math:`\Delta`, to which the threshold is set.
+    r"""The batch's deviation of the ratio, and :math:`\Delta`, which sets the threshold.
 
     With ``reading="max"``, :math:`\Delta \leftarrow \max(\Delta_{\min}, \delta\Delta,
     \max|\rho_R - 1|)`; with ``"ema"``, :math:`\Delta \leftarrow \max(\Delta_{\min}, \delta\Delta +
     (1 - \delta)\,\mathrm{mean}|\rho_R - 1|)` [inferred].
 
     Args:
-        largest: :math:`\Delta` before.
-        relative_ratio: :math:`\rho_R`, without a gradient. NaN counts as no deviation: it shows in
-            the losses, and must not stay in a running maximum as well.
+        largest: the previous :math:`\Delta`.
+        relative_ratio: :math:`\rho_R`, without a gradient. NaN counts as no deviation, so that the
+            running maximum stays finite; the losses show it.
         decay: :math:`\delta`, in ``[0, 1]``. Smaller values forget large deviations sooner.
         floor: :math:`\Delta_{\min}`, greater than 0.
-        reading: how batches are summed up.
-        mask: which of the batch count; ``None``: all.
+        reading: ``"max"`` or ``"ema"``, as above.
+        mask: mask of the transitions that count; ``None`` for all.
 
     Returns:
-        The largest or, with ``"ema"``, mean :math:`|\rho_R - 1|` of the batch; and :math:`\Delta`
-        after it.
+        The maximum or, with ``"ema"``, the mean of :math:`|\rho_R - 1|` over the batch; and the
+        updated :math:`\Delta`.
 
     Examples:
         >>> import torch
@@ -164,12 +164,12 @@ def importance_weight(
     reading: Literal["max", "mean"],
     mask: Tensor | None = None,  # shape: [*B]
 ) -> Tensor:  # shape: [*B]
-    r"""The weights of prioritized replay over their largest, or over their mean [inferred].
+    r"""The weights of prioritized replay, divided by their maximum or mean [inferred].
 
     Args:
-        weight: as the replay buffer gives them, at least 0.
-        reading: what they are divided by.
-        mask: which of the batch count; ``None``: all.
+        weight: weights from the replay buffer, at least 0.
+        reading: the divisor, ``"max"`` or ``"mean"``.
+        mask: mask of the transitions that count; ``None`` for all.
 
     Examples:
         >>> import torch
@@ -181,7 +181,7 @@ def importance_weight(
         return weight / (weight.max() if reading == "max" else weight.mean())
     kept = torch.where(mask, weight, 0.0)
     divisor = kept.max() if reading == "max" else kept.sum() / mask.sum().clamp_min(1)
-    # Where nothing counts, 0 / 0 would be a gradient of NaN behind a loss of 0.
+    # If nothing counts, 0 / 0 would give a loss of 0 a gradient of NaN.
     return kept / divisor.clamp_min(torch.finfo(kept.dtype).tiny)
 
 
@@ -189,10 +189,10 @@ def of_each_transition(
     log_ratio: Tensor,  # shape: [*B] or [*B, 1]
     advantage: Tensor,  # shape: [*B]
 ) -> Tensor:  # shape: [*B]
-    """A log-likelihood as one number for each transition, as its advantage is.
+    """The log-likelihood in the shape of the advantage, one number per transition.
 
     Raises:
-        ValueError: it is one for each of several actions.
+        ValueError: it has one number for each of several actions.
     """
     if log_ratio.shape == (*advantage.shape, 1):
         return log_ratio.squeeze(-1)
@@ -205,18 +205,17 @@ def of_each_transition(
     return log_ratio
 
 
-# exp(20) is far beyond any ratio that the loss treats differently (the relative ratio is within
-# 1e-8 of its end there) and far below what overflows when it is squared in float32.
+# At exp(20) the relative ratio is within 1e-8 of its limit, and the square fits float32.
 MAX_LOG_RATIO = 20.0
 
 
 class PPORPELoss(SharedEvaluation):
     r"""Proximal policy optimization with relative Pearson divergence, one-step actor-critic.
 
-    The divergence between the learned policy :math:`\pi` and the one that acted, :math:`b`, is
-    measured on the *relative* density ratio, which is bounded, and the gain of the penalty is set
-    so that the loss is stationary exactly at the threshold (Kobayashi, "Proximal policy
-    optimization with relative Pearson divergence", arXiv:2010.03290):
+    The divergence between the learned policy :math:`\pi` and the behavior policy :math:`b` is
+    measured on the *relative* density ratio, which is bounded. The gain of the penalty makes the
+    loss stationary exactly at the threshold (Kobayashi, "Proximal policy optimization with relative
+    Pearson divergence", arXiv:2010.03290):
 
     .. math::
         \rho_R &= \rho / (1 - \beta + \beta\rho), \quad \rho = \pi(a|s) / b(a|s) \\
@@ -225,26 +224,26 @@ class PPORPELoss(SharedEvaluation):
         L_V &= \tfrac12 \textstyle\sum_k (y - V_k(s))^2, \quad
         y = r + \gamma (1 - \mathrm{terminated}) \bar V(s')
 
-    with :math:`A = y - V(s)` detached, :math:`\bar V` the mean of the target critic's heads and
-    the threshold :math:`\epsilon = \kappa\Delta`. Both terms are multiplied by the importance
-    weights of prioritized replay where the batch has them, divided by the batch's largest (Schaul
-    et al., arXiv:1511.05952), and ``|A|`` is written as the new priority.
+    Here :math:`A = y - V(s)` is detached, :math:`\bar V` is the mean of the target critic's heads
+    and :math:`\epsilon = \kappa\Delta` is the threshold. If the batch has importance weights of
+    prioritized replay, both terms are multiplied by them, divided by their maximum (Schaul et al.,
+    arXiv:1511.05952). ``|A|`` is written as the new priority.
 
-    [inferred] Only the abstracts of the algorithm's papers could be read, so these are settings:
-    all heads share one target; ``threshold``, ``critic_weighting``, ``baseline`` and
-    ``importance`` each have the reading that was seen to work as their default. Of ``reduction``
-    the default is TorchRL's mean; the experiment's is ``"sum"``, for :class:`~.AdaTerm`'s ``eps``.
+    [inferred] Only the abstracts of the algorithm's papers were available. All heads share one
+    target. ``threshold``, ``critic_weighting``, ``baseline`` and ``importance`` are settings, and
+    their defaults are the variants that worked. ``reduction`` defaults to the mean, as in TorchRL;
+    the experiment uses ``"sum"``, which suits ``eps`` of :class:`~.AdaTerm`.
 
     Args:
-        actor_network (ProbabilisticTensorDictSequential): the policy. A target copy is kept.
-        critic_network (TensorDictModule): writes ``state_value`` ``[*B, 1]`` and, where it is an
-            ensemble, ``state_value_heads`` ``[*B, heads]``, whose mean is ``state_value``.
-            A target copy is kept.
+        actor_network (ProbabilisticTensorDictSequential): the policy. The loss keeps a target copy.
+        critic_network (TensorDictModule): the value function. Writes ``state_value`` ``[*B, 1]``
+            and, for an ensemble, ``state_value_heads`` ``[*B, heads]``, whose mean is
+            ``state_value``. The loss keeps a target copy.
 
     Keyword Args:
         gamma (float): discount in ``[0, 1)``. Larger values look further ahead. Default 0.99.
         kappa (float): share of the largest deviation of the ratio that is allowed, above 0.
-            Smaller values keep the policy nearer to the one that acted. Default 0.5.
+            Smaller values keep the policy closer to the behavior policy. Default 0.5.
         beta (float): mixture of the relative ratio, in ``(0, 1)``. At 0.5 the ratio is symmetric
             about 1; larger values bound it more tightly. Default 0.5.
         decay (float): decay of :math:`\Delta` per update, in ``[0, 1]``. Smaller values forget
@@ -253,25 +252,25 @@ class PPORPELoss(SharedEvaluation):
         threshold (str): ``"max"``: :math:`\Delta` is a decaying maximum of
             :math:`|\rho_R - 1|` over batches; ``"ema"``: an exponential moving average of its
             batch mean. [inferred] Default ``"max"``.
-        critic_weighting (str): ``"ratio"`` multiplies :math:`L_V` with the detached
+        critic_weighting (str): ``"ratio"`` multiplies :math:`L_V` by the detached
             :math:`\rho_R`; ``"none"`` does not. [inferred] Default ``"none"``.
-        baseline (str): ``"stored"``: :math:`b` is the likelihood stored when the action was taken;
-            ``"target"``: the target policy's likelihood now. [inferred] Default ``"stored"``.
-        importance (str): what the importance weights of prioritized replay are divided by:
-            ``"max"``, the batch's largest, so that they only scale the loss down; ``"mean"``, their
-            mean, as TorchRL's own losses do, which leaves the loss at full strength beside a
-            regularizer. [inferred] Default ``"max"``.
-        reduction (str): ``"mean"``, ``"sum"`` or ``"none"``; over a batch a sum is ``B`` times the
-            mean, a regularizer's terms included. Default ``"mean"``.
+        baseline (str): source of :math:`b`: ``"stored"``, the likelihood stored with the action, or
+            ``"target"``, the current likelihood of the target policy. [inferred] Default
+            ``"stored"``.
+        importance (str): divisor of the importance weights of prioritized replay: ``"max"``, the
+            largest weight in the batch, which only scales the loss down; or ``"mean"``, as in
+            TorchRL's losses, which keeps the loss at full strength relative to a regularizer.
+            [inferred] Default ``"max"``.
+        reduction (str): ``"mean"``, ``"sum"`` or ``"none"``, also for the terms of a regularizer. A
+            sum is ``B`` times the mean. Default ``"mean"``.
 
     Raises:
-        TypeError: a setting of another type.
-        ValueError: a setting outside its range, or a threshold so wide that :math:`C` could
+        TypeError: a setting has the wrong type.
+        ValueError: a setting is out of its range, or the threshold is so wide that :math:`C` could
             change its sign.
 
-    .. note:: ``delta`` is a persistent buffer: it travels with the ``state_dict``, and stays as it
-        is in ``eval()`` mode. Likelihood ratios are limited to ``exp(20)`` either way, so that no
-        float32 overflows.
+    .. note:: ``delta`` is a persistent buffer, part of the ``state_dict``. It does not change in
+        ``eval()`` mode. Likelihood ratios are clamped to ``[exp(-20), exp(20)]`` to avoid overflow.
 
     Examples:
         >>> import torch
@@ -370,9 +369,9 @@ class PPORPELoss(SharedEvaluation):
         self.baseline = baseline
         self.importance = importance
         self.reduction = reduction
-        # A concrete device, so that the buffer follows the networks' without asking for one.
+        # A concrete device: the buffer follows the device of the networks.
         self.register_buffer("delta", torch.tensor(delta_min, device=self._default_device))
-        # Now, and not at the first batch: it is a part of the state_dict.
+        # Now, not at the first batch: it is part of the state_dict.
         self.make_value_estimator()
         self._in_keys: list[NestedKey] | None = None
         self._out_keys: list[NestedKey] | None = None
@@ -408,7 +407,7 @@ class PPORPELoss(SharedEvaluation):
     def make_value_estimator(
         self, value_type: ValueEstimators | str | None = None, **hyperparams: float
     ) -> PPORPELoss:
-        """Builds the value estimator; only TD(0) is right for replayed single transitions."""
+        """Builds the value estimator. Only TD(0) is correct for replayed single transitions."""
         dispatch_value_estimator(
             self,
             value_type or self.default_value_estimator,
@@ -452,7 +451,7 @@ class PPORPELoss(SharedEvaluation):
             loss_critic = loss_critic * relative_ratio
 
         weight = self._maybe_get_priority_weight(tensordict)
-        if weight is not None:  # One of shape [*B, 1] would be spread over pairs of transitions.
+        if weight is not None:  # A weight of shape [*B, 1] would broadcast to pairs of transitions.
             weight = importance_weight(weight.reshape(advantage.shape), self.importance, mask)
             loss_actor, loss_critic = weight * loss_actor, weight * loss_critic
         return TensorDict(
@@ -465,27 +464,27 @@ class PPORPELoss(SharedEvaluation):
         )
 
     def _reduce_loss(self, loss: Tensor, tensordict: TensorDictBase, **kwargs: Any) -> Tensor:
-        """Only regularizers give weights: with a mean of 1 their gain is that beside any mean."""
+        """Reduces a term. Weights come from regularizers only, and get a mean of 1."""
         weights = kwargs.get("weights")
-        if weights is not None and kwargs["reduction"] != "mean":  # A mean divides by it anyway.
+        if weights is not None and kwargs["reduction"] != "mean":  # A mean normalizes already.
             kwargs["weights"] = importance_weight(weights, "mean", self._mask(tensordict, weights))
         return super()._reduce_loss(loss, tensordict, **kwargs)
 
     def _mask(self, tensordict: TensorDictBase, like: Tensor) -> Tensor | None:
-        """Which transitions count, of the shape of a tensor; ``None``: all."""
+        """The mask of transitions that count, in the shape of a tensor; ``None`` for all."""
         if not any(tensordict.get(key, None) is not None for key in self._loss_mask_keys()):
             return None
         return self._reduce_loss(torch.ones_like(like), tensordict, reduction="none") > 0
 
     def evaluate_at_batch(self, network: str, tensordict: TensorDictBase) -> TensorDictBase:
-        """What a network writes at the batch's own states; a regularizer reads it here as well."""
+        """Evaluates a network at the batch's states; regularizers reuse the result."""
         net = getattr(self, network)
         run = net.get_dist_params if network == "actor_network" else net
         with getattr(self, f"{network}_params").to_module(net):
             return run(tensordict.select(*net.in_keys))
 
     def _values(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """The heads ``[*B, K]`` and their mean ``[*B, 1]``; one head where there is no ensemble."""
+        """The heads ``[*B, K]`` and their mean ``[*B, 1]``; one head without an ensemble."""
         written = self.evaluate_at_batch("critic_network", tensordict)
         value = written.get(self.tensor_keys.value)
         heads = written.get(self.tensor_keys.value_heads, None)
@@ -507,7 +506,7 @@ class PPORPELoss(SharedEvaluation):
         states = tensordict.select(*self.actor_network.in_keys)
         with torch.no_grad(), self.target_actor_network_params.to_module(self.actor_network):
             baseline = self.actor_network.get_dist(states).log_prob(action)
-        return log_prob - baseline  # Out here: the policy's own gradient is kept.
+        return log_prob - baseline  # Outside of no_grad: keeps the policy's gradient.
 
     @torch.no_grad()
     def _update_threshold(

@@ -1,4 +1,4 @@
-"""The protocol for regularizers: a TorchRL loss with further terms."""
+"""The base class of regularizers: a TorchRL loss with additional terms."""
 
 from __future__ import annotations
 
@@ -43,59 +43,58 @@ from torchrl_l2c2.objectives._specialize import SpecializedLoss
 Made = TypeVar("Made")
 
 GAIN = "regularizer_gain"
-"""The coefficient of every regularized loss that multiplies all its added terms."""
+"""Name of the coefficient that multiplies all added terms of a regularized loss."""
 
 PROGRESS = "regularizer_progress"
-"""The share of training that is over, where the gain follows it."""
+"""Name of the buffer with the completed share of training, for a ramp."""
 
 
 class RegularizedLoss(SpecializedLoss, SharedEvaluation):
-    r"""A TorchRL loss with further terms: the base class of every regularizer of this package.
+    r"""A TorchRL loss with additional terms: the base class of all regularizers.
 
     ``Regularizer(loss, ...)`` returns an instance of ``Regularizer[type(loss)]``, a subclass of
-    both classes that is made once for each pair. It is a full member of the loss's class: updaters,
-    ``set_keys``, ``select_out_keys``, scheduled coefficients, ``deepcopy`` and checkpoints work as
-    before, and its ``state_dict`` has the keys of the base loss (plus the networks of a regularizer
-    such as :class:`ASAPLoss`, and the progress of a ramp). It holds the networks, parameters and
-    buffers of ``loss`` themselves, not copies, and ``loss`` stays the base loss. From then on,
-    rename keys, choose value estimators, move, cast or compile the regularized loss.
+    both classes that is made once for each pair. Updaters, ``set_keys``, ``select_out_keys``,
+    scheduled coefficients, ``deepcopy`` and checkpoints work as before. The ``state_dict`` has the
+    keys of the base loss (plus the networks of a regularizer such as :class:`ASAPLoss`, and the
+    progress of a ramp). The regularized loss shares networks, parameters and buffers with ``loss``,
+    which stays unchanged. After wrapping, call ``set_keys``, ``make_value_estimator``, ``to`` and
+    ``torch.compile`` on the regularized loss.
 
-    ``forward`` returns the loss's own terms, unchanged (compiled: up to rounding), and the terms of
-    the regularizer, for the training loop to sum. After :meth:`fold`, which
-    :func:`~torchrl_l2c2.smooth` calls, they are part of the loss's own terms instead.
+    ``forward`` returns the loss's own terms, unchanged (up to rounding if compiled), and the
+    regularizer's terms, for the training loop to sum. After :meth:`fold`, which
+    :func:`~torchrl_l2c2.smooth` calls, the penalty is part of the loss's own terms instead.
 
     A regularizer is a subclass that defines ``__init__`` and one or both of
     :meth:`policy_regularizer` and :meth:`value_regularizer`. When its ``__init__`` runs, the object
-    already is the loss: no other constructor is called. ``__init__`` declares what is added, with
-    :meth:`declare_networks`, :meth:`declare_terms` and :meth:`register_coefficient`; the two
-    methods compute it, with :meth:`policies_at`, :meth:`values_at`, :meth:`transitions`,
-    :meth:`reduce_term` and :meth:`scaled`. Regularizers can be applied to one another's results.
+    already is the loss; do not call another constructor. ``__init__`` declares the terms with
+    :meth:`declare_networks`, :meth:`declare_terms` and :meth:`register_coefficient`. The two
+    methods compute the terms with :meth:`policies_at`, :meth:`values_at`, :meth:`transitions`,
+    :meth:`reduce_term` and :meth:`scaled`. Regularizers can be nested.
 
-    .. note:: Losses that are not trained on transitions, and recurrent policies, are refused.
-        Regularizers evaluate networks without dropout. A network that draws random numbers in its
-        forward pass is refused at its first evaluation. Running statistics of normalization layers
-        are left alone.
+    .. note:: Recurrent policies and losses that are not trained on transitions are refused, as is a
+        network that draws random numbers in its forward pass (at its first evaluation).
+        Regularizers evaluate networks without dropout, and do not update running statistics of
+        normalization layers.
 
     Args:
         base_loss (LossModule): the loss.
 
     Attributes:
-        regularizer_gain (Tensor): multiplies all added terms, at least 0; 1 unless assigned to.
-            Larger values regularize more; 0 leaves the base loss's values and gradients. It can be
-            assigned to at any time, also between calls of a compiled loss.
-        policy_terms (frozenset of str): the ``loss_*`` keys of all regularizers applied that train
-            the policy.
-        auxiliary_terms (frozenset of str): the keys of terms that train networks of the
-            regularizers' own.
-        added_terms (frozenset of str): all ``loss_*`` keys of all regularizers applied.
+        regularizer_gain (Tensor): factor of all added terms, at least 0; initially 1. Larger values
+            regularize more; 0 leaves the base loss's values and gradients unchanged. Assign to it
+            at any time, also between calls of a compiled loss.
+        policy_terms (frozenset of str): the added ``loss_*`` keys that train the policy.
+        auxiliary_terms (frozenset of str): the added ``loss_*`` keys that train networks of a
+            regularizer, such as a predictor.
+        added_terms (frozenset of str): all added ``loss_*`` keys.
 
     Raises:
-        TypeError: the loss cannot be regularized, or already is by this regularizer.
+        TypeError: the loss cannot be regularized, or has this regularizer already.
 
     Warns:
-        UserWarning: in use, once each: an added term that is never differentiated; next
-            observations that are not finite; a ramp that :meth:`set_progress` never moved; keys or
-            a value estimator of the base loss that changed after the wrapping.
+        UserWarning: in use, once each: an added term is never differentiated; next observations are
+            not finite; :meth:`set_progress` is never called for a ramp; or keys or the value
+            estimator of the base loss change after the wrapping.
 
     Examples:
         >>> import torch
@@ -131,8 +130,8 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
 
     _inputs: tuple[NestedKey, ...] = ()
     _followed: tuple[str, ...] = ()
-    _evaluation = EvaluatedNetworks()  # Every loss has its own, made with it.
-    # The last values; tensors, as they are shared where the gains are.
+    _evaluation = EvaluatedNetworks()  # Replaced for each loss in __new__.
+    # The last values, as tensors: shared memory then covers both them and the gains.
     _coefficients: Mapping[str, Tensor] = MappingProxyType({})
     _diagnostics: tuple[str, ...] = ()
     _folded: bool = False
@@ -157,7 +156,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
 
     @classmethod
     def _made_methods(cls, original: type[LossModule]) -> dict[str, Any]:
-        """Methods such as ``actor_loss`` that loops may call instead of ``forward``."""
+        """Makes the methods that loops may call instead of ``forward``, such as ``actor_loss``."""
         return {
             name: make_part(getattr(original, name), kind, targets)
             for name, (kind, targets) in PARTS.items()
@@ -165,7 +164,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         }
 
     def set_keys(self, **kwargs: NestedKey | None) -> None:
-        """As for the loss itself; the inputs of the regularizer follow."""
+        """Sets keys as for the base loss, and updates the regularizer's inputs."""
         super().set_keys(**kwargs)
         self._inspect(self._evaluation.specs)
 
@@ -174,13 +173,13 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         """Computes the loss's own terms and the regularizer's.
 
         Args:
-            tensordict (TensorDictBase): the batch, as the loss itself takes it.
+            tensordict (TensorDictBase): the batch, as for the base loss.
 
         Returns:
-            TensorDict: the loss's own output with the regularizer's terms and diagnostics added. If
-            the penalty is folded, it is part of the loss's own terms, and is reported under
-            ``penalty_*`` instead of ``loss_*``; without gradients (``torch.no_grad()``) it is then
-            not computed: the own terms are the base loss's, and the regularizer's entries are NaN.
+            TensorDict: the base loss's output with the regularizer's terms and diagnostics. A
+            folded penalty is part of the loss's own terms and is reported as ``penalty_*`` instead
+            of ``loss_*``. Under ``torch.no_grad()`` a folded penalty is not computed: the terms are
+            the base loss's terms, and the regularizer's entries are NaN.
         """
         if self._folded and not torch.is_grad_enabled():
             terms = super().forward(tensordict)
@@ -190,7 +189,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             return terms
         outer = self._evaluation.begin_forward_pass()
         try:
-            # The loss's own draws come first: at one seed its terms are those of the base loss.
+            # The base loss draws its random numbers first: with one seed its terms stay the same.
             terms = super().forward(tensordict)
             added = self.policy_regularizer(tensordict)
             added.update(self.value_regularizer(tensordict))
@@ -208,7 +207,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         return terms
 
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The terms that train the policy, with their diagnostics; empty if there are none.
+        """Computes the terms that train the policy, and their diagnostics.
 
         Args:
             tensordict (TensorDictBase): the batch that ``forward`` or ``actor_loss`` takes.
@@ -217,7 +216,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         return TensorDict()
 
     def value_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The terms that train the value functions, with their diagnostics.
+        """Computes the terms that train the value functions, and their diagnostics.
 
         Args:
             tensordict (TensorDictBase): the batch that ``forward`` or ``value_loss`` takes.
@@ -230,11 +229,11 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
     def fold(self) -> RegularizedLoss:
         """Makes the penalty part of the loss's own terms.
 
-        A term that trains the policy is added to ``loss_actor`` or ``loss_objective``, a term that
-        trains a value function to the loss of that function (``loss_qvalue``, ``loss_critic``,
-        ...), in ``forward`` and in methods such as ``actor_loss`` and ``value_loss``. Loops that
-        sum terms by name, and loops that sum every ``loss_*`` key, then train with the regularizer.
-        The penalty is reported as ``penalty_*``, without a gradient.
+        Policy terms are added to ``loss_actor`` or ``loss_objective``, value terms to the loss of
+        their value function (``loss_qvalue``, ``loss_critic``, ...). This applies to ``forward``
+        and to methods such as ``actor_loss`` and ``value_loss``. Loops that sum terms by name, or
+        sum all ``loss_*`` keys, then train with the regularizer. The penalty is reported as
+        ``penalty_*``, without a gradient.
 
         Returns:
             The loss itself.
@@ -262,7 +261,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         return self
 
     def _rename_out_keys(self, names: Mapping[str, str]) -> None:
-        """Renames entries of ``out_keys``; a selection of them stays one."""
+        """Renames entries of ``out_keys``, and keeps a selection of them."""
         selected = [names.get(key, key) for key in self.out_keys]
         self.reset_out_keys()
         self.out_keys = [names.get(key, key) for key in self.out_keys]
@@ -275,19 +274,19 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         return self._folded
 
     def ramp(self, length: float = 1.0, *, end: float = 1.0) -> RegularizedLoss:
-        r"""Has the gain rise with the progress of training, which :meth:`set_progress` sets.
+        r"""Makes the gain rise linearly with the progress of training.
 
         .. math::
             \mathtt{regularizer\_gain} = \mathtt{end} \cdot \min(1, x / \mathtt{length})
 
-        Until the first call of :meth:`set_progress` the gain is ``end``.
+        :meth:`set_progress` sets the progress :math:`x`. Until its first call the gain is ``end``.
 
         Args:
-            length (float): the share of training after which the gain is ``end``, in (0, 1].
-                Smaller values smooth earlier. Defaults to ``1.0``.
+            length (float): share of training after which the gain is ``end``, in (0, 1]. Smaller
+                values smooth earlier. Defaults to ``1.0``.
 
         Keyword Args:
-            end (float): the last gain, at least 0. Larger values regularize more. Defaults to
+            end (float): final gain, at least 0. Larger values regularize more. Defaults to
                 ``1.0``.
 
         Returns:
@@ -306,18 +305,18 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         return self
 
     def set_progress(self, progress: float) -> None:
-        """Says how much of training is over; moves the gain of a ramp.
+        """Sets the progress of training, which sets the gain of a :meth:`ramp`.
 
-        Call it after every rollout or episode. It does nothing for a loss without a :meth:`ramp`.
-        It works between calls of a compiled loss, and the ``state_dict`` of the loss keeps it.
+        Call it after every rollout or episode. It has no effect on a loss without a ramp. It works
+        between calls of a compiled loss. The ``state_dict`` contains the progress.
 
         Args:
-            progress (float): the share of training that is over, from 0 to 1. The last batch may go
-                beyond: values up to 2 count as 1.
+            progress (float): completed share of training, from 0 to 1. Values from 1 to 2 count as
+                1, because the last rollout may exceed the total.
 
         Raises:
-            TypeError: it is not a number.
-            ValueError: it is below 0, or above 2: a number of frames instead of a share.
+            TypeError: the progress is not a number.
+            ValueError: the progress is below 0 or above 2 (such as a number of frames).
 
         Examples:
             >>> import torch
@@ -360,7 +359,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
 
     @property
     def _policy_side(self) -> frozenset[str]:
-        """Terms that train the policy, or a predictor of the regularizer's own."""
+        """Keys of terms that train the policy or a predictor."""
         return self.policy_terms | self.auxiliary_terms
 
     def _add_penalties(self, terms: TensorDictBase, added: TensorDictBase) -> None:
@@ -376,7 +375,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             terms.set(penalty_key(key), value.detach())
 
     def _folded_value(self, key: str, term: Tensor) -> Tensor:
-        """A term as it is added: only its gradient, if it trains the regularizer's own network."""
+        """A term as it is added to another: an auxiliary term adds its gradient but no value."""
         return term - term.detach() if key in self.auxiliary_terms else term
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -388,7 +387,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             number = as_number(name, value)
             check_real(name, number, at_least=0)
         except (TypeError, ValueError):
-            if value is self._buffers.get(name):  # ``-=`` has written it by now.
+            if value is self._buffers.get(name):  # ``-=`` has already changed the buffer.
                 value.detach_().copy_(self._coefficients[name])
             raise
         if name not in self._buffers:
@@ -429,14 +428,20 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         lines.append(f"folded={self._folded}, skip_ends={self.skip_ends}, ramp={self._ramp}")
         return "\n".join(lines)
 
-    # For who writes a regularizer: declarations, made in __init__.
+    # Declarations, for the __init__ of a regularizer.
 
     def declare_networks(self, networks: Iterable[str], *, successors: bool = True) -> None:
-        """Declares which networks, by their names, are evaluated; with successors at next states.
+        """Declares the networks that the regularizer evaluates.
+
+        Args:
+            networks: names of the networks.
+
+        Keyword Args:
+            successors: whether they are also evaluated at next states.
 
         Raises:
-            TypeError: one is recurrent, does not declare its keys, or has several distributions;
-                the loss reads no successors; or a string in the place of a list.
+            TypeError: a network is recurrent, does not declare its keys, or has several
+                distributions; the loss reads no next states; or ``networks`` is a string.
             ValueError: the loss has no network of that name.
         """
         networks = listed_names(networks)
@@ -450,10 +455,13 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         self._inspect([*self._evaluation.specs, *networks])
 
     def declare_policy(self, *, successors: bool = True) -> None:
-        """Declares that the policy is evaluated; with successors at next states.
+        """Declares that the regularizer evaluates the policy.
+
+        Keyword Args:
+            successors: whether the policy is also evaluated at next states.
 
         Raises:
-            TypeError: the loss has none, or as :meth:`declare_networks`.
+            TypeError: the loss has no policy, or as for :meth:`declare_networks`.
         """
         networks = self.policy_networks()
         if not networks:
@@ -462,7 +470,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         self.declare_networks(networks, successors=successors)
 
     def declare_inputs(self, keys: Iterable[NestedKey]) -> None:
-        """Declares entries of the batch that are read beside states and their successors."""
+        """Declares further entries of the batch that the regularizer reads."""
         self._inputs = (*self._inputs, *keys)
         self._inspect(self._evaluation.specs)
 
@@ -474,18 +482,18 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         auxiliary: Iterable[str] = (),
         diagnostics: Iterable[str] = (),
     ) -> None:
-        """Declares what the two methods return; adds it to ``out_keys``, in the order given.
+        """Declares the keys that the two methods return, and appends them to ``out_keys``.
 
         Keyword Args:
             policy: ``loss_*`` keys of terms that train the policy, for ``policy_terms``.
-            value: ``loss_*`` keys of terms that train value functions alone.
-            auxiliary: ``loss_*`` keys of terms that train networks of the regularizer's own, for
+            value: ``loss_*`` keys of terms that train only value functions.
+            auxiliary: ``loss_*`` keys of terms that train networks of the regularizer, for
                 ``auxiliary_terms``.
-            diagnostics: other keys, of entries that train nothing.
+            diagnostics: keys of other entries, without the prefix ``loss_``.
 
         Raises:
-            TypeError: a string in the place of a list of them.
-            ValueError: a key has the beginning of another kind, or is one of the loss's.
+            TypeError: an argument is a string instead of a list.
+            ValueError: a key has the wrong prefix, or the loss has the key already.
         """
         policy, value, auxiliary, diagnostics = map(
             listed_names, (policy, value, auxiliary, diagnostics)
@@ -505,19 +513,20 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         self.added_terms = self.added_terms.union(policy, others)
 
     def register_coefficient(self, name: str, value: float, used: bool = True) -> None:
-        """Makes a gain, a buffer of shape ``[]`` that can be assigned to later on.
+        """Registers a gain, a buffer of shape ``[]`` that can be assigned to later.
 
-        Not persistent: the ``state_dict`` is to keep the keys of the plain loss's.
+        The buffer is not persistent: the ``state_dict`` keeps the keys of the base loss.
 
         Args:
-            name: the attribute.
-            value: a finite number of at least 0, or a tensor of one, now and whenever it is
-                assigned to.
-            used: whether there is a term that it scales. If not, assigning to it is an error.
+            name: name of the attribute.
+            value: a finite number of at least 0, or a tensor with a single such number. Later
+                assignments have the same range.
+            used: whether the gain scales a term. If not, assigning to it is an error.
 
         Raises:
-            TypeError: the value is no number.
-            ValueError: it is negative or not finite, or the loss has something of that name.
+            TypeError: the value is not a number.
+            ValueError: the value is negative or not finite, or the loss has an attribute of that
+                name.
         """
         if name in self._coefficients or hasattr(self, name):
             raise ValueError(f"the loss has {name!r} already: choose another name.")
@@ -529,26 +538,27 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             self.register_buffer(name, gain, persistent=False)
 
     def scaled(self, term: Tensor, *names: str, auxiliary: bool = False) -> Tensor:
-        """A term times its gains and ``regularizer_gain``; these may change before ``backward``.
+        """Multiplies a term by its gains and ``regularizer_gain``.
+
+        The gains may change before ``backward``.
 
         Args:
             term: a reduced term.
-            *names: registered coefficients.
-            auxiliary: whether the term trains a network of the regularizer's own, which
-                ``regularizer_gain`` leaves alone.
+            *names: names of registered coefficients.
+            auxiliary: whether the term is auxiliary. ``regularizer_gain`` does not apply to it.
         """
-        # Autograd keeps the factor, and an assignment writes into the gain itself.
+        # Autograd keeps the factor, and an assignment would change it in place.
         for name in (*names, *(() if auxiliary else (GAIN,))):
             term = term * self._buffers[name].clone()
         return term
 
     @property
     def networks(self) -> dict[str, NetworkSpec]:
-        """The declared networks by name, with the keys of their inputs and outputs."""
+        """The inputs and outputs of the declared networks, by the network's name."""
         return self._evaluation.specs
 
     def policy_networks(self) -> list[str]:
-        """The name of the loss's policy, where it has one."""
+        """The name of the loss's policy in a list; empty without a policy."""
         return [] if getattr(self, POLICY_NETWORK, None) is None else [POLICY_NETWORK]
 
     def value_networks(self) -> list[str]:
@@ -561,26 +571,29 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         ]
 
     def has_stochastic_policy(self) -> bool:
-        """Whether the policy, a declared network, is a distribution; otherwise it is an action."""
+        """Checks whether the policy is a distribution. The policy must be declared."""
         return self.networks[POLICY_NETWORK].stochastic
 
     def is_ensemble(self, network: str) -> bool:
-        """Whether the loss has expanded a network's parameters to those of several."""
+        """Checks whether the loss has expanded a network to an ensemble."""
         return is_ensemble(self, network)
 
-    # For who writes a regularizer: computations, made in the two methods.
+    # Computations, for the two methods of a regularizer.
 
     def transitions(
         self, tensordict: TensorDictBase, networks: Iterable[str], *, labels: bool = False
     ) -> dict[NestedKey, tuple[Tensor, Tensor]]:
-        """The states that networks read, with their successors: keys to pairs of ``[*B, *F]``.
+        """Finds the states that networks read, and their successors.
 
-        Neither has a gradient. Inputs without a successor (goals) are left out.
+        Inputs without a successor, such as goals, are left out.
 
         Args:
             tensordict: the batch, ``[*B]``.
-            networks: names of declared ones.
-            labels: also inputs that are not floating point, such as masks.
+            networks: names of declared networks.
+            labels: whether to include inputs that are not floating point, such as masks.
+
+        Returns:
+            Pairs of state and successor by key, ``[*B, *F]`` each, detached.
 
         Raises:
             TypeError: a network reads no floating-point state.
@@ -590,15 +603,15 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         return find_transitions(tensordict, read, labels=labels)
 
     def policy_states(self, tensordict: TensorDictBase) -> dict[NestedKey, Tensor]:
-        """The floating-point states that the policy reads, ``[*B, *F]`` by their keys.
+        """Finds the floating-point states that the policy reads, ``[*B, *F]`` by key.
 
-        Unlike :meth:`transitions`, also those without a successor, such as goals.
+        Unlike :meth:`transitions`, it includes states without a successor, such as goals.
 
         Args:
             tensordict: the batch, ``[*B]``.
 
         Raises:
-            TypeError: it reads none.
+            TypeError: the policy reads no floating-point state.
         """
         read = self.networks[POLICY_NETWORK].states
         return find_states(tensordict, read, POLICY_NETWORK)
@@ -606,16 +619,17 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
     def policies_at(
         self, tensordict: TensorDictBase, states: TensorDictBase, rows: Tensor | None = None
     ) -> tuple[Policy, Policy]:
-        """The policy at the batch's states and at others, in one evaluation.
+        """Evaluates the policy at the batch's states and at other states, in one pass.
 
         Args:
             tensordict: the batch, ``[*B]``.
-            states: entries that take the place of the batch's, ``[K, *B]``.
-            rows: ``[M]``, of the batch as one row, if these states, ``[K, M]``, are theirs alone.
+            states: the other states, ``[K, *B]``. Entries missing here are read from the batch.
+            rows: indices in the flattened batch, ``[M]``, if ``states`` has only these rows,
+                ``[K, M]``.
 
         Returns:
-            The policy at the one and at the other: distributions ``[K, *B]`` or, where it is
-            deterministic, actions ``[K, *B, A]``.
+            The policy at the batch's states and at the other states: distributions ``[K, *B]``
+            or, for a deterministic policy, actions ``[K, *B, A]``.
         """
         return self._evaluation.policies_at(self, tensordict, states, rows)
 
@@ -625,18 +639,18 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         states: TensorDictBase,
         network: str = POLICY_NETWORK,
     ) -> Policy:
-        """The policy at other states alone.
+        """Evaluates the policy at other states only.
 
-        Its gradients are free of every other evaluation's, so that they may be taken at once, as by
-        a search for states.
+        The evaluation shares no graph with any other, so its gradients can be taken immediately,
+        for example in a search for states.
 
         Args:
             tensordict: the batch, ``[*B]``.
-            states: as for :meth:`policies_at`; the batch's own where these are given.
-            network: the policy, or the name of a copy of it with parameters of its own.
+            states: as for :meth:`policies_at`.
+            network: name of the policy, or of a copy with separate parameters.
 
         Returns:
-            A distribution ``[K, *B]`` or, where it is deterministic, actions ``[K, *B, A]``.
+            A distribution ``[K, *B]`` or, for a deterministic policy, actions ``[K, *B, A]``.
         """
         return self._evaluation.policy_at(self, tensordict, states, network)
 
@@ -647,30 +661,30 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         states: TensorDictBase,
         rows: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """A value function at the batch's states and at others, in one evaluation.
+        """Evaluates a value function at the batch's states and at other states, in one pass.
 
         Args:
-            network: the name of a declared one.
+            network: name of a declared network.
             tensordict: the batch, ``[*B]``. Action values are taken at its actions.
-            states: entries that take the place of the batch's, ``[K, *B]``.
+            states: as for :meth:`policies_at`.
             rows: as for :meth:`policies_at`.
 
         Returns:
-            Values ``[1, *B, ...]`` and ``[K, *B, ...]``, with the ensemble's dimension in front of
-            both where :meth:`is_ensemble`.
+            Values ``[1, *B, ...]`` and ``[K, *B, ...]``. An ensemble (:meth:`is_ensemble`) adds a
+            first dimension to both.
         """
         return self._evaluation.values_at(self, network, tensordict, states, rows)
 
     def known_states(self, tensordict: TensorDictBase) -> TensorDictBase | None:
-        """Other states, ``[K, *B]``, that are in the batch; ``None`` if they are drawn later.
+        """The other states, ``[K, *B]``, if the batch has them; ``None`` if they are drawn later.
 
-        A regularizer that returns here the object that it gives to :meth:`policies_at` and
-        :meth:`values_at` has small batches evaluated in one pass when compiled.
+        If this is the object that the regularizer passes to :meth:`policies_at` and
+        :meth:`values_at`, compiled losses evaluate small batches in one pass.
         """
         return None
 
     def made_once(self, name: str, make: Callable[[], Made]) -> Made:
-        """What ``make()`` gives: in a forward pass once for all who ask by a name, else anew."""
+        """Caches the result of ``make()`` under a name for the forward pass."""
         if (shared := self._evaluation.forward_pass) is None:
             return make()
         if name not in shared.made:
@@ -678,17 +692,17 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         return shared.made[name]
 
     def sample_rows(self, name: str, tensordict: TensorDictBase, fraction: float) -> Tensor | None:
-        """A random share of the rows of a batch, the same in one forward pass for one name.
+        """Draws a random share of a batch's rows, once per forward pass and name.
 
-        Drawn with torch's global generator, no row twice and each as likely.
+        Rows are drawn uniformly without replacement, with torch's global generator.
 
         Args:
-            name: who asks, such as ``"caps"``.
+            name: name of the regularizer, such as ``"caps"``.
             tensordict: the batch, ``[*B]``.
-            fraction: its share, in (0, 1]; rounded to whole rows, at least one.
+            fraction: share of the rows, in (0, 1]; rounded to whole rows, at least one.
 
         Returns:
-            Row numbers ``[M]`` in the batch written as one row; ``None`` stands for all rows.
+            Indices ``[M]`` in the flattened batch; ``None`` for all rows.
         """
         device = self._buffers[GAIN].device
         return self.made_once(f"{name}_rows", lambda: draw_rows(tensordict, fraction, device))
@@ -698,11 +712,11 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         tensordict: TensorDictBase,
         transitions: Mapping[NestedKey, tuple[Tensor, Tensor]],
     ) -> Tensor:
-        """Which transitions count: their next observation is known.
+        """Computes the mask of transitions that count: transitions with a known next observation.
 
-        A next observation that is not finite in any coordinate of an entry is not known. With
-        ``skip_ends``, the next observation of a transition at which an episode ends is not known
-        either (for environments whose ``next`` is the reset state).
+        A next observation is unknown if an entry has no finite coordinate. With ``skip_ends``, it
+        is also unknown if the transition ends an episode (for environments whose ``next`` is the
+        reset state).
 
         Args:
             tensordict: the batch, ``[*B]``.
@@ -722,7 +736,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         return counts if done is None else counts & ~done
 
     def _ends(self, tensordict: TensorDictBase) -> Tensor | None:
-        """Which transitions end an episode, ``[*B]``, if these are left out."""
+        """The mask of transitions that end an episode, ``[*B]``; ``None`` unless ``skip_ends``."""
         if not self.skip_ends:
             return None
         key = next_key(getattr(self.tensor_keys, "done", "done"))
@@ -734,7 +748,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
     def warn_uncounted(self, counts: Tensor) -> None:
         """Warns once if next observations of the batch are not finite; eager only.
 
-        On a GPU only some batches are looked at, as it would have to be waited for.
+        On a GPU only some batches are checked, because the check synchronizes.
         """
         if not is_compiling():
             self._watch.see_counts(type(self).__name__, counts)
@@ -747,20 +761,23 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         rows: Tensor | None = None,
         counts: Tensor | None = None,
     ) -> Tensor:
-        """Reduces as the loss does its own terms: its reduction, masks and priority weights.
+        """Reduces a term like the loss's own terms: same reduction, masks and priority weights.
 
-        Losses that ignore priority weights ignore them here, too. A mean is TorchRL's weighted
-        mean, whose strength does not depend on the weights; a sum is its weighted sum.
-        :class:`PPORPELoss` scales its own terms down by the weights; the terms of a regularizer
-        around it get weights with a mean of 1, and so keep their full gain.
+        Losses that ignore priority weights also ignore them here. ``"mean"`` is TorchRL's weighted
+        mean, which does not scale with the weights; ``"sum"`` is its weighted sum.
+        :class:`PPORPELoss` scales its own terms down by the weights; added terms use weights with a
+        mean of 1 and keep their full gain.
 
         Args:
-            value: ``[*B, ...]``; the term is ``[]`` or, with ``reduction="none"``, like it.
+            value: the term before the reduction, ``[*B, ...]``.
             tensordict: the batch, ``[*B]``.
-            rows: ``[M]``, if ``value`` is ``[M, ...]``, of these rows of the batch written as one
-                row. They stand for all rows: the expectation of the term does not change.
-            counts: which values count, ``[*B]`` or ``[M]``. A mean is taken over these only;
-                others are 0 in a sum or without a reduction.
+            rows: indices in the flattened batch, ``[M]``, if ``value`` has only these rows,
+                ``[M, ...]``. They represent all rows: the expectation of the term does not change.
+            counts: mask of the values that count, ``[*B]`` or ``[M]``. A mean is over these values;
+                in a sum or without a reduction the others are 0.
+
+        Returns:
+            The term, ``[]``; with ``reduction="none"`` in the shape of ``value``.
         """
         weights = None
         if hasattr(self.tensor_keys, "priority_weight"):
@@ -777,7 +794,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
     ) -> Tensor:
         """The unweighted mean over the unmasked batch, detached; with reduction="none" the values.
 
-        Arguments are those of :meth:`reduce_term`.
+        The arguments are the same as for :meth:`reduce_term`.
         """
         reduction = "none" if self._term_reduction == "none" else "mean"
         return self._reduced(value.detach(), tensordict, rows, counts, reduction, None, masked=True)
@@ -810,11 +827,11 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         if reduction != "mean":
             return total
         share = reduce(counted.expand_as(value).to(value.dtype))
-        # Not divided where all count: rounding would change the term.
+        # No division if all count: rounding would change the term.
         return torch.where(counts.all() | (share == 0), total, total / share)
 
     def evaluate_at_batch(self, network: str, tensordict: TensorDictBase) -> TensorDictBase:
-        """As the loss does; kept until ``forward`` is done (see :class:`SharedEvaluation`)."""
+        """Evaluates a network as the loss does, and caches the result for the forward pass."""
         evaluate = super().evaluate_at_batch
         return self._evaluation.at_batch(self, network, tensordict, evaluate, self.known_states)
 
@@ -841,10 +858,10 @@ def penalty_key(term: str) -> str:
 
 
 def listed_names(names: Iterable[str]) -> list[str]:
-    """A list of names; a string alone would be its letters.
+    """Copies names to a list; refuses a string, which would become its letters.
 
     Raises:
-        TypeError: it is a string.
+        TypeError: the names are a string.
     """
     if isinstance(names, str):
         raise TypeError(f"a list of names is wanted, got the string {names!r}: [{names!r}] is one.")

@@ -29,38 +29,40 @@ States = Mapping[NestedKey, Tensor]
 class SR2LLoss(RegularizedLoss):
     r"""A loss with the smoothness-inducing adversarial term of SR2L (Shen et al., 2020).
 
-    Adds to any TorchRL loss with a policy, as ``loss_sr2l``,
+    Adds this term, ``loss_sr2l``, to any TorchRL loss with a policy:
 
     .. math::
         \lambda\, \mathbb E\left[\max_{\lVert \delta \rVert_\infty \le \epsilon}
             D\big(\pi(\cdot|s), \pi(\cdot|s + \delta)\big)\right]
 
-    ("Deep Reinforcement Learning with Robust and Smooth Policy", arXiv 2003.09423). The maximum is
-    sought by projected gradient ascent on the signs, from a random point of the box, with steps of
-    :math:`2.5\,\epsilon` over their number [inferred]. Gradients flow into the policy alone,
-    through both states and not through the search.
+    ("Deep Reinforcement Learning with Robust and Smooth Policy", arXiv 2003.09423). Projected
+    gradient ascent searches for the maximum. It starts at a random point of the box and follows the
+    sign of the gradient, in steps of :math:`2.5\,\epsilon` divided by their number [inferred]. The
+    term trains the policy only, with gradients through both states but not through the search.
 
-    .. note:: ``torch.compile`` does not take it, as the search takes gradients of its own (the
-        experiment's updates are compiled otherwise, and are). It evaluates the policy at the
-        states, at each of its ``steps`` and at their end, and differentiates all of it.
+    .. note:: The loss cannot be passed to ``torch.compile``, because the search takes gradients.
+        (The experiment compiles its updates in another way, and supports it.) The cost is high: the
+        policy is evaluated and differentiated at the states, in each of the ``steps`` and at the
+        point found.
 
     Args:
         base_loss (LossModule): the loss; see :class:`RegularizedLoss` for how it is wrapped.
         epsilon (float): half the width of the box, in the observation's units, greater than 0.
-            Larger values smooth over larger distances; usual are 0.01 to 0.05 of normalized
-            observations. Defaults to ``0.05``.
-        coeff (float): :math:`\lambda`, at least 0. Larger values flatten the policy; usual are 0.03
-            to 0.3. Scheduled as ``sr2l_coeff``. Defaults to ``0.1``.
+            Larger values smooth over larger distances. Typical values are 0.01 to 0.05 for
+            normalized observations. Defaults to ``0.05``.
+        coeff (float): :math:`\lambda`, at least 0. Larger values flatten the policy. Typical values
+            are 0.03 to 0.3. Scheduled as ``sr2l_coeff``. Defaults to ``0.1``.
 
     Keyword Args:
-        steps (int): of the ascent, at least 1. More come nearer to the maximum. Defaults to ``10``.
-        policy_distance (str or callable): :math:`D`. ``"jeffreys"``, the mean of the KL divergences
-            either way, the paper's; or as for :class:`L2C2Loss`. Of deterministic
-            policies half the squared distance of the actions, the paper's but for the half, or with
-            ``"mse"`` their mean squared error. Defaults to ``"jeffreys"``.
-        fraction (float): share of the batch, in (0, 1], whose states are compared, drawn anew each
-            time with torch's global generator. Smaller ones cost less time and memory, pay in large
-            batches, and are noisier; the terms' expectation stays. Defaults to ``1.0``.
+        steps (int): number of ascent steps, at least 1. Larger values come closer to the maximum.
+            Defaults to ``10``.
+        policy_distance (str or callable): :math:`D`. ``"jeffreys"`` (the paper) is the mean of the
+            two KL divergences; the other values are as for :class:`L2C2Loss`. Deterministic
+            policies use half the squared distance of the actions (the paper has no factor
+            one half), or with ``"mse"`` their mean squared error. Defaults to ``"jeffreys"``.
+        fraction (float): share of the batch, in (0, 1], whose states are compared. Each call draws
+            new rows with torch's global generator. Smaller values save time and memory in large
+            batches and make the term noisier; its expectation does not change. Defaults to ``1.0``.
 
     Raises:
         TypeError: the loss has no policy or cannot be regularized, or an argument has the wrong
@@ -132,11 +134,11 @@ class SR2LLoss(RegularizedLoss):
 
 
 def jeffreys_divergence(p: Distribution, q: Distribution) -> Tensor:
-    r"""The mean of the KL divergences either way, :math:`\tfrac12 D(p \Vert q) + \tfrac12 D(q \Vert p)`.
+    r"""The mean of the two KL divergences, :math:`\tfrac12 D(p \Vert q) + \tfrac12 D(q \Vert p)`.
 
     Args:
-        p: one policy, batch shape ``[*B]``.
-        q: the other, of the same actions.
+        p: a policy, batch shape ``[*B]``.
+        q: another policy with the same action space.
 
     Returns:
         The divergences, shape ``[*B]``, at least 0.
@@ -147,23 +149,23 @@ def jeffreys_divergence(p: Distribution, q: Distribution) -> Tensor:
         >>> from torchrl_l2c2.objectives.sr2l import jeffreys_divergence
         >>> jeffreys_divergence(Normal(torch.tensor([3.0]), 1.0), Normal(torch.zeros(1), 1.0))
         tensor([4.5000])
-    """  # noqa: E501
+    """
     return 0.5 * (kl_divergence(p, q) + kl_divergence(q, p))
 
 
 def ascend(
     distance: Callable[[States], Tensor], states: States, epsilon: float, steps: int
 ) -> States:
-    """States in a box around others at which a function is large.
+    """Searches a box around states for the point with the largest distance.
 
     Args:
-        distance: one number, ``[*B]``, for each of the states, differentiable in these.
-        states: by their keys, ``[*B, *F]``.
+        distance: function from states to one number each, ``[*B]``; differentiable.
+        states: states by key, ``[*B, *F]``.
         epsilon: half the width of the box.
-        steps: of the ascent.
+        steps: number of ascent steps.
 
     Returns:
-        The states that were found, without a gradient.
+        The states found, without a gradient.
     """
     moved = {k: s + epsilon * (2.0 * torch.rand_like(s) - 1.0) for k, s in states.items()}
     for _ in range(steps):

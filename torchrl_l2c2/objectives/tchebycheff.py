@@ -1,4 +1,4 @@
-"""Smooth Tchebycheff scalarization: of a loss and its regularizers, the worse one counts most."""
+"""Smooth Tchebycheff scalarization of a loss and its regularizers: the larger one counts most."""
 
 from __future__ import annotations
 
@@ -14,55 +14,55 @@ from torchrl_l2c2._checks import check_real
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
 
 OBJECTIVES = ("loss_actor", "loss_objective", "loss_entropy")
-"""The names under which TorchRL's losses return what trains their policy."""
+"""Names of the policy's terms in TorchRL's losses."""
 
 
 class TchebycheffLoss(RegularizedLoss):
     r"""A regularized loss whose policy is trained by a smooth maximum instead of a sum.
 
-    With :math:`f_1` the sum of the loss's own terms that train the policy and :math:`f_2` that of
-    the regularizers', gains included, the policy descends
+    Let :math:`f_1` be the sum of the loss's own terms that train the policy, and :math:`f_2` the
+    sum of the regularizers' terms, gains included. The policy descends
 
     .. math::
         g = \mu \ln \sum_i e^{(f_i - z_i) / \mu}, \qquad
         \nabla g = \sum_i p_i \nabla f_i, \qquad
         p_i = \frac{e^{(f_i - z_i) / \mu}}{\sum_j e^{(f_j - z_j) / \mu}},
 
-    the smooth Tchebycheff scalarization (arXiv 2402.19078), where without it the policy descends
-    :math:`f_1 + f_2`. A sum reaches the convex parts of a Pareto front alone; this reaches all of
-    it, by the gains. Every term of the policy is returned times its :math:`p_i`, so that the sum of
-    all terms has the gradient of :math:`g`; terms of values stay as they are. ``tchebycheff`` is
-    :math:`g` and ``tchebycheff_share`` is :math:`p_2`, for the log.
+    instead of :math:`f_1 + f_2`: the smooth Tchebycheff scalarization (arXiv 2402.19078). With a
+    sum, the gains reach only the convex parts of a Pareto front; with :math:`g` they reach all of
+    it. Each policy term is multiplied by its :math:`p_i`, so the sum of the returned terms has the
+    gradient of :math:`g`. Value terms are unchanged. Two entries are for the log: ``tchebycheff``
+    is :math:`g`, ``tchebycheff_share`` is :math:`p_2`.
 
-    It goes around the last regularizer: the terms of one around it are added as they are. Loops
-    that call ``policy_regularizer`` themselves, without ``forward``, take the shares from
+    Apply it after all regularizers: the terms of a regularizer applied later are added unweighted.
+    Loops that call ``policy_regularizer`` without ``forward`` must multiply the terms by
     :func:`tchebycheff_shares`.
 
-    .. note:: The loss of an actor has no natural zero: that of SAC or TD3 is minus a value, so that
-        :math:`z_1` has to be about minus the largest value that can be hoped for, and that of PPO
-        is near 0 for good policies and for bad ones, so that :math:`f_2 - z_2` alone decides: the
-        share falls as the policy gets smoother.
+    .. note:: Actor losses have no natural zero. For SAC and TD3 the actor loss is minus a value:
+        set :math:`z_1` to about minus the largest value you expect. For PPO the actor loss is near
+        0 for good and bad policies: only :math:`f_2 - z_2` matters, and the regularizers' share
+        falls as the policy gets smoother.
 
     Args:
-        base_loss (LossModule): a regularized loss, with a term that trains the policy. Its
-            reduction is not ``"none"``.
-        mu (float): :math:`\mu`, greater than 0, in the unit of the losses. Smaller values come
-            nearer to the maximum, where only the worse one counts; larger ones to the plain mean
-            of both, :math:`\mu \ln 2` aside. Defaults to ``1.0``.
-        ideal (pair of float): :math:`z`, the least values that are to be hoped for. Larger
-            :math:`z_1` train the regularizers more. Defaults to ``(0.0, 0.0)``.
+        base_loss (LossModule): a regularized loss with a term that trains the policy. Its
+            reduction must not be ``"none"``.
+        mu (float): :math:`\mu`, greater than 0, in the unit of the losses. Smaller values approach
+            the maximum, where only the larger objective counts; larger values approach the mean of
+            both plus :math:`\mu \ln 2`. Defaults to ``1.0``.
+        ideal (pair of float): :math:`z`, the smallest values you expect. Larger :math:`z_1` train
+            the regularizers more. Defaults to ``(0.0, 0.0)``.
 
     Keyword Args:
-        objectives (str or iterable of str): names of the terms that are :math:`f_1`, among the
-            ``loss_`` entries that train the policy. Of CQL's two losses of the policy name the one
-            that is descended, ``"loss_actor"`` or ``"loss_actor_bc"``. Defaults to those of
+        objectives (str or iterable of str): names of the terms in :math:`f_1`, among the ``loss_``
+            entries that train the policy. CQL has two policy losses: pass the name of the loss that
+            the loop minimizes, ``"loss_actor"`` or ``"loss_actor_bc"``. Defaults to the names in
             ``OBJECTIVES`` that the loss has.
 
     Raises:
-        TypeError: the loss has no regularizer with a term of the policy, or an argument has the
-            wrong type.
-        ValueError: an argument is out of its range, the loss does not have one of the objectives,
-            or it is a regularizer's or, in use, terms are not single numbers.
+        TypeError: the loss has no regularizer with a policy term, or an argument has the wrong
+            type.
+        ValueError: an argument is out of its range, or an objective is not a term of the base loss;
+            in use, terms are not single numbers.
 
     Examples:
         >>> import torch
@@ -117,10 +117,10 @@ class TchebycheffLoss(RegularizedLoss):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """As the loss itself, with the policy's terms times their shares.
+        """Computes the loss, with each policy term times its share.
 
         Args:
-            tensordict (TensorDictBase): the batch, as the loss itself takes it.
+            tensordict (TensorDictBase): the batch, as for the base loss.
         """
         terms = super().forward(tensordict)
         sums = [sum(terms[key] for key in keys) for keys in self._tchebycheff_keys]
@@ -149,7 +149,7 @@ def smooth_tchebycheff(
 
     Args:
         values: :math:`f`, weights included.
-        ideal: :math:`z`, a number for each.
+        ideal: :math:`z`, one number for each value.
         mu: :math:`\mu`, greater than 0.
 
     Examples:
@@ -166,12 +166,12 @@ def tchebycheff_shares(
     ideal: Iterable[float],  # N of them
     mu: float,
 ) -> Tensor:  # shape: [N]
-    """The derivative of :func:`smooth_tchebycheff` by each value: a softmax.
+    r"""The derivative of :func:`smooth_tchebycheff` with respect to each value: a softmax.
 
     Args:
         values: :math:`f`, as for :func:`smooth_tchebycheff`.
-        ideal: :math:`z`, likewise.
-        mu: likewise.
+        ideal: :math:`z`, as for :func:`smooth_tchebycheff`.
+        mu: :math:`\mu`, as for :func:`smooth_tchebycheff`.
 
     Examples:
         >>> import torch
