@@ -106,10 +106,10 @@ class RegularizedPPO(PPO):
                 "Expected regularizer_cfg in the algorithm's configuration, got it next to that, "
                 "where it has no effect. Move it next to class_name."
             )
-        updates = {"max_iterations": cfg.get("max_iterations")}
-        made = {**cfg, "algorithm": {**updates, **cfg["algorithm"]}}
-        algorithm = PPO.construct_algorithm(obs, env, made, device)
-        cfg["obs_groups"] = made["obs_groups"]
+        # In place: rsl_rl 5.4 writes entries into it, which its runner reads.
+        cfg["algorithm"].setdefault("max_iterations", cfg.get("max_iterations"))
+        algorithm = PPO.construct_algorithm(obs, env, cfg, device)
+        del cfg["algorithm"]["max_iterations"]
         return algorithm
 
     def _neighbors(self, loss: RegularizedLoss) -> NeighborTransform | None:
