@@ -289,7 +289,10 @@ def test_an_explicit_ramp_goes_before_the_runners_iterations() -> None:
 @pytest.mark.parametrize("method", ["caps", "lcp", "sr2l"])
 def test_other_methods_train(method: str) -> None:
     """Their terms are logged, and the actor's update is another."""
-    plain, ppo = make(PPO), make(rsl.RegularizedPPO, regularizer_cfg={"method": method})
+    plain, ppo = (
+        make(PPO),
+        make(rsl.RegularizedPPO, regularizer_cfg={"method": method, "strength": 100.0}),
+    )
     losses = [update(collected(each)) for each in (plain, ppo)]
     assert all(value > 0 for name, value in losses[1].items() if name.startswith(method))
     assert losses[1].keys() > losses[0].keys()
