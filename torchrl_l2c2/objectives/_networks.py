@@ -297,7 +297,7 @@ class EvaluatedNetworks:
         states: TensorDictBase,
         rows: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """A value function at the batch's states, ``[1, *B, ...]``, and others, ``[K, *B, ...]``."""
+        """Values at the batch's states, ``[1, *B, ...]``, and at others, ``[K, *B, ...]``."""
         key = self.specs[network].output
         if key is None:
             # Not earlier: set_keys may be called after the wrapping.
