@@ -34,7 +34,6 @@ from torchrl_l2c2.experiment._torchrl_internals import (
     TraceableClipPPOLoss,
     first_observation,
     forget_traced,
-    leave_out,
     load_replay_state,
     noisy,
     replay_state,
@@ -155,23 +154,6 @@ def test_the_stored_tensors_are_the_storages_own():
         extend(buffer, row)
     stored_tensors(buffer.storage)["observation"][1] = 7.0
     assert buffer[1]["observation"].tolist() == [7.0] * 3
-
-
-def test_a_row_that_is_left_out_is_drawn_no_more_and_weighs_on_no_other():
-    """Until something else is stored in its place."""
-    buffer = prioritized()
-    buffer.extend(TensorDict({"row": torch.arange(4)}, [4]))
-    buffer.update_priority(torch.arange(4), torch.tensor([1.0, 0.25, 4.0, 9.0]))
-    leave_out(buffer.sampler, torch.tensor([1, 3]))
-    drawn = [buffer.sample() for _ in range(50)]
-    rows = torch.cat([batch["row"] for batch in drawn])
-    assert set(rows.tolist()) == {0, 2}
-    # Priorities to the power 0.7, by the least of the others, to the power -0.5.
-    weights = torch.cat([batch["priority_weight"] for batch in drawn])
-    torch.testing.assert_close(weights, torch.where(rows == 0, 1.0, 4.0**-0.35))
-    buffer.extend(TensorDict({"row": torch.arange(10, 16)}, [CAPACITY]))
-    drawn = torch.cat([buffer.sample()["row"] for _ in range(50)])
-    assert set(drawn.tolist()) == {10, 11, 12, 13, 14, 15}
 
 
 def test_the_simulator_is_the_one_that_was_wrapped():

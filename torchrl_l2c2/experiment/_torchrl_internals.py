@@ -15,7 +15,6 @@ from torch.distributions import Distribution
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.data import (
     LazyTensorStorage,
-    PrioritizedSampler,
     TensorDictPrioritizedReplayBuffer,
     TensorDictReplayBuffer,
 )
@@ -78,20 +77,6 @@ def stored_tensors(storage: LazyTensorStorage) -> TensorDictBase | None:
     """The storage's own tensors ``[capacity, ...]``; the public ``storage[:]`` copies them."""
     tensors: TensorDictBase | None = storage._storage
     return tensors
-
-
-def leave_out(sampler: PrioritizedSampler, rows: Tensor) -> None:
-    """Has rows drawn no more, until something else is stored in their place.
-
-    The least priority that ``update_priority`` can give would lower every other row's importance
-    weight.
-
-    Args:
-        sampler (PrioritizedSampler): The sampler, on the CPU.
-        rows (Tensor): The rows ``[B]``, on the CPU.
-    """
-    sampler._sum_tree[rows] = torch.zeros(len(rows))
-    sampler._min_tree[rows] = torch.full((len(rows),), torch.inf)
 
 
 class RowWriter:
