@@ -550,7 +550,7 @@ class TestWhichStatesAreMoved:
         """A critic that reads another observation would be compared with itself."""
         critic = ValueOperator(mlp(4, 1), in_keys=["state"])
         base = ClipPPOLoss(gaussian_actor(), critic)
-        with pytest.raises(ValueError, match=r"critic_network reads \['state'\] alone.*beta=0"):
+        with pytest.raises(ValueError, match=r"critic_network reads only \['state'\].*beta=0"):
             L2C2Loss(base, NEAR, moved_keys=["observation"])
         assert L2C2Loss(base, NEAR, beta=0.0, moved_keys=["observation"]).policy_terms
         assert L2C2Loss(base, NEAR, moved_keys=["observation", "state"]).added_terms

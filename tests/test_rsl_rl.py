@@ -569,8 +569,8 @@ def test_a_checkpoint_of_another_ppo_is_a_beginning(before: type[PPO]) -> None:
     "settings, said",
     [
         ({"model": RNNModel}, "the actor is recurrent .RNNModel.*Take a feed-forward model"),
-        ({"normal": {"class_name": "BetaDistribution"}}, "BetaDistribution, and normal ones alone"),
-        ({"normal": None}, "NoneType, and normal ones alone"),
+        ({"normal": {"class_name": "BetaDistribution"}}, "normal .* got a BetaDistribution"),
+        ({"normal": None}, "normal .* got a NoneType"),
         ({"regularizer_cfg": {"sigmaa": 1.0}}, "sigmaa"),
     ],
 )

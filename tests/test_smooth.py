@@ -640,7 +640,7 @@ class TestPresets:
         with pytest.raises(TypeError, match=f"{type(base).__name__} has no preset") as error:
             smooth(base, method)
         nearest, call = re.search(
-            r"The nearest is that of (\w+); .*: (smooth\(.*\))\.$", str(error.value)
+            r"The nearest is the preset of (\w+); .*: (smooth\(.*\))\.$", str(error.value)
         ).groups()
         kind = NEAREST[type(base).__name__]
         assert nearest == KINDS[kind][0][0]

@@ -242,5 +242,5 @@ class TestInARun:
 
     def test_the_ideal_is_of_the_scalarization(self):
         """Alone it would do nothing."""
-        with pytest.raises(SettingError, match="tchebycheff_ideal is of tchebycheff_mu"):
+        with pytest.raises(SettingError, match="tchebycheff_ideal works only with tchebycheff_mu"):
             L2C2Config(tchebycheff_ideal=1.0)

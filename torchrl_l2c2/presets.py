@@ -1,7 +1,7 @@
-"""Settings of regularizers that worked, in one table by method and kind of loss.
+"""Presets of the regularizers, in one table by method and kind of loss.
 
-Losses are named by their classes, so that settings can be read without importing torch.
-:func:`torchrl_l2c2.smooth` applies them.
+Losses are given by class name: the table can be read without importing torch.
+:func:`torchrl_l2c2.smooth` applies the presets.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 NEIGHBORHOOD_FIELDS = frozenset({"sigma", "lambda_min", "lambda_max", "shared", "max_step"})
-"""Settings of L2C2 that are fields of its neighborhood."""
+"""Settings of L2C2 that are fields of ``Neighborhood``."""
 
 
 @dataclass(frozen=True)
@@ -20,10 +20,10 @@ class Preset:
 
     Attributes:
         settings: keyword arguments of the regularizer, and of its ``Neighborhood``.
-        ramp: the share of training over which the gain rises from 0; ``None``: a constant gain.
-        evidence: the page with the runs of these settings; ``None``: its authors' settings, which
-            have no recorded runs with this kind of loss.
-        tasks: what the runs trained.
+        ramp: share of training over which the gain rises from 0; ``None`` for a constant gain.
+        evidence: page with the runs of these settings; ``None`` for settings of the method's
+            authors, without recorded runs with this kind of loss.
+        tasks: tasks of the runs.
     """
 
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -32,10 +32,10 @@ class Preset:
     tasks: str = ""
 
     def overridden(self, overrides: Mapping[str, Any]) -> Preset:
-        """The preset with other settings; ``ramp`` is one of them.
+        """Replaces settings, including ``ramp``.
 
         Raises:
-            TypeError: a neighborhood is given both whole and by its fields.
+            TypeError: both a neighborhood and its fields are given.
         """
         settings, overrides = dict(self.settings), dict(overrides)
         ramp = overrides.pop("ramp", self.ramp)
@@ -66,7 +66,7 @@ KINDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "td3": (("TD3Loss",), ("DDPGLoss",)),
     "ppo_rpe": (("PPORPELoss",), ()),
 }
-"""Kinds of losses, which share a preset: the classes that it was found with, and similar ones."""
+"""Kinds of losses that share presets: the classes used for tuning, and similar classes."""
 
 NEAREST = {
     "ReinforceLoss": "ppo",
@@ -170,7 +170,7 @@ PRESETS: dict[str, dict[str, Preset]] = {
         kind: Preset({"lambda_spatial": 0.3, "lambda_temporal": 2.0, "lambda_grad": 0.05})
         for kind in KINDS
     },
-    # Of the mean: a learned deviation would grow to lower the likelihood's gradient, or the KL.
+    # "mean": a learned deviation would grow, because that lowers the likelihood's gradient or KL.
     "lcp": {
         **{kind: Preset({"coeff": 0.002, "of": "mean"}) for kind in KINDS},
         "ppo_rpe": Preset({"coeff": 0.002, "of": "log_prob"}),
@@ -180,7 +180,7 @@ PRESETS: dict[str, dict[str, Preset]] = {
         "ppo_rpe": Preset({**_SR2L, "policy_distance": "jeffreys"}),
     },
 }
-"""The settings, by method and kind of loss. This is the only place that has them."""
+"""The presets, by method and kind of loss."""
 
 GAIN_SETTING = {
     "l2c2": "lambda_min",
@@ -191,7 +191,7 @@ GAIN_SETTING = {
     "lcp": "coeff",
     "sr2l": "coeff",
 }
-"""The setting that has to be given if there is no preset, by method."""
+"""The setting required if there is no preset, by method."""
 
 # The largest gain of L2C2 that had no measurable effect with these kinds of losses.
 _PAPERS_LAMBDA_MAX = 1.0
@@ -199,13 +199,13 @@ _WITHOUT_EFFECT = ("ppo", "sac", "td3")
 
 
 def kind_of(loss_class: type) -> tuple[str | None, bool]:
-    """The kind of a loss, by the first of its classes in :data:`KINDS`.
+    """Finds the kind of a loss: the first of its classes in :data:`KINDS`.
 
     Args:
         loss_class (type): the class of the loss, or a subclass of it.
 
     Returns:
-        tuple: the kind, or ``None``; and whether the preset was found with this very class.
+        tuple: the kind, or ``None``; and whether the presets were tuned with this class.
 
     Examples:
         >>> from torchrl.objectives import REDQLoss, SACLoss
@@ -247,7 +247,7 @@ def preset(method: str, kind: str) -> Preset:
 
 
 def without_effect(loss_class: type, lambda_max: float) -> bool:
-    """Whether L2C2 with gains up to this had no measurable effect with such losses."""
+    """Checks whether such small gains of L2C2 had no measurable effect with such losses."""
     kind, _ = kind_of(loss_class)
     return kind in _WITHOUT_EFFECT and lambda_max <= _PAPERS_LAMBDA_MAX
 

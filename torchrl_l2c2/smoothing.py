@@ -144,8 +144,8 @@ def _no_preset(loss: LossModule, method: str) -> str:
     nearest = preset(method, kind)
     settings = dict(nearest.settings) | ({} if nearest.ramp is None else {"ramp": nearest.ramp})
     return (
-        f"{name} has no preset. The nearest is that of {KINDS[kind][0][0]}; to use it, pass its "
-        f"settings: smooth(loss, {method!r}, {_shown(settings)})."
+        f"{name} has no preset. The nearest is the preset of {KINDS[kind][0][0]}; to use it, pass "
+        f"its settings: smooth(loss, {method!r}, {_shown(settings)})."
     )
 
 

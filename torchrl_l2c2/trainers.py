@@ -1,7 +1,6 @@
-"""The components as nodes of TorchRL's own configuration, made from their signatures.
+"""Hydra configurations of the components, for TorchRL's trainers.
 
-Needs ``hydra-core``, as TorchRL's own configurations do; nothing else in the package imports this
-module.
+Needs ``hydra-core``, as TorchRL's configurations do. No other module imports this module.
 """
 
 from __future__ import annotations
@@ -101,13 +100,13 @@ def _make_neighbor_transform(
 def _make_observation_noise(
     scale: Any, in_keys: Any, seed: int | None = None, device: str = "cpu"
 ) -> ObservationNoise:
-    # A list arrives as OmegaConf's own, which torch does not take.
+    # OmegaConf passes its own list type, which torch does not accept.
     scale = list(scale) if isinstance(scale, ListConfig) else scale
     return ObservationNoise(scale, in_keys=_listed(in_keys), generator=_generator(seed, device))
 
 
 def _listed(keys: Any) -> Any:
-    """Names of entries; a string is one, and not its letters."""
+    """A list of names of entries; a string is a single name."""
     return keys if isinstance(keys, str) else _normalize_hydra_keys(keys)
 
 
@@ -123,14 +122,14 @@ def _node(
     without: tuple[str, ...] = (),
     partial: bool = False,
 ) -> type:
-    """The dataclass of a component's parameters, with their types and defaults.
+    """Makes a dataclass of a component's parameters, with their types and defaults.
 
     Args:
-        component: the class that is configured.
-        base: the class of TorchRL's that its configuration belongs to.
-        builder: what is called in its place; where it says something of a parameter, it is right.
+        component: the class to configure.
+        base: TorchRL's base class of the configuration.
+        builder: function called instead of the class; its types and defaults take precedence.
         without: parameters that are not configured.
-        partial: whether the rest is given in the program, as the parameters to an optimizer.
+        partial: whether the program passes the other arguments, such as an optimizer's parameters.
     """
     target = component if builder is None else builder
     module = "torchrl_l2c2" if builder is None else __name__
@@ -157,7 +156,7 @@ def _node(
 
 
 def _parameters(function: Callable[..., Any]) -> dict[str, tuple[Any, Any]]:
-    """A function's named parameters: what OmegaConf can check of their types, and defaults."""
+    """A function's parameters by name, with types that OmegaConf can check, and defaults."""
     hints = get_type_hints(function)
     return {
         name: (
@@ -170,7 +169,7 @@ def _parameters(function: Callable[..., Any]) -> dict[str, tuple[Any, Any]]:
 
 
 def _checkable(hint: Any) -> Any:
-    """Numbers, strings and lists are checked where they are composed; objects are built later."""
+    """Converts a type hint to a type that OmegaConf checks; ``Any`` for objects."""
     members = get_args(hint) if get_origin(hint) is not Literal else ()
     simple: list[Any] = [kind for kind in (bool, int, float, list[Any]) if kind in (hint, *members)]
     if get_origin(hint) is Literal or hint is str:
@@ -185,11 +184,11 @@ class SmoothLossConfig(LossConfig):
     """Hydra configuration of :func:`~torchrl_l2c2.smooth`.
 
     Attributes:
-        base_loss: the configuration of the loss.
-        method: as for ``smooth``, like the others.
+        base_loss: configuration of the loss.
+        method: as for ``smooth``.
         strength: as for ``smooth``.
         fold: as for ``smooth``.
-        overrides: settings that replace the preset's, by name.
+        overrides: settings that replace the preset, by name.
     """
 
     base_loss: Any = MISSING
@@ -223,12 +222,11 @@ TSoftUpdateConfig = _node(TSoftUpdate, TargetNetUpdaterConfig)
 
 
 def register() -> None:
-    """Adds the package's configurations to Hydra's store, in the groups of TorchRL's.
+    """Adds the package's configurations to Hydra's store, in TorchRL's groups.
 
-    TorchRL stores its own when ``torchrl.trainers.algorithms.configs`` is imported; importing this
-    module imports that one too, and so brings TorchRL's configurations with it. The package's own
-    are stored by this call alone, so that looking at a class changes nothing for others in the
-    process. Calling it again changes nothing. Every name is new in its group:
+    Importing this module also stores TorchRL's configurations. The package's configurations are
+    stored only by this call; further calls have no effect. No name replaces a configuration of
+    TorchRL:
 
     ====================== ===================================
     group                  names
@@ -242,11 +240,11 @@ def register() -> None:
     ``neighborhood``       ``l2c2``
     ====================== ===================================
 
-    ``loss: smooth`` is :func:`~torchrl_l2c2.smooth`, with the presets of its table. The other nodes
-    have the parameters of their components, with their defaults. ``base_loss`` is the configuration
-    of another loss, such as TorchRL's ``loss: sac``; ``neighborhood`` one of the group of that
-    name, or nothing for the paper's; and a transform's ``seed`` gives it a generator of its own, on
-    its ``device``, which is the device of the batches (``cuda:0``; default ``cpu``).
+    ``loss: smooth`` is :func:`~torchrl_l2c2.smooth`, with its presets. The other configurations
+    have the parameters and defaults of their components. ``base_loss`` is the configuration of
+    another loss, such as TorchRL's ``loss: sac``. ``neighborhood`` is a configuration of the group
+    ``neighborhood``; without it, the paper's settings apply. With ``seed``, a transform has its own
+    generator on ``device``, the device of the batches (such as ``cuda:0``; default ``cpu``).
 
     Examples:
         >>> from hydra import compose, initialize

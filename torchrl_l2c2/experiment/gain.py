@@ -1,4 +1,4 @@
-"""The regularizer's gain in the course of a run: a ramp, or a gain that follows a measure."""
+"""The schedule of the regularizer's gain in a run: a ramp, or a gain that follows a metric."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from torchrl_l2c2.gains import ConstantGain, RampGain, TargetGain
 
 
 class GainControl:
-    """Sets the regularizer's gain between the updates of two episodes, and reports it.
+    """Sets the regularizer's gain after episodes, and logs it.
 
     Args:
-        config (ExperimentConfig): the settings; with a constant gain nothing is set later on.
-        learner (Learner): has the loss.
+        config (ExperimentConfig): the settings.
+        learner (Learner): the learner with the loss.
 
     Raises:
-        SettingError: the gain is to follow a column that is not measured.
+        SettingError: the gain follows a column that the run does not have.
 
     Attributes:
-        gain: the gain between 0 and 1, or the one that follows a measure; ``None``: constant.
+        gain: schedule of the gain; ``None`` for a constant gain.
     """
 
     def __init__(self, config: ExperimentConfig, learner: Learner) -> None:
         self._learner = learner
         self._updates = 0
         self._warns_of_measure = True
-        # Of the episodes since the gain was set: of a rollout several end, and any one is noisy.
+        # Values since the last step: a rollout may end several episodes, and each is noisy.
         self._seen: list[float] = []
         self.gain: ConstantGain | None = None
         if not isinstance(config.regularizer, GainConfig):
@@ -52,30 +52,31 @@ class GainControl:
             self.gain = TargetGain(
                 self._config.gain_target, self._config.gain_rate, self._config.gain_limit
             )
-            # It rises by itself; a ramp ends where it ends.
+            # This gain rises by itself until it has an effect.
             learner.tells_faint_regularizer = False
         self._apply()
 
     def after(
         self, row: Mapping[str, float], training: Budget, *, ends_round: bool = True
     ) -> dict[str, float]:
-        """Sets the gain for what follows an episode; returns its old value and what set it.
+        """Sets the gain after an episode, and returns the entries to log.
 
-        Without an update since the last time nothing is set. A measure is the mean over the
-        episodes since then: with rollouts, those of the last. After a rollout that no episode ended
-        in, a target has nothing to be set from.
+        The gain changes only if there was an update since its last change. A target uses the mean
+        of its metric over the episodes since then, which with rollouts are the episodes that ended
+        in the last rollout. Without such an episode the gain stays.
 
         Args:
-            row (Mapping): the episode's metrics; without an episode, the numbers ``"episode"`` and
+            row (Mapping): the episode's metrics; without an episode, ``"episode"`` and
                 ``"frames"``.
-            training (Budget): all of it, over which a ramp rises.
+            training (Budget): the whole training, over which a ramp rises.
 
         Keyword Args:
-            ends_round (bool): whether it is the last that was played with the same policy; the gain
-                stays until then. Default ``True``.
+            ends_round (bool): whether this is the last episode with the current policy. The gain
+                changes only then. Default ``True``.
 
         Returns:
-            dict: the gain that was applied, the measure, and the target; empty if it is constant.
+            dict: the gain that was applied, the measured value and the target; empty for a constant
+            gain.
         """
         if self.gain is None or (self._config.gain == "target" and self._config.gain_of not in row):
             return {}
@@ -92,7 +93,7 @@ class GainControl:
         return logged
 
     def state_dict(self) -> dict[str, Any]:
-        """The gain, the updates that it has followed, and the measures since."""
+        """The gain, the update of its last change, and the values measured since."""
         gains = {} if self.gain is None else {"all": self.gain.state_dict()}
         return {"gains": gains, "updates": self._updates, "seen": list(self._seen)}
 
@@ -119,13 +120,13 @@ class GainControl:
     def _measure(self, row: Mapping[str, float], training: Budget) -> float:
         if self._config.gain == "ramp":
             spent = training.spent(int(row["episode"]), int(row["frames"]))
-            return min(1.0, spent / training.total)  # A last round may go beyond it.
+            return min(1.0, spent / training.total)  # The last round may exceed the total.
         self._seen.append(row[self._config.gain_of])
         numbers = [measured for measured in self._seen if math.isfinite(measured)]
         return fmean(numbers) if numbers else self._seen[-1]
 
     def _check_column(self, name: str, *, tested: bool) -> None:
-        """Which columns will have numbers is known before anything is played."""
+        """Refuses a column that the run will not have, before the run begins."""
         columns = {*EPISODE_COLUMNS, *self._learner.report(0), *(TESTED if tested else ())}
         if "scale" not in self._learner.agent.policy.out_keys:
             columns.remove("policy_scale")
@@ -137,14 +138,14 @@ class GainControl:
             )
 
     def _warn_of_measure(self, column: str, measured: float) -> None:
-        """Says once that a target is not followed, as its column has no fitting number."""
+        """Warns once if the column of a target is negative or not finite."""
         if 0.0 <= measured < math.inf or not self._warns_of_measure:
             return
         self._warns_of_measure = False
         warnings.warn(
             f"regularizer.gain_of={column} is {measured:g} after update {self._updates}: the gain "
-            "stays where that is no number, and falls where it is below 0, whatever gain_target "
-            "is. Choose a column of numbers of at least 0; test_* have some in the last late_share "
-            "of training alone.",
+            "stays if this is not a number, and falls if it is below 0, for any gain_target. "
+            "Choose a column of numbers of at least 0. test_* columns have numbers only in the "
+            "last late_share of training.",
             stacklevel=4,
         )

@@ -55,7 +55,7 @@ def check_evaluates_states(loss: LossModule) -> None:
     if isinstance(loss, IMAGINING):
         raise TypeError(
             f"{name} evaluates its networks along trajectories that a learned model imagines, not "
-            "at single observed states, so that there is no neighborhood to regularize them in."
+            "at single observed states. There is no neighborhood to regularize them in."
         )
     if isinstance(loss, OF_SEQUENCES):
         raise TypeError(

@@ -73,7 +73,7 @@ def fold_targets(term: str, trains_policy: bool, own: Iterable[str]) -> list[str
         found = found if network is None else found[:1]
         if network is None and len(found) > 1:
             raise TypeError(
-                f"{term!r} may belong to {found}: end its name with that of its network, such as "
+                f"{term!r} may belong to {found}: end its name with the network's name, such as "
                 f"{term}_qvalue, or use fold=False and add it in the training loop."
             )
     if not found:
@@ -104,7 +104,7 @@ def add_penalty(own: Tensor, penalty: Tensor, key: str) -> Tensor:
 def make_part(
     method: Callable[..., Any], kind: str, targets: tuple[str, ...]
 ) -> Callable[..., Any]:
-    """Wraps a method such as ``actor_loss`` so that it includes a folded penalty.
+    """Wraps a method such as ``actor_loss`` to include a folded penalty.
 
     Args:
         method: method of the loss's class.

@@ -189,7 +189,7 @@ class L2C2Loss(RegularizedLoss):
 
     Warns:
         UserWarning: the loss has no policy, or no trained value function while ``beta`` is above 0,
-            and one term is left out; or the gains are at most those of the paper, which had no
+            and one term is left out; or the gains are as small as in the paper, which had no
             measurable effect with such losses.
 
     Examples:
@@ -281,9 +281,9 @@ class L2C2Loss(RegularizedLoss):
         )
         if without_effect(type(base_loss), neighborhood.lambda_max):
             warnings.warn(
-                f"gains up to {neighborhood.lambda_max:g}, such as the paper's, had no measurable "
-                f"effect with losses like {type(base_loss).__name__}. smooth(loss) takes settings "
-                "that had one; or raise lambda_min and lambda_max.",
+                f"gains up to {neighborhood.lambda_max:g}, such as the paper's gains, had no "
+                f"measurable effect with losses like {type(base_loss).__name__}. Use smooth(loss), "
+                "or raise lambda_min and lambda_max.",
                 stacklevel=2,
             )
 
@@ -476,9 +476,9 @@ def _read_moved_keys(
         )
     if still := [name for name, states in read.items() if not set(keys) & set(states)]:
         raise ValueError(
-            f"moved_keys names {keys}, and {still[0]} reads {list(read[still[0]])} alone, which "
-            "would not move: name one of these, too, or leave its term out (of value functions "
-            "with beta=0)."
+            f"moved_keys names {keys}, but {still[0]} reads only {list(read[still[0]])}, which "
+            "would not move: name one of these, too, or leave out its term (beta=0 for value "
+            "functions)."
         )
     return keys
 
@@ -496,12 +496,12 @@ def _check_terms(loss: str, policies: list[str], values: list[str], beta: float,
     if not policies:
         warnings.warn(
             f"{loss} has no policy network: L2C2Loss leaves out the policy term and regularizes "
-            f"{', '.join(values)} alone.",
+            f"only {', '.join(values)}.",
             stacklevel=3,
         )
     if beta and not values:
         warnings.warn(
             f"{loss} trains no value function: L2C2Loss leaves out the value term and regularizes "
-            "the policy alone. Pass beta=0 to say so.",
+            "only the policy. Pass beta=0 to silence this warning.",
             stacklevel=3,
         )

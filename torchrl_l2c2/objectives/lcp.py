@@ -90,8 +90,9 @@ class LCPLoss(RegularizedLoss):
         self.declare_policy(successors=False)
         if of == "log_prob" and not self.has_stochastic_policy():
             raise TypeError(
-                f"LCPLoss needs a stochastic policy: that of {type(base_loss).__name__} has no "
-                "likelihood. Use of='mean', or another regularizer."
+                "LCPLoss needs a stochastic policy: the policy of "
+                f"{type(base_loss).__name__} has no likelihood. Use of='mean', or another "
+                "regularizer."
             )
         self.declare_terms(policy=["loss_lcp"])
 

@@ -129,8 +129,8 @@ def update_deviation(
 
     Args:
         largest: the previous :math:`\Delta`.
-        relative_ratio: :math:`\rho_R`, without a gradient. NaN counts as no deviation, so that the
-            running maximum stays finite; the losses show it.
+        relative_ratio: :math:`\rho_R`, without a gradient. NaN counts as no deviation: the running
+            maximum must stay finite, and the losses show the NaN.
         decay: :math:`\delta`, in ``[0, 1]``. Smaller values forget large deviations sooner.
         floor: :math:`\Delta_{\min}`, greater than 0.
         reading: ``"max"`` or ``"ema"``, as above.

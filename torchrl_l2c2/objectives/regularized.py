@@ -270,7 +270,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
 
     @property
     def folded(self) -> bool:
-        """Whether the penalty is part of the loss's own terms."""
+        """``True`` if the penalty is part of the loss's own terms."""
         return self._folded
 
     def ramp(self, length: float = 1.0, *, end: float = 1.0) -> RegularizedLoss:

@@ -1,6 +1,6 @@
 """L2C2, CATS and other regularizers in rsl_rl's PPO, by class name in a run's configuration.
 
-Needs the extra ``rsl-rl``. ``docs/rsl_rl.md`` shows what to write.
+Needs the extra ``rsl-rl``. ``docs/rsl_rl.md`` has examples.
 """
 
 from torchrl_l2c2.rsl_rl.networks import ActorCriticLoss

@@ -20,22 +20,22 @@ from torchrl.modules import IndependentNormal
 from torchrl_l2c2.objectives import SharedEvaluation
 
 MEAN, SCALE, VALUE, VALID = "loc", "scale", "state_value", "valid"
-"""Entries of a batch: the policy's parameters and the value, and whether a row is a transition."""
+"""Entries of a batch: the policy's parameters, the value, and the mask of known transitions."""
 ENTRIES = ("action", MEAN, SCALE, VALUE, VALID)
-"""All that the losses read or write beside observation groups, which cannot have these names."""
+"""Reserved entries, which observation groups cannot have as names."""
 
 
 class ActorCriticLoss(SharedEvaluation):
-    """rsl_rl's actor and critic as a TorchRL loss that has no terms of its own.
+    """rsl_rl's actor and critic as a TorchRL loss without terms.
 
-    rsl_rl computes the terms of PPO itself; this is what the regularizers of this package are put
-    around. Batches have the observation groups by their names, and again under ``"next"``. Where
-    they also have the policy's parameters as ``"loc"`` and ``"scale"``, which rsl_rl works out
-    before, the actor is not evaluated again. Rows that are false in ``"valid"``, where a batch has
-    it, count nothing: terms are means over the others.
+    The regularizers of this package wrap this loss; rsl_rl itself computes the terms of PPO.
+    Batches have the observation groups by name, and the next observations under ``"next"``. If a
+    batch has the policy's parameters as ``"loc"`` and ``"scale"``, which rsl_rl computes first, the
+    actor is not evaluated again. If a batch has ``"valid"``, terms are means over the rows where it
+    is true.
 
     Args:
-        actor (MLPModel): the policy, a normal distribution; also a model with convolutions.
+        actor (MLPModel): the policy, a normal distribution. Models with convolutions also work.
         critic (MLPModel): the value function.
 
     Raises:
@@ -66,7 +66,7 @@ class ActorCriticLoss(SharedEvaluation):
         return False
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """No terms; keeps what is known of the policy for the regularizers around it."""
+        """Returns no terms; caches the policy's parameters for the regularizers."""
         if MEAN in tensordict.keys():
             self.evaluate_at_batch("actor_network", tensordict)
         return TensorDict()
@@ -76,7 +76,7 @@ class ActorCriticLoss(SharedEvaluation):
 
 
 class _Actor(TensorDictModuleBase):
-    """The parameters of the policy, apart from those that rsl_rl's update still has a use for."""
+    """Evaluates the policy's parameters without changing the distribution that rsl_rl uses."""
 
     def __init__(self, actor: MLPModel) -> None:
         super().__init__()
@@ -84,7 +84,7 @@ class _Actor(TensorDictModuleBase):
         self.in_keys, self.out_keys = groups(actor), [MEAN, SCALE]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        # Not a call of the model: that draws actions, and moves the global generator.
+        # Calling the model would draw actions with the global generator.
         output = self.model.mlp(self.model.get_latent(tensordict))
         distribution = copy.copy(self.model.distribution)
         distribution.update(output)
@@ -102,7 +102,7 @@ class _Critic(TensorDictModuleBase):
 
 
 def write_parameters(tensordict: TensorDictBase, parameters: tuple[Tensor, ...]) -> TensorDictBase:
-    """Writes mean and scale, in single precision also where the networks ran in a lower one."""
+    """Writes mean and scale in single precision, also if the networks ran in a lower precision."""
     mean, scale = torch.broadcast_tensors(*(parameter.float() for parameter in parameters))
     return tensordict.set(MEAN, mean).set(SCALE, scale)
 
@@ -116,13 +116,13 @@ def _check_models(actor: MLPModel, critic: MLPModel) -> None:
     for name, model in (("actor", actor), ("critic", critic)):
         if model.is_recurrent:
             raise TypeError(
-                f"the {name} is recurrent ({type(model).__name__}): its output depends on the "
-                "observations before, so that it has no value at one near the current one alone. "
+                f"the {name} is recurrent ({type(model).__name__}): its output depends on earlier "
+                "observations, so it cannot be evaluated at a neighbor of the current observation. "
                 "Take a feed-forward model, such as MLPModel, with a history of observations."
             )
     if not isinstance(actor.distribution, GaussianDistribution):
         raise TypeError(
-            f"the actor's distribution is a {type(actor.distribution).__name__}, and normal ones "
-            "alone can be compared: let distribution_cfg of the actor name GaussianDistribution "
-            "or HeteroscedasticGaussianDistribution."
+            "Expected a normal distribution of the actor, got a "
+            f"{type(actor.distribution).__name__}. Name GaussianDistribution or "
+            "HeteroscedasticGaussianDistribution in the actor's distribution_cfg."
         )

@@ -24,41 +24,40 @@ from torchrl_l2c2.smoothing import smooth
 from torchrl_l2c2.transforms import NeighborTransform
 
 FINAL = "final_obs"
-"""The entry of an environment's extras with the last observations of ended episodes."""
+"""Key of an environment's extras with the last observations of ended episodes."""
 
 PREVIOUS = ("grad_caps", "asap")
-"""Methods that need the observation before each state, which rollouts of rsl_rl lack."""
+"""Methods that need the previous observation, which rsl_rl's rollouts lack."""
 
 
 class RegularizedPPO(PPO):
     """rsl_rl's PPO with a regularizer: :class:`L2C2PPO`, :class:`CATSPPO` or another method.
 
-    A run's configuration names it instead of PPO, ``"class_name":
-    "torchrl_l2c2.rsl_rl:RegularizedPPO"``. The preset is the same as with TorchRL's PPO
-    (:func:`~torchrl_l2c2.smooth`). One printed line has the settings.
+    To use it, set ``"class_name": "torchrl_l2c2.rsl_rl:RegularizedPPO"`` in the algorithm's
+    configuration. The preset is the same as with TorchRL's PPO (:func:`~torchrl_l2c2.smooth`). The
+    settings are printed in one line.
 
     Args:
         actor (MLPModel): the policy, feed-forward and normal.
         critic (MLPModel): the value function, feed-forward.
-        storage (RolloutStorage): as rsl_rl makes it; it is taken over.
+        storage (RolloutStorage): the storage that rsl_rl has made; its buffers are taken over.
         *args: arguments of rsl_rl's PPO.
-        regularizer_cfg (dict, optional): ``method``, any that
-            :func:`~torchrl_l2c2.smooth` has but ``"grad_caps"`` and ``"asap"``, by default
-            ``"l2c2"``; ``strength``, which multiplies the penalty, by default 1; ``ramp_updates``,
-            the number of updates over which the gain rises from 0, an integer of at least 1, or
-            ``None`` for a constant gain (smaller numbers smooth earlier); and overrides of the
-            preset, by the names that ``smooth`` has for them. Without ``ramp_updates`` a preset
-            with a ramp takes ``max_iterations``.
-        max_iterations (int, optional): Number of updates in the whole training. The runner's
-            configuration gives it in Isaac Lab and mjlab. ``None``: unknown, and the gain is
-            constant unless there is ``ramp_updates``.
+        regularizer_cfg (dict, optional): settings of the regularizer. ``method`` is a method of
+            :func:`~torchrl_l2c2.smooth` except ``"grad_caps"`` and ``"asap"`` (default:
+            ``"l2c2"``). ``strength`` multiplies the penalty (default: 1). ``ramp_updates`` is the
+            number of updates over which the gain rises from 0, at least 1, or ``None`` for a
+            constant gain (default: ``max_iterations`` if the preset has a ramp); smaller numbers
+            smooth earlier. Other entries override the preset, as in ``smooth``.
+        max_iterations (int, optional): number of updates in the whole training. In Isaac Lab and
+            mjlab the runner's configuration sets it. With ``None`` the gain is constant unless
+            ``ramp_updates`` is given.
         **kwargs: arguments of rsl_rl's PPO.
 
     Raises:
         TypeError: a model is recurrent, the policy is not normal, or an argument is unknown or of
             the wrong type.
-        ValueError: an argument is out of its range, or the method is not known or does not work
-            with rsl_rl.
+        ValueError: an argument is out of its range, or the method is unknown or does not work with
+            rsl_rl.
     """
 
     method: ClassVar[str | None] = None
@@ -100,7 +99,7 @@ class RegularizedPPO(PPO):
 
     @staticmethod
     def construct_algorithm(obs: TensorDict, env: VecEnv, cfg: dict[str, Any], device: str) -> PPO:
-        """As rsl_rl's; ``max_iterations`` of the runner's configuration reaches the algorithm."""
+        """Constructs the algorithm as rsl_rl does, and passes it the runner's max_iterations."""
         if "regularizer_cfg" in cfg:
             raise ValueError(
                 "Expected regularizer_cfg in the algorithm's configuration, got it next to that, "
@@ -113,7 +112,7 @@ class RegularizedPPO(PPO):
         return algorithm
 
     def _neighbors(self, loss: RegularizedLoss) -> NeighborTransform | None:
-        """Draws the neighbors of L2C2 in all observation groups that its networks read."""
+        """Makes the transform for L2C2's neighbors, in all observation groups of its networks."""
         if not isinstance(loss, L2C2Loss):
             return None
         stored = self.storage.observations
@@ -139,7 +138,7 @@ class RegularizedPPO(PPO):
         self.storage.add_last(obs)
 
     def update(self) -> dict[str, float]:
-        """As rsl_rl's, with the regularizer's terms and diagnostics among the losses."""
+        """Updates as rsl_rl does, and adds the regularizer's terms to the returned losses."""
         losses = super().update()
         del losses["symmetry"]
         losses.update(self.regularization.report())
@@ -152,11 +151,11 @@ class RegularizedPPO(PPO):
     def load(
         self, loaded_dict: dict[str, Any], load_cfg: dict[str, bool] | None, strict: bool
     ) -> bool:
-        """As rsl_rl's; a checkpoint of the plain PPO, or of another regularizer, is a beginning."""
+        """Loads a checkpoint, also of rsl_rl's PPO or of a run with another regularizer."""
         resumes = super().load(loaded_dict, load_cfg, strict)
         if resumes and "regularization_state_dict" in loaded_dict:
             state = dict(loaded_dict["regularization_state_dict"])
-            # The first process has written it: others would draw as that one does.
+            # The first process wrote it: the other processes would draw the same numbers.
             if self.is_multi_gpu and self.gpu_global_rank:
                 state.pop("generator", None)
             self.regularization.load_state_dict(state)
@@ -189,11 +188,11 @@ def _check_final(final: Any, obs: TensorDict) -> None:
 
 
 class L2C2PPO(RegularizedPPO):
-    r"""rsl_rl's PPO under the locally Lipschitz continuous constraint (Kobayashi, L2C2, 2022).
+    r"""rsl_rl's PPO with the locally Lipschitz continuous constraint (Kobayashi, L2C2, 2022).
 
-    A run's configuration names it instead of PPO, ``"class_name":
-    "torchrl_l2c2.rsl_rl:L2C2PPO"``, and may say more under ``"regularizer_cfg"``. To the loss of
-    PPO it adds the terms of :class:`~torchrl_l2c2.L2C2Loss`,
+    To use it, set ``"class_name": "torchrl_l2c2.rsl_rl:L2C2PPO"`` in the algorithm's configuration,
+    with settings in ``"regularizer_cfg"``. It adds the terms of :class:`~torchrl_l2c2.L2C2Loss` to
+    PPO's loss:
 
     .. math::
         \lambda_\pi\, \mathbb E\left[\frac{d_\pi(\pi(\cdot|s), \pi(\cdot|\tilde s))}
@@ -201,22 +200,22 @@ class L2C2PPO(RegularizedPPO):
         + \beta\lambda_\pi\, \mathbb E\left[\frac{d_V(V(s), V(\tilde s))}
         {d(s, \tilde s; s')}\right],
 
-    over the transitions of each minibatch, with the settings that
-    :func:`~torchrl_l2c2.smooth` has for PPO: the distance of the means, and no value term.
-    Neighbors move in all observation groups that the regularized networks read, before these
-    normalize them: the mean and scale of a normalization change neither the neighbors nor their
-    distances. Where an episode ended, the next observation
-    that rsl_rl knows is that after the reset, and the transition is left out of the mean; unless
-    the environment gives the episode's own last observations as ``extras["final_obs"]``, a
-    TensorDict of all groups, ``[num_envs]``, in steps that end one.
+    over the transitions of each minibatch, with the preset of :func:`~torchrl_l2c2.smooth` for PPO:
+    the distance of the means, and no value term. Neighbors move in all observation groups that the
+    regularized networks read, before the networks normalize them: the normalization does not change
+    the neighbors or their distances.
 
-    Neighbors are drawn with a generator of their own, seeded with :func:`torch.initial_seed`: at a
-    gain of 0 a training run has the numbers of rsl_rl's PPO. A symmetry extension works as
-    before. ``update`` returns, and rsl_rl logs, the terms ``l2c2_actor`` and, unless ``beta`` is 0,
-    ``l2c2_critic``, as they were added to the loss, and L2C2Loss's diagnostics.
+    When an episode ends, rsl_rl stores the observation after the reset, so these transitions are
+    left out of the mean. They count if the environment writes the last observations of ended
+    episodes to ``extras["final_obs"]``, a TensorDict of all groups, ``[num_envs]``.
 
-    Takes the arguments of :class:`RegularizedPPO`. ``regularizer_cfg`` has arguments of
-    :class:`~torchrl_l2c2.Neighborhood` and L2C2Loss, by name, ``strength`` and ``ramp_updates``.
+    Neighbors have their own generator, seeded with :func:`torch.initial_seed`: at a gain of 0 a
+    training run has the same random numbers as with rsl_rl's PPO. A symmetry extension works as
+    before. rsl_rl logs the terms ``l2c2_actor`` and, unless ``beta`` is 0, ``l2c2_critic``, and the
+    diagnostics of L2C2Loss.
+
+    Takes the arguments of :class:`RegularizedPPO`. ``regularizer_cfg`` accepts the arguments of
+    :class:`~torchrl_l2c2.Neighborhood` and L2C2Loss, ``strength`` and ``ramp_updates``.
 
     Examples:
         >>> import torch
@@ -247,18 +246,18 @@ class L2C2PPO(RegularizedPPO):
 class CATSPPO(RegularizedPPO):
     r"""rsl_rl's PPO with CATS's temporal term (arXiv 2610.07910).
 
-    Named and configured as :class:`L2C2PPO` is. It adds the term of
-    :class:`~torchrl_l2c2.CATSLoss`,
+    It is named and configured like :class:`L2C2PPO`, and adds the term of
+    :class:`~torchrl_l2c2.CATSLoss`:
 
     .. math::
         \min\left(1, \frac kK\right) \lambda\,
         \mathbb E\left[\lVert \mu(s) - \mu(s') \rVert_2^2\right],
 
-    in update :math:`k`, with :math:`K` = ``ramp_updates``, over the transitions that an episode's
-    end leaves out as there.
+    in update :math:`k`, with :math:`K` = ``ramp_updates``. Transitions that end an episode are
+    treated as in :class:`L2C2PPO`.
 
-    Takes the arguments of :class:`RegularizedPPO`. ``regularizer_cfg`` has arguments of
-    CATSLoss, by name, ``strength`` and ``ramp_updates``.
+    Takes the arguments of :class:`RegularizedPPO`. ``regularizer_cfg`` accepts the arguments of
+    CATSLoss, ``strength`` and ``ramp_updates``.
     """
 
     method = "cats"
@@ -284,7 +283,7 @@ def _check_options(method: str, options: Iterable[str]) -> None:
     allowed = set(signature(getattr(objectives, METHODS[method])).parameters)
     if "neighborhood" in allowed:
         allowed |= NEIGHBORHOOD_FIELDS
-    # The ends of episodes are left out always.
+    # Transitions that end an episode are always left out.
     allowed -= {"base_loss", "neighborhood", "skip_ends"}
     allowed |= {"method", "strength", "ramp_updates"}
     if unknown := sorted(set(options) - allowed):

@@ -1,4 +1,4 @@
-"""A regularized loss in the place of rsl_rl's symmetry extension."""
+"""A regularized loss with the interface of rsl_rl's symmetry extension."""
 
 from __future__ import annotations
 
@@ -22,19 +22,20 @@ _METHODS = {"l2c2_coeff": "l2c2", "cats_lambda_temporal": "cats"}
 
 
 class Regularization:
-    """What rsl_rl's PPO asks a symmetry extension for, answered by a regularized loss.
+    """A regularized loss with the interface of rsl_rl's symmetry extension.
 
-    The update of PPO has one place for a term of others: that of the mirror loss. This object
-    stands there, passes on to the real extension what is its, and adds the regularizer's terms to
-    its loss. The regularizer is computed at the batch's own rows, not at mirrored ones.
+    rsl_rl's PPO accepts one additional term, the mirror loss of the symmetry extension. This object
+    takes its place: it forwards calls to the real extension, and adds the regularizer's terms to
+    the mirror loss. The regularizer is computed at the original rows of the batch, not at mirrored
+    rows.
 
     Args:
-        loss (RegularizedLoss): around an
+        loss (RegularizedLoss): the regularizer around an
             :class:`~torchrl_l2c2.rsl_rl.ActorCriticLoss`.
-        neighbors (NeighborTransform, optional): writes into batches what the loss reads there.
-        method (str): The regularizer's name, which checkpoints have.
-        ramp_updates (int, optional): Number of updates over which ``regularizer_gain`` rises from
-            0. ``None``: constant.
+        neighbors (NeighborTransform, optional): transform that writes neighbors into batches.
+        method (str): the regularizer's name, which is saved in checkpoints.
+        ramp_updates (int, optional): number of updates over which ``regularizer_gain`` rises from
+            0; ``None`` for a constant gain.
         symmetry (Symmetry, optional): the real extension.
     """
 
@@ -59,19 +60,21 @@ class Regularization:
         self._set_progress()
 
     def augment_batch(self, batch: RolloutStorage.Batch, original_batch_size: int) -> None:
-        """Adds mirrored rows where there is a symmetry that does."""
+        """Adds mirrored rows if there is a symmetry extension."""
         if self.symmetry is not None:
             self.symmetry.augment_batch(batch, original_batch_size)
 
     def compute_loss(
         self, actor: MLPModel, batch: RolloutStorage.Batch, original_batch_size: int
     ) -> Tensor:
-        """The regularizer's terms and, weighted, the mirror loss; called after the surrogate's.
+        """Sums the regularizer's terms and the weighted mirror loss.
+
+        rsl_rl calls it after computing the surrogate loss.
 
         Args:
-            actor: has just been evaluated at ``batch.observations``.
-            batch: of :class:`~torchrl_l2c2.rsl_rl.SuccessorStorage`.
-            original_batch_size: how many of its rows are not mirrored ones; they come first.
+            actor: the policy, just evaluated at ``batch.observations``.
+            batch: a batch of :class:`~torchrl_l2c2.rsl_rl.SuccessorStorage`.
+            original_batch_size: number of original rows, which come before the mirrored rows.
         """
         batch_of_loss = self._transitions(actor, batch, original_batch_size)
         terms = dict(self.loss(batch_of_loss).items())
@@ -85,7 +88,7 @@ class Regularization:
         return total
 
     def report(self) -> dict[str, float]:
-        """Means over the batches since the last call, by the names of the terms."""
+        """Returns the means over the batches since the last call, by the names of the terms."""
         names, sums = list(self._sums), list(self._sums.values())
         means = (torch.stack(sums) / self._batches).tolist() if sums else []
         self._sums, self._batches = {}, 0
@@ -97,20 +100,20 @@ class Regularization:
         self._set_progress()
 
     def state_dict(self) -> dict[str, Any]:
-        """What the next updates depend on."""
+        """The method, the number of updates and the state of the generator."""
         generator = None if self.neighbors is None else self.neighbors.generator
         drawn = {} if generator is None else {"generator": generator.get_state()}
         return {"method": self.method, "updates": self.updates, **drawn}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores what :meth:`state_dict` gave; of another regularizer nothing."""
+        """Restores the result of :meth:`state_dict`; ignores the state of another method."""
         older = _METHODS.get(state["coefficient"]) if "coefficient" in state else self.method
         if state.get("method", older) != self.method:
             return
         self.updates = state["updates"]
         self._set_progress()
         generator = None if self.neighbors is None else self.neighbors.generator
-        # One of another kind is saved by another kind of device: this one's then begins anew.
+        # A generator of another kind of device has another state: do not restore it.
         if generator is not None and "generator" in state:
             saved = state["generator"].cpu()
             if saved.shape == generator.get_state().shape:

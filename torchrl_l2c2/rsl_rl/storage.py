@@ -1,4 +1,4 @@
-"""Rollouts of rsl_rl whose batches know the observation that came next."""
+"""rsl_rl's rollout storage with next observations."""
 
 from __future__ import annotations
 
@@ -9,24 +9,23 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-# Where a batch's rows lie in the rollout, among the observations while a batch is drawn.
+# Entry of the observations with their rows in the rollout, while a batch is drawn.
 ROW = "_row"
 
 
 class SuccessorStorage(RolloutStorage):
-    """A rollout storage whose batches have the observations after their own.
+    """A rollout storage whose batches have the next observations.
 
-    It takes over the buffers of the one that rsl_rl has made. The observation after a step is the
-    one that is stored with the next step, and is looked up there: there is one step's more of
-    observations, and no second copy. Where an episode ended, that is the first observation of
-    another one, and counts as unknown unless :meth:`add_final` was told what the episode's own was.
+    It takes over the buffers of the storage that rsl_rl has made. The next observation is read from
+    the next step of the rollout, so the storage grows by only one step of observations. If an
+    episode ended, the next step belongs to another episode, and the next observation is unknown
+    unless it was passed to :meth:`add_final`.
 
-    Batches have two attributes more: ``next_observations``, a TensorDict like ``observations``, and
+    Batches have two more attributes: ``next_observations``, a TensorDict like ``observations``, and
     ``has_next``, boolean, ``[B]``, false in rows whose next observation is unknown.
 
     Args:
-        storage (RolloutStorage): the storage, for reinforcement learning. It is not to be used
-            afterwards.
+        storage (RolloutStorage): the storage, for reinforcement learning. Do not use it afterwards.
 
     Examples:
         >>> import torch
@@ -53,11 +52,11 @@ class SuccessorStorage(RolloutStorage):
         self._observations[-1].copy_(observations)
 
     def add_final(self, observations: TensorDictBase, dones: Tensor) -> None:
-        """Stores the last observations of the episodes that the step before has ended.
+        """Stores the last observations of the episodes that ended in the previous step.
 
         Args:
-            observations: ``[num_envs]``; only the rows of ended episodes are read.
-            dones: which they are, ``[num_envs]``.
+            observations: the observations, ``[num_envs]``; only rows of ended episodes are read.
+            dones: mask of the ended episodes, ``[num_envs]``.
         """
         ended = dones.flatten().nonzero().flatten()
         self._final_rows.append((self.step - 1) * self.num_envs + ended)
@@ -71,7 +70,7 @@ class SuccessorStorage(RolloutStorage):
     def mini_batch_generator(
         self, num_mini_batches: int, num_epochs: int = 8
     ) -> Iterator[RolloutStorage.Batch]:
-        """The batches of rsl_rl, drawn as there, with their next observations."""
+        """Draws batches as rsl_rl does, and adds their next observations."""
         finals = self._find_finals()
         for batch in super().mini_batch_generator(num_mini_batches, num_epochs):
             rows = batch.observations.pop(ROW)
@@ -79,7 +78,7 @@ class SuccessorStorage(RolloutStorage):
             yield batch
 
     def _find_finals(self) -> tuple[Tensor, TensorDictBase] | None:
-        """Which of the known final observations is each row's, -1 where none is; and these."""
+        """The index of each row's final observation, -1 without one, and these observations."""
         if not self._finals:
             return None
         finals, rows = torch.cat(self._finals), torch.cat(self._final_rows)

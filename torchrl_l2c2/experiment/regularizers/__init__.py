@@ -1,4 +1,4 @@
-"""What is added to the loss: a file for each regularizer, and a line here for each choice."""
+"""Choices of the setting ``regularizer``. Each regularizer has a file."""
 
 from typing import Any
 
@@ -29,8 +29,8 @@ __all__ = [
     "preset_settings",
 ]
 
-# Choices that begin with the preset of the algorithm, with what they replace in it; l2c2_paper has
-# the paper's settings with any algorithm.
+# Choices that start from the algorithm's preset, with their overrides. l2c2_paper has the paper's
+# settings with every algorithm.
 BEGIN_WITH_PRESET: dict[str, tuple[str, dict[str, Any]]] = {
     "l2c2": ("l2c2", {}),
     "l2c2_constant": ("l2c2", {"gain": "constant"}),
@@ -40,11 +40,11 @@ BEGIN_WITH_PRESET: dict[str, tuple[str, dict[str, Any]]] = {
 
 
 def preset_settings(regularizer: str, algorithm: str) -> dict[str, Any]:
-    """The settings that a choice of regularizer begins with, for an algorithm.
+    """The initial settings of a regularizer for an algorithm.
 
     Args:
-        regularizer (str): a name of :data:`REGULARIZERS`.
-        algorithm (str): a name of an algorithm.
+        regularizer (str): a name in :data:`REGULARIZERS`.
+        algorithm (str): name of the algorithm.
 
     Returns:
         dict: settings by name; empty if there is no preset.
@@ -73,9 +73,9 @@ REGULARIZERS: dict[str, RegularizerConfig] = {
     "lcp": LCPConfig(),
     "l2c2": L2C2Config(),
     "l2c2_paper": L2C2Config(name="l2c2_paper"),
-    # The paper's ablation: the policy alone is regularized.
+    # The paper's ablation: only the policy is regularized.
     "l2c2_policy": L2C2Config(name="l2c2_policy", beta=0.0),
-    # For policies of any scale, and where little is to be lost early.
+    # The distance of the means suits policies of any scale; a ramp costs less return early.
     "l2c2_mean": L2C2Config(name="l2c2_mean", policy_distance="mean"),
     "l2c2_ramp": L2C2Config(name="l2c2_ramp", policy_distance="mean", gain="ramp"),
     "l2c2_constant": L2C2Config(name="l2c2_constant"),

@@ -1,4 +1,4 @@
-"""ASAP, a rival: actions that could be predicted from the state before."""
+"""Settings of ASAP: actions that are predictable from the previous state."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @settings
 class ASAPConfig(GainConfig):
-    """A rival, ASAPLoss; frames keep the observation before theirs."""
+    """Settings of ASAPLoss. Batches have the previous observation."""
 
     reads_previous: ClassVar[bool] = True
 
@@ -23,20 +23,22 @@ class ASAPConfig(GainConfig):
     lambda_spatial: float = Field(
         default=0.3,
         ge=0,
-        description="gain of the distance to what was predicted [its authors' on MuJoCo, and .03 "
-        "on LunarLander and Pendulum]",
+        description="gain of the distance to the predicted action [the authors' value for MuJoCo; "
+        "0.03 for LunarLander and Pendulum]",
     )
     lambda_temporal: float = Field(
-        default=2.0, ge=0, description="gain of the predictor's own loss [its authors']"
+        default=2.0, ge=0, description="gain of the predictor's loss [the authors' value]"
     )
     lambda_grad: float = Field(
         default=0.05,
         ge=0,
-        description="gain of the change of the action's change [its authors' on MuJoCo, and .005 "
-        "on LunarLander and Pendulum]",
+        description="gain of the action's second difference [the authors' value for MuJoCo; 0.005 "
+        "for LunarLander and Pendulum]",
     )
     epsilon: float = Field(
-        default=0.1, gt=0, description="smaller ones punish zigzags around one place more"
+        default=0.1,
+        gt=0,
+        description="constant in the denominator; smaller values penalize small zigzags more",
     )
     mean: Literal["loc", "action"] = COMPARED_MEAN
 

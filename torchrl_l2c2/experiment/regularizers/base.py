@@ -1,4 +1,4 @@
-"""What every regularizer's settings make, and how those say what sets the gain."""
+"""Base classes of the regularizers' settings, and the settings of the gain."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from torchrl_l2c2.neighborhood import Neighborhood
     from torchrl_l2c2.transforms import NeighborTransform
 
-# The gains that read a setting: with the others it would have no effect.
+# Values of ``gain`` with which a setting has an effect.
 READ_BY = {
     "gain_target": ("target",),
     "gain_of": ("target",),
@@ -25,19 +25,19 @@ READ_BY = {
     "gain_limit": ("target",),
     "gain_length": ("ramp",),
 }
-# A setting of all who compare means.
+# The setting of regularizers that compare means.
 COMPARED_MEAN: Any = Field(
     default="loc",
-    description="means compared before or after the squashing, which deterministic policies (td3) "
-    "have after it alone [inferred: loc]",
+    description="loc: compare means before the squashing; action: after it. No difference for "
+    "deterministic policies (td3) [inferred: loc]",
 )
 
 
 class RegularizerConfig:
-    """Makes a regularized loss and, where batches are to hold neighbors for it, what draws them.
+    """Settings of a regularizer.
 
     Attributes:
-        reads_previous: whether its batches are to have the observation before each state.
+        reads_previous: whether batches must have the previous observation.
     """
 
     reads_previous: ClassVar[bool] = False
@@ -46,23 +46,23 @@ class RegularizerConfig:
 
     @property
     def neighborhood(self) -> Neighborhood | None:
-        """Where the states lie that it compares with; ``None`` where that is no neighborhood."""
+        """The neighborhood of the compared states; ``None`` without a neighborhood."""
         return None
 
     @property
     def ramped(self) -> bool:
-        """Whether its gain rises over the length of a training."""
+        """Checks whether the gain is a ramp."""
         return False
 
     def wrap(self, loss: LossModule) -> LossModule:
-        """The loss with the regularizer's terms."""
+        """Adds the regularizer's terms to a loss."""
         raise NotImplementedError
 
     def add_to(self, loss: LossModule) -> LossModule:
-        """As :meth:`wrap`, for the loss of an algorithm that was chosen.
+        """Calls :meth:`wrap`; errors name the setting.
 
         Raises:
-            SettingError: the regularizer is none for such a loss.
+            SettingError: the regularizer does not work with this loss.
         """
         try:
             return self.wrap(loss)
@@ -72,19 +72,19 @@ class RegularizerConfig:
             raise SettingError("", f"regularizer={self.name}: {error}") from error
 
     def neighbors(self, generator: torch.Generator) -> NeighborTransform | None:
-        """What draws the neighbors in the replay buffer's batches; ``None`` where none are read."""
+        """Makes the transform that draws neighbors in the replay buffer; ``None`` if not needed."""
         return None
 
 
 @settings
 class GainConfig(RegularizerConfig):
-    """A regularizer whose terms have a gain: how it is set in the course of a run."""
+    """Settings of a regularizer with a gain, and of the gain's schedule."""
 
     strength: float = Field(
         default=1.0,
         ge=0,
-        description="factor on the penalty; larger values smooth more, at some point at the cost "
-        "of return",
+        description="factor on the penalty; larger values smooth more, too large values lower the "
+        "return",
     )
     gain: Literal["constant", "ramp", "target"] = Field(
         default="constant",
@@ -126,18 +126,18 @@ class GainConfig(RegularizerConfig):
             if self.gain not in gains and given != usual:
                 raise SettingError(
                     name,
-                    f"is of gain={' and gain='.join(gains)} alone, got {given} with "
-                    f"gain={self.gain}: choose such a gain, or leave {name} at "
+                    f"works only with gain={' or gain='.join(gains)}, got {given} with "
+                    f"gain={self.gain}: change gain, or leave {name} at "
                     f"{'null' if usual is None else usual}.",
                 )
 
     def add_to(self, loss: LossModule) -> LossModule:
-        """As :meth:`RegularizerConfig.add_to`, at its strength."""
+        """Calls :meth:`RegularizerConfig.add_to`, and sets the strength."""
         loss = super().add_to(loss)
         loss.regularizer_gain = self.strength
         return loss
 
     @property
     def ramped(self) -> bool:
-        """As :attr:`RegularizerConfig.ramped`."""
+        """Checks whether the gain is a ramp."""
         return self.gain == "ramp"

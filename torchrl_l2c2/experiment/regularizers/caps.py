@@ -1,4 +1,4 @@
-"""CAPS, the paper's baseline."""
+"""Settings of CAPS, the method that the paper compares with."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 
 @settings
 class CAPSConfig(GainConfig):
-    """The baseline, CAPSLoss."""
+    """Settings of CAPSLoss."""
 
     name: str = "caps"
     sigma: float = Field(
-        default=0.2, gt=0, description="standard deviation of the states compared with s [paper]"
+        default=0.2, gt=0, description="standard deviation of the noise on the state [paper]"
     )
     lambda_temporal: float = Field(
         default=0.01, ge=0, description="gain of the distance between s and s' [paper]"

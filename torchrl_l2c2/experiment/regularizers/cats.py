@@ -1,4 +1,4 @@
-"""CATS, a rival: the temporal term alone, on a ramp."""
+"""Settings of CATS: the temporal term with a ramp."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 
 @settings
 class CATSConfig(GainConfig):
-    """A rival, CATSLoss, with its linear ramp over the training."""
+    """Settings of CATSLoss, with a linear ramp over the training."""
 
     name: str = "cats"
     gain: Literal["constant", "ramp", "target"] = Field(
-        default="ramp", description="as for the others; the ramp is the method's own"
+        default="ramp", description="schedule of the gain, as for other methods [paper: ramp]"
     )
     lambda_temporal: float = Field(
         default=0.1, ge=0, description="gain of the distance between s and s' [inferred]"

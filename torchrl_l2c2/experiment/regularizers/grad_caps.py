@@ -1,4 +1,4 @@
-"""Grad-CAPS, a rival: the change of the action's change."""
+"""Settings of Grad-CAPS: the second difference of the actions."""
 
 from __future__ import annotations
 
@@ -15,16 +15,18 @@ if TYPE_CHECKING:
 
 @settings
 class GradCAPSConfig(GainConfig):
-    """A rival, GradCAPSLoss; frames keep the observation before theirs."""
+    """Settings of GradCAPSLoss. Batches have the previous observation."""
 
     reads_previous: ClassVar[bool] = True
 
     name: str = "grad_caps"
     lambda_temporal: float = Field(
-        default=0.01, ge=0, description="gain of the change of the action's change [inferred]"
+        default=0.01, ge=0, description="gain of the action's second difference [inferred]"
     )
     epsilon: float = Field(
-        default=0.1, gt=0, description="smaller ones punish zigzags around one place more"
+        default=0.1,
+        gt=0,
+        description="constant in the denominator; smaller values penalize small zigzags more",
     )
     mean: Literal["loc", "action"] = COMPARED_MEAN
 

@@ -1,4 +1,4 @@
-"""L2C2, the paper's method."""
+"""Settings of L2C2, the paper's method."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @settings
 class L2C2Config(GainConfig):
-    """The paper's method, L2C2Loss."""
+    """Settings of L2C2Loss, the paper's method."""
 
     name: str = "l2c2"
     sigma: float = Field(
@@ -30,54 +30,57 @@ class L2C2Config(GainConfig):
     lambda_min: float = Field(
         default=0.01, gt=0, description="gain at the edge of the neighborhood [paper]"
     )
-    lambda_max: float = Field(default=1.0, gt=0, description="gain at its center [paper]")
+    lambda_max: float = Field(
+        default=1.0, gt=0, description="gain at the center of the neighborhood [paper]"
+    )
     shared: bool = Field(
         default=False,
-        description="one draw for all dimensions of the state, and not one for each [paper: each]",
+        description="line neighborhood (one random number for all dimensions of the state) instead "
+        "of a box neighborhood (one for each) [paper: box]",
     )
     max_step: float | None = Field(
         default=None,
         gt=0,
         description="longest step from s to s' that counts, in the observation's units (with "
-        "algorithm.normalize_observations in its deviations): a reset or a teleport is longer; "
-        "null: all [paper]",
+        "algorithm.normalize_observations, in standard deviations); excludes resets and teleports; "
+        "null: no limit [paper]",
     )
     beta: float = Field(
         default=0.1,
         ge=0,
-        description="gain of the value's regularization relative to the policy's [paper]",
+        description="gain of the value terms relative to the policy term [paper]",
     )
     num_samples: int = Field(default=1, ge=1, description="neighbors per transition [inferred: 1]")
     over_neighbors: Literal["mean", "max"] = Field(
         default="mean",
-        description="mean over a transition's neighbors [paper], or the largest of them, which "
+        description="mean over a transition's neighbors [paper] or the largest penalty, which "
         "needs num_samples above 1",
     )
     fraction: float = Field(
         default=1.0,
         gt=0,
         le=1,
-        description="share of the batch that has neighbors; smaller ones cost less in large "
-        "batches, and are noisier [paper: all]",
+        description="share of the batch that has neighbors; smaller values save time in large "
+        "batches and make the terms noisier [paper: all]",
     )
     policy_distance: Literal["hellinger", "mean", "mse", "kl"] = Field(
         default="hellinger",
-        description="how policies are compared: hellinger [paper], half the squared distance of "
-        "their means before the squashing, these means' squared error, a mean over the action's "
-        "dimensions, or the KL divergence; they need other gains; of deterministic policies (td3) "
-        "the first two are half the squared distance of the actions",
+        description="distance of policies: hellinger [paper]; mean: half the squared distance of "
+        "the means before the squashing; mse: their mean squared error over the action's "
+        "dimensions; kl: the KL divergence. Each needs other gains. For deterministic policies "
+        "(td3), hellinger and mean are half the squared distance of the actions",
     )
 
     tchebycheff_mu: float | None = Field(
         default=None,
         gt=0,
-        description="the policy descends the smooth maximum of its loss and its regularization, "
-        "smoother for larger values; null: their sum [paper]",
+        description="temperature of the smooth maximum of the policy's loss and its penalty, which "
+        "the policy minimizes; larger values are smoother; null: their sum [paper]",
     )
     tchebycheff_ideal: float | None = Field(
         default=None,
-        description="of tchebycheff_mu: the policy's loss that is hoped for, as minus the largest "
-        "value; null: 0",
+        description="smallest expected policy loss, with tchebycheff_mu; for example minus the "
+        "largest value; null: 0",
     )
 
     def __post_init__(self) -> None:
@@ -93,12 +96,12 @@ class L2C2Config(GainConfig):
         if self.tchebycheff_ideal is not None and self.tchebycheff_mu is None:
             raise SettingError(
                 "tchebycheff_ideal",
-                f"is of tchebycheff_mu, which is null, got {self.tchebycheff_ideal}: set both.",
+                f"works only with tchebycheff_mu, got {self.tchebycheff_ideal}: set both.",
             )
 
     @property
     def neighborhood(self) -> Neighborhood:
-        """Where neighbors are drawn, for the loss and the transform alike."""
+        """The neighborhood of the loss and the transform."""
         from torchrl_l2c2.neighborhood import Neighborhood
 
         return Neighborhood(

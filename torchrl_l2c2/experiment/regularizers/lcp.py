@@ -1,4 +1,4 @@
-"""LCP, a rival: a penalty on the gradient of the log-likelihood."""
+"""Settings of LCP: a penalty on the gradient of the log-likelihood."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ if TYPE_CHECKING:
 
 @settings
 class LCPConfig(GainConfig):
-    """A rival, LCPLoss."""
+    """Settings of LCPLoss."""
 
     name: str = "lcp"
     coeff: float = Field(default=0.002, ge=0, description="gain of the squared gradient")
     of: Literal["log_prob", "mean"] = Field(
         default="log_prob",
-        description="gradient of the log-likelihood, its authors', or of the mean action, which "
-        "noise does not lower",
+        description="function to differentiate: the log-likelihood [the authors' choice] or the "
+        "mean action, whose gradient does not fall when the policy gets wider",
     )
 
     def wrap(self, loss: LossModule) -> LossModule:

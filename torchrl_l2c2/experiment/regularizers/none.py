@@ -1,4 +1,4 @@
-"""No regularizer: the paper's vanilla."""
+"""No regularizer: the baseline."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 @settings
 class NoRegularizerConfig(RegularizerConfig):
-    """The loss as it is: the paper's vanilla."""
+    """The loss without a regularizer: the baseline."""
 
     name: str = "none"
 

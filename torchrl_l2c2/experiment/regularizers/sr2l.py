@@ -1,4 +1,4 @@
-"""SR2L, a rival: the worst state in a small box."""
+"""Settings of SR2L: the worst state in a small box."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ if TYPE_CHECKING:
 
 @settings
 class SR2LConfig(GainConfig):
-    """A rival, SR2LLoss; its update costs several others."""
+    """Settings of SR2LLoss. An update takes several times as long as with other regularizers."""
 
     name: str = "sr2l"
     epsilon: float = Field(
         default=0.05, gt=0, description="half the width of the box, in the observation's units"
     )
-    coeff: float = Field(default=0.1, ge=0, description="gain of the largest distance in it")
-    steps: int = Field(default=10, ge=1, description="of the ascent to it")
+    coeff: float = Field(default=0.1, ge=0, description="gain of the largest distance in the box")
+    steps: int = Field(default=10, ge=1, description="ascent steps to the largest distance")
     policy_distance: Literal["jeffreys", "hellinger", "mean", "mse", "kl"] = Field(
         default="jeffreys",
-        description="how policies are compared; deterministic ones by their actions, and not by kl",
+        description="distance of policies; deterministic policies are compared by their actions, "
+        "and kl does not work with them",
     )
 
     def wrap(self, loss: LossModule) -> LossModule:
