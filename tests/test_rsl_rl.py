@@ -587,7 +587,7 @@ def test_the_groups_that_move_can_be_chosen() -> None:
     assert ppo.regularization.neighbors.in_keys == ["policy"]
     assert ppo.regularization.neighbors.out_key == "near"
     assert update(collected(ppo))["l2c2_critic"] > 0
-    with pytest.raises(ValueError, match=r"\['privileged'\], but actor_network reads only \['policy'\]"):
+    with pytest.raises(ValueError, match=r"privileged.*, but actor_network reads only .*policy"):
         make(rsl.L2C2PPO, regularizer_cfg={"moved_keys": ["privileged"], "beta": 0.5})
     with pytest.raises(ValueError, match=r"names \['nonsense'\], .*'policy', 'privileged'"):
         make(rsl.L2C2PPO, regularizer_cfg={"moved_keys": ["nonsense"], "beta": 0.5})
