@@ -36,6 +36,7 @@ from tensordict.nn import (
 )
 from torch import nn
 from torchrl.data import Bounded
+from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.modules import (
     Actor,
     LSTMModule,
@@ -215,10 +216,12 @@ class TestTheClass:
                     wrong.append(i)
 
         threads = [threading.Thread(target=ask, args=(i,)) for i in range(2)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
+        # TorchRL has one exploration type for all threads: they may leave each other's behind.
+        with set_exploration_type(ExplorationType.RANDOM):
+            for thread in threads:
+                thread.start()
+            for thread in threads:
+                thread.join()
         assert expected[0] != expected[1] and not wrong
 
     def test_a_loss_may_call_itself(self):

@@ -131,7 +131,7 @@ def check_device_found(device: str) -> None:
     """Refuses a device that PyTorch does not find.
 
     Raises:
-        SettingError: with the number of those that it finds.
+        SettingError: The device is not there; names the number of CUDA devices.
     """
     found = torch.cuda.device_count()
     if device != "cpu" and (torch.device(device).index or 0) >= found:
