@@ -22,7 +22,7 @@ import logging, sys, time
 import torch
 logging.getLogger("torchrl").setLevel(logging.ERROR)
 torch.set_num_threads(1)
-from benchmarks.speed import Effort, updates
+from benchmarks.setups import Effort, updates
 from torchrl_l2c2 import make_actor
 from torchrl_l2c2.experiment import TaskConfig, make_env
 from torchrl_l2c2.experiment.collection import EpisodeCollector
