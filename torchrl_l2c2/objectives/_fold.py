@@ -134,7 +134,7 @@ def make_part(
                 if value.ndim and not term.ndim and self._term_reduction == "sum":
                     term = term / value.numel()  # The loop sums the unreduced values.
                 value = add_penalty(value, self._folded_value(key, term), str(returned))
-                metadata["penalty_" + key.removeprefix("loss_")] = term.detach()
+                metadata[penalty_key(key)] = term.detach()
         return (value, *rest) if isinstance(out, tuple) else value
 
     return part
@@ -228,3 +228,13 @@ class TermWatch:
 
 def _forget(pending: set[str], key: str, gradient: Tensor) -> None:
     pending.discard(key)
+
+
+def penalty_key(term: str) -> str:
+    """The key under which a folded term is reported.
+
+    Examples:
+        >>> penalty_key("loss_l2c2_actor")
+        'penalty_l2c2_actor'
+    """
+    return "penalty_" + term.removeprefix("loss_")

@@ -28,7 +28,14 @@ from torchrl_l2c2.objectives._batch import (
     next_key,
     spread_rows,
 )
-from torchrl_l2c2.objectives._fold import PARTS, TermWatch, add_penalty, fold_targets, make_part
+from torchrl_l2c2.objectives._fold import (
+    PARTS,
+    TermWatch,
+    add_penalty,
+    fold_targets,
+    make_part,
+    penalty_key,
+)
 from torchrl_l2c2.objectives._networks import (
     POLICY_NETWORK,
     VALUE_NETWORKS,
@@ -845,16 +852,6 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             specs = (self._evaluation.specs[name] for name in self._followed)
             successors = (next_key(key) for spec in specs for key in spec.states)
             self.in_keys = list(dict.fromkeys([*self.in_keys, *successors, *self._inputs]))
-
-
-def penalty_key(term: str) -> str:
-    """The key under which a folded term is reported.
-
-    Examples:
-        >>> penalty_key("loss_l2c2_actor")
-        'penalty_l2c2_actor'
-    """
-    return "penalty_" + term.removeprefix("loss_")
 
 
 def listed_names(names: Iterable[str]) -> list[str]:
