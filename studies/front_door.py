@@ -100,7 +100,7 @@ def train_td3(seed: int, smoothed: bool, frames: int = 5_000) -> torch.nn.Module
     return actor
 
 
-def train_ppo(seed: int, smoothed: bool, frames: int = 30_720) -> torch.nn.Module:
+def train_ppo(seed: int, smoothed: bool, frames: int = 61_440) -> torch.nn.Module:
     """PPO on rollouts of 2,048 frames."""
     env = pendulum(seed)
     actor, critic = make_actor(3, env.action_spec, hidden=(64, 64)), make_critic(3, hidden=(64, 64))
