@@ -18,7 +18,13 @@ import torch
 from tensordict.nn import TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
-from torchrl.envs import ExplorationType, GymEnv, set_exploration_type
+from torchrl.envs import (
+    ExplorationType,
+    GymEnv,
+    RewardScaling,
+    TransformedEnv,
+    set_exploration_type,
+)
 from torchrl.modules import MLP, Actor, AdditiveGaussianModule, TanhModule, ValueOperator
 from torchrl.objectives import ClipPPOLoss, LossModule, SACLoss, SoftUpdate, TD3Loss
 from torchrl.objectives.value import GAE
@@ -100,9 +106,9 @@ def train_td3(seed: int, smoothed: bool, frames: int = 5_000) -> torch.nn.Module
     return actor
 
 
-def train_ppo(seed: int, smoothed: bool, frames: int = 61_440) -> torch.nn.Module:
-    """PPO on rollouts of 2,048 frames."""
-    env = pendulum(seed)
+def train_ppo(seed: int, smoothed: bool, frames: int = 30_720) -> torch.nn.Module:
+    """PPO on rollouts of 2,048 frames, with rewards of about 1."""
+    env = TransformedEnv(pendulum(seed), RewardScaling(loc=0.0, scale=0.1))
     actor, critic = make_actor(3, env.action_spec, hidden=(64, 64)), make_critic(3, hidden=(64, 64))
     loss: LossModule = ClipPPOLoss(actor, critic, normalize_advantage=True, entropy_coeff=0.0)
     advantage = GAE(gamma=0.9, lmbda=0.95, value_network=critic)
