@@ -20,15 +20,15 @@ from torchrl_l2c2.experiment import (
     TaskConfig,
     make_env,
 )
-from torchrl_l2c2.experiment.acting import on_tensors
-from torchrl_l2c2.experiment.environments import quiet_output
+from torchrl_l2c2.experiment.collect.acting import on_tensors
+from torchrl_l2c2.experiment.envs.environments import quiet_output, time_limit
 from torchrl_l2c2.modules import make_actor
 
 
 def collection_rows(effort: Effort) -> Iterable[Row]:
     """Frames with noise, stored as batches, against the simulator's with the same policy."""
     for name, task in PAPER_TASKS.items():
-        task = dataclasses.replace(task, max_steps=min(task.time_limit, effort.steps))
+        task = dataclasses.replace(task, max_steps=min(time_limit(task), effort.steps))
         env = make_env(task, seed=0)
         actor = make_actor(env.observation_spec["observation"].shape[-1], env.action_spec)
         collector = EpisodeCollector(
@@ -65,13 +65,13 @@ def worker_rows(effort: Effort) -> Iterable[Row]:
         env = make_env(task, seed=0)
         actor = make_actor(env.observation_spec["observation"].shape[-1], env.action_spec)
         one = EpisodeCollector(
-            env, actor, frames_per_batch=task.time_limit, compile_policy=effort.compile
+            env, actor, frames_per_batch=time_limit(task), compile_policy=effort.compile
         )
         two = MultiEpisodeCollector(
             partial(make_env, task, 0),
             actor,
             num_workers=2,
-            max_steps=task.time_limit,
+            max_steps=time_limit(task),
             compile_policy=effort.compile,
         )
         times = alternate(

@@ -24,10 +24,11 @@ from omegaconf import OmegaConf
 from benchmarks.timing import machine
 from studies.paper import is_as_usual
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig
-from torchrl_l2c2.experiment.composition import CONF
-from torchrl_l2c2.experiment.regularizers import REGULARIZERS
-from torchrl_l2c2.experiment.reports import Record, read_records
-from torchrl_l2c2.experiment.tasks import TASKS
+from torchrl_l2c2.experiment.analysis.reports import Record, read_records
+from torchrl_l2c2.experiment.cli.composition import CONF
+from torchrl_l2c2.experiment.envs.environments import time_limit
+from torchrl_l2c2.experiment.settings.regularizers import REGULARIZERS
+from torchrl_l2c2.experiment.settings.tasks import TASKS
 
 RECORDS = Path(__file__).parents[1] / "results" / "runs.csv"
 CORES = (1, 2, 4, 16, 64, 128, 256, 512)
@@ -93,7 +94,7 @@ def paced(task: str, method: str) -> float:
     took = time.process_time() - start
     pace = (experiment.player.frames - frames) / took
     experiment.close()
-    return start - begun + config.task.episodes * config.task.time_limit / pace
+    return start - begun + config.task.episodes * time_limit(config.task) / pace
 
 
 def main() -> None:

@@ -76,7 +76,7 @@ def _train_here(
         NoRegularizerConfig,
         TaskConfig,
     )
-    from torchrl_l2c2.experiment.process import keep_freed_memory
+    from torchrl_l2c2.experiment.run.process import keep_freed_memory
 
     keep_freed_memory()  # As train.py does.
     task = TaskConfig(

@@ -8,9 +8,9 @@ from functools import partial
 from benchmarks.setups import Effort
 from benchmarks.timing import Row, alternate
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig, PPOConfig, TaskConfig
-from torchrl_l2c2.experiment.regularizers import REGULARIZERS
-from torchrl_l2c2.experiment.reports.names import method_name
-from torchrl_l2c2.experiment.update import ReplayUpdate
+from torchrl_l2c2.experiment.analysis.reports.names import method_name
+from torchrl_l2c2.experiment.learn.update import ReplayUpdate
+from torchrl_l2c2.experiment.settings.regularizers import REGULARIZERS
 
 # Whole trainings of PPO on Walker2d over those without a regularizer, in CATS (arXiv 2610.07910).
 PUBLISHED = {"caps": 1.286, "l2c2": 1.771, "grad_caps": 1.302, "asap": 1.405, "cats": 1.198}

@@ -15,7 +15,8 @@ import torch
 from benchmarks.setups import Effort, paper_config, play_episode
 from benchmarks.timing import Row, alternate
 from torchrl_l2c2.experiment import Experiment
-from torchrl_l2c2.experiment.metrics_log import MetricsLog
+from torchrl_l2c2.experiment.envs.environments import time_limit
+from torchrl_l2c2.experiment.run.metrics_log import MetricsLog
 
 ROOT = Path(__file__).parent.parent
 
@@ -32,7 +33,7 @@ def run_rows(effort: Effort) -> Iterable[Row]:
         draw = learner.draw()
         priority = torch.rand(len(draw.rows))
         episode = parts.player.collector.rollout()
-        frames = config.task.time_limit
+        frames = time_limit(config.task)
         summed: dict[str, Callable[[], object]] = {
             "collect": partial(_of_episode, parts.player.collector.rollout, frames),
             "store": partial(_of_episode, lambda: parts.learner.remember(episode), frames),

@@ -22,7 +22,8 @@ from torchrl_l2c2.experiment import (
     PrioritizedReplayConfig,
     TaskConfig,
 )
-from torchrl_l2c2.experiment.update import ReplayUpdate, make_update
+from torchrl_l2c2.experiment.agents.optimizers import make_optimizer
+from torchrl_l2c2.experiment.learn.update import ReplayUpdate, make_update
 from torchrl_l2c2.updaters import TSoftUpdate
 
 REGULARIZERS = {
@@ -85,7 +86,7 @@ def updates(
         draw = update.draw()
         return lambda: update.update(True, *draw)
     agent.loss.to(device)
-    agent.optimizer = config.optimizer.make(agent.loss.parameters())
+    agent.optimizer = make_optimizer(config.optimizer, agent.loss.parameters())
     agent.target_updater = TSoftUpdate(agent.loss)
     step = make_update(agent, compile=False)
     if compile:

@@ -15,36 +15,25 @@ import os
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterable
+from importlib import import_module
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import torch
-from tqdm import tqdm
-
-from benchmarks.collection_rows import collection_rows, worker_rows
-from benchmarks.peers import peer_rows
-from benchmarks.regularizer_rows import regularizer_rows
-from benchmarks.run_rows import import_rows, process_rows, run_rows, start_rows, work
-from benchmarks.setups import QUICK, Effort
-from benchmarks.timing import Row, machine, to_markdown, to_text
-from benchmarks.update_rows import cuda_rows, large_update_rows, ppo_update_rows, update_rows
-from torchrl_l2c2.experiment.process import keep_freed_memory
-
-ROWS: dict[str, Callable[[Effort], Iterable[Row]]] = {
-    "import": import_rows,
-    "update": update_rows,
-    "ppo_update": ppo_update_rows,
-    "regularizers": regularizer_rows,
-    "update_4096": large_update_rows,
-    "collection": collection_rows,
-    "workers": worker_rows,
-    "run": run_rows,
-    "start": start_rows,
-    "peers": peer_rows,
-    "processes": process_rows,
-    "cuda": cuda_rows,
+# Module and function of each group of rows; imported when it is measured, so that --help is quick.
+ROWS = {
+    "import": "run_rows.import_rows",
+    "update": "update_rows.update_rows",
+    "ppo_update": "update_rows.ppo_update_rows",
+    "regularizers": "regularizer_rows.regularizer_rows",
+    "update_4096": "update_rows.large_update_rows",
+    "collection": "collection_rows.collection_rows",
+    "workers": "collection_rows.worker_rows",
+    "run": "run_rows.run_rows",
+    "start": "run_rows.start_rows",
+    "peers": "peers.peer_rows",
+    "processes": "run_rows.process_rows",
+    "cuda": "update_rows.cuda_rows",
 }
 
 
@@ -66,6 +55,14 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
 def main(arguments: list[str] | None = None) -> None:
     """Measures, prints and writes the rows."""
     options = _parse(arguments)
+    import torch
+    from tqdm import tqdm
+
+    from benchmarks.run_rows import work
+    from benchmarks.setups import QUICK, Effort
+    from benchmarks.timing import machine, to_markdown, to_text
+    from torchrl_l2c2.experiment.run.process import keep_freed_memory
+
     for chatty in ("torchrl", "torch"):
         logging.getLogger(chatty).setLevel(logging.ERROR)
     warnings.simplefilter("ignore")
@@ -81,7 +78,8 @@ def main(arguments: list[str] | None = None) -> None:
     for group in tqdm(options.rows, disable=None):
         # Functions of one source share what was compiled for them: begin anew.
         torch.compiler.reset()
-        for row in ROWS[group](effort):
+        module, _, function = ROWS[group].partition(".")
+        for row in getattr(import_module(f"benchmarks.{module}"), function)(effort):
             tqdm.write(to_text(row))
             rows.append(row)
     result = {

@@ -21,10 +21,10 @@ from omegaconf import OmegaConf
 from benchmarks.timing import machine
 from torchrl_l2c2 import action_variation
 from torchrl_l2c2.experiment import ExperimentConfig
-from torchrl_l2c2.experiment.composition import CONF, check_preset, register
-from torchrl_l2c2.experiment.environments import TEST_SEED
-from torchrl_l2c2.experiment.settings import SettingError
-from torchrl_l2c2.experiment.tasks import FIELD_TASKS
+from torchrl_l2c2.experiment.cli.composition import CONF, check_preset, register
+from torchrl_l2c2.experiment.envs.environments import TEST_SEED
+from torchrl_l2c2.experiment.settings.fields import SettingError
+from torchrl_l2c2.experiment.settings.tasks import FIELD_TASKS
 from torchrl_l2c2.metrics import spectral_smoothness
 
 PEER = Path(__file__).with_name("zoo_peer.py")

@@ -1,6 +1,6 @@
 """An exported policy in its simulator, with ONNX Runtime, Gymnasium and NumPy only.
 
-``python -m torchrl_l2c2.experiment.export RUN`` writes the folder; ``python examples/onnx_policy.py
+``python -m torchrl_l2c2 export RUN`` writes the folder; ``python examples/onnx_policy.py
 RUN/export 10`` plays ten episodes with it.
 """
 

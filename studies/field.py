@@ -6,18 +6,23 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from studies.paper import is_of_own_task
-from torchrl_l2c2.experiment.finished import Record
-from torchrl_l2c2.experiment.reports.comparison import (
+from torchrl_l2c2.experiment.analysis.reports.comparison import (
     COMPARED,
     INTERVAL_NOTE,
     Estimate,
     estimate_cell,
     improvement_cell,
 )
-from torchrl_l2c2.experiment.reports.groups import Group, baseline_of, by_task, group_records
-from torchrl_l2c2.experiment.reports.statistics import mean
-from torchrl_l2c2.experiment.reports.tables import Table, number_range, of_runs
-from torchrl_l2c2.experiment.tasks import FIELD_TASKS
+from torchrl_l2c2.experiment.analysis.reports.groups import (
+    Group,
+    baseline_of,
+    by_task,
+    group_records,
+)
+from torchrl_l2c2.experiment.analysis.reports.statistics import mean
+from torchrl_l2c2.experiment.analysis.reports.tables import Table, number_range, of_runs
+from torchrl_l2c2.experiment.run.finished import Record
+from torchrl_l2c2.experiment.settings.tasks import FIELD_TASKS
 
 
 class PublishedCell(NamedTuple):

@@ -10,10 +10,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from studies.field import BETTER, TEST, field_groups, known_cell
-from torchrl_l2c2.experiment.finished import Record
-from torchrl_l2c2.experiment.reports.comparison import COMPARED, INTERVAL_NOTE, improvement_cell
-from torchrl_l2c2.experiment.reports.groups import Group, baseline_of, over_tasks
-from torchrl_l2c2.experiment.reports.tables import Table, number, number_range, of_runs, or_dash
+from torchrl_l2c2.experiment.analysis.reports.comparison import (
+    COMPARED,
+    INTERVAL_NOTE,
+    improvement_cell,
+)
+from torchrl_l2c2.experiment.analysis.reports.groups import Group, baseline_of, over_tasks
+from torchrl_l2c2.experiment.analysis.reports.tables import (
+    Table,
+    number,
+    number_range,
+    of_runs,
+    or_dash,
+)
+from torchrl_l2c2.experiment.run.finished import Record
 
 CHOICE_LEGEND = (
     "Compared with vanilla's runs of the same seeds and other settings, smoothest first; the "

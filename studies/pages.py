@@ -26,14 +26,18 @@ from studies.paper import (
     statistics_table,
 )
 from studies.targets import gain_targets_table
-from torchrl_l2c2.experiment.files import write_atomically
-from torchrl_l2c2.experiment.finished import Record
-from torchrl_l2c2.experiment.reports.comparison import COMPARED, Estimate, improvement_cell
-from torchrl_l2c2.experiment.reports.figures import draw_plane
-from torchrl_l2c2.experiment.reports.groups import Group, group_records
-from torchrl_l2c2.experiment.reports.records import digest, merge, read_records
-from torchrl_l2c2.experiment.reports.statistics import mean
-from torchrl_l2c2.experiment.reports.tables import number_range, settings_notes
+from torchrl_l2c2.experiment.analysis.reports.comparison import (
+    COMPARED,
+    Estimate,
+    improvement_cell,
+)
+from torchrl_l2c2.experiment.analysis.reports.figures import draw_plane
+from torchrl_l2c2.experiment.analysis.reports.groups import Group, group_records
+from torchrl_l2c2.experiment.analysis.reports.records import digest, merge, read_records
+from torchrl_l2c2.experiment.analysis.reports.statistics import mean
+from torchrl_l2c2.experiment.analysis.reports.tables import number_range, settings_notes
+from torchrl_l2c2.experiment.run.files import write_atomically
+from torchrl_l2c2.experiment.run.finished import Record
 
 ROOT = Path(__file__).parents[1]
 FIELD_PAGES = ("field", "hopper", "sac_lunarlander", "sac_pendulum", "walker2d")

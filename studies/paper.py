@@ -6,18 +6,18 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from torchrl_l2c2.experiment.finished import QUANTITIES, TESTS, Record
-from torchrl_l2c2.experiment.reports.comparison import (
+from torchrl_l2c2.experiment.analysis.reports.comparison import (
     COMPARED,
     INTERVAL_NOTE,
     comparison_table,
     improvement_cell,
     improvements_over_tasks,
 )
-from torchrl_l2c2.experiment.reports.groups import Group, baseline_of, group_records
-from torchrl_l2c2.experiment.reports.statistics import interquartile_mean
-from torchrl_l2c2.experiment.reports.tables import Table, number, number_range, pooled
-from torchrl_l2c2.experiment.tasks import TASKS
+from torchrl_l2c2.experiment.analysis.reports.groups import Group, baseline_of, group_records
+from torchrl_l2c2.experiment.analysis.reports.statistics import interquartile_mean
+from torchrl_l2c2.experiment.analysis.reports.tables import Table, number, number_range, pooled
+from torchrl_l2c2.experiment.run.finished import QUANTITIES, TESTS, Record
+from torchrl_l2c2.experiment.settings.tasks import TASKS
 
 
 class Published(NamedTuple):

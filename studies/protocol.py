@@ -17,15 +17,15 @@ from pathlib import Path
 from typing import Any
 
 from studies.paper import is_of_paper, paper_of, paper_table
-from torchrl_l2c2.experiment.config import ExperimentConfig
+from torchrl_l2c2.experiment.analysis.reports.groups import Group, group_records
+from torchrl_l2c2.experiment.analysis.reports.names import method_name
+from torchrl_l2c2.experiment.analysis.reports.records import merge, read_records, write_records
+from torchrl_l2c2.experiment.analysis.reports.runs import find_runs
+from torchrl_l2c2.experiment.analysis.reports.tables import Table, number_range, or_dash
 from torchrl_l2c2.experiment.errors import UserError, told_in_a_line
-from torchrl_l2c2.experiment.finished import QUANTITIES, TESTS, FinishedRun, Record
-from torchrl_l2c2.experiment.identity import of_length
-from torchrl_l2c2.experiment.reports.groups import Group, group_records
-from torchrl_l2c2.experiment.reports.names import method_name
-from torchrl_l2c2.experiment.reports.records import merge, read_records, write_records
-from torchrl_l2c2.experiment.reports.runs import find_runs
-from torchrl_l2c2.experiment.reports.tables import Table, number_range, or_dash
+from torchrl_l2c2.experiment.run.finished import QUANTITIES, TESTS, FinishedRun, Record
+from torchrl_l2c2.experiment.settings.config import ExperimentConfig
+from torchrl_l2c2.experiment.settings.identity import of_length
 
 METHODS = ("none", "caps")  # L2C2 is not looked at until a reading is taken.
 CAP = 5.0

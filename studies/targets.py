@@ -5,9 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
-from torchrl_l2c2.experiment.finished import QUANTITIES, Record
-from torchrl_l2c2.experiment.reports.groups import Group, baseline_of, by_task, group_records
-from torchrl_l2c2.experiment.reports.tables import Table, number, number_range, or_dash, pooled
+from torchrl_l2c2.experiment.analysis.reports.groups import (
+    Group,
+    baseline_of,
+    by_task,
+    group_records,
+)
+from torchrl_l2c2.experiment.analysis.reports.tables import (
+    Table,
+    number,
+    number_range,
+    or_dash,
+    pooled,
+)
+from torchrl_l2c2.experiment.run.finished import QUANTITIES, Record
 
 # A target is followed in training's own episodes, and is to hold of a policy that is deployed.
 FOLLOWED, DEPLOYED = "late_sampled", "last_mean"

@@ -23,9 +23,9 @@ IMPORTED.set_forkserver_preload(
         "matplotlib.figure",
         "pybullet_envs_gymnasium",
         "torchrl.objectives",
-        "torchrl_l2c2.experiment.command",
-        "torchrl_l2c2.experiment.diagnosis",
-        "torchrl_l2c2.experiment.training",
+        "torchrl_l2c2.experiment.cli.train",
+        "torchrl_l2c2.experiment.analysis.diagnosis",
+        "torchrl_l2c2.experiment.run.experiment",
     ]
 )
 

@@ -19,8 +19,8 @@ from torchrl_l2c2.experiment import (
     TD3Config,
     UniformReplayConfig,
 )
-from torchrl_l2c2.experiment.composition import CONF, register
-from torchrl_l2c2.experiment.config import GROUPS
+from torchrl_l2c2.experiment.cli.composition import CONF, register
+from torchrl_l2c2.experiment.settings.config import GROUPS
 
 ALGORITHMS = {
     "ppo_rpe": PPORPEConfig(hidden=(8,), replay_ratio=2.0),

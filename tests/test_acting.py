@@ -11,8 +11,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import Actor, AdditiveGaussianModule, EGreedyModule, QValueActor
 
 from tests.losses import OBSERVATION, gaussian_actor, mlp
-from torchrl_l2c2.experiment.acting import on_tensors
-from torchrl_l2c2.experiment.compilation import compiler_available
+from torchrl_l2c2.experiment.collect.acting import on_tensors
+from torchrl_l2c2.experiment.learn.compilation import compiler_available
 
 BOX, CHOICES = Bounded(-1, 1, (2,)), OneHot(4)
 POLICIES = {

@@ -16,19 +16,21 @@ from torchrl_l2c2.experiment import (
     ExperimentConfig,
     PPORPEConfig,
     TaskConfig,
-    diagnose,
-    evaluate,
     evaluate_policy,
-    export,
     load_policy,
-    video,
 )
-from torchrl_l2c2.experiment.acting import exploring_in
-from torchrl_l2c2.experiment.evaluate import main
-from torchrl_l2c2.experiment.regularizers import REGULARIZERS
+from torchrl_l2c2.experiment.agents.agent import exploring_in
+from torchrl_l2c2.experiment.cli import diagnose, export, video
+from torchrl_l2c2.experiment.cli.evaluate import main
+from torchrl_l2c2.experiment.run.evaluation import Evaluation
+from torchrl_l2c2.experiment.settings.regularizers import REGULARIZERS
 
 # What each command begins with.
-LOADS = {evaluate: "load_policy", diagnose: "diagnose_run", video: "play_pictures"}
+LOADS = (
+    "run.policies.load_policy",
+    "analysis.diagnosis.diagnose_run",
+    "analysis.video.play_pictures",
+)
 
 TASK = TaskConfig("pendulum", "Pendulum-v1", episodes=6, max_steps=40)
 FEW_UPDATES = {"task": TASK, "algorithm": PPORPEConfig(replay_ratio=1.0), "compile": False}
@@ -148,8 +150,8 @@ def test_what_could_not_be_written_is_refused_before_it_is_played(
     pytest.importorskip("imageio_ffmpeg")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
-    for module in (evaluate, diagnose, video):
-        monkeypatch.setattr(f"{module.__name__}.{LOADS[module]}", None)
+    for name in LOADS:
+        monkeypatch.setattr(f"torchrl_l2c2.experiment.{name}", None)
     with pytest.raises(SystemExit, match=f"error: .*{told}"):
         main([str(folder), option])
     other = diagnose if option.startswith("--output") else video
@@ -160,8 +162,8 @@ def test_what_could_not_be_written_is_refused_before_it_is_played(
 def test_the_summary_is_json_and_is_told_before_anything_is_written(folder, capsys, monkeypatch):
     """What is no number, such as a measure of too short an episode, is null."""
     figures = {"return_mean": 1.0, "roughness_mean": math.nan}
-    monkeypatch.setattr(evaluate.Evaluation, "summary", lambda self: figures)
-    monkeypatch.setattr(evaluate, "write_json", broken)
+    monkeypatch.setattr(Evaluation, "summary", lambda self: figures)
+    monkeypatch.setattr("torchrl_l2c2.experiment.run.files.write_json", broken)
     with pytest.raises(SystemExit, match="error: no space left"):
         main([str(folder), "--episodes", "1", "--output", str(folder / "result.json")])
     told = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
@@ -187,10 +189,10 @@ def test_numbers_that_are_not_finite_end_every_command_in_one_line(folder, monke
     def diverged(*_, **__):
         raise FloatingPointError("reward is not finite at frame 5")
 
-    for module, name in LOADS.items():
-        monkeypatch.setattr(module, name, diverged)
+    for command, name in zip((main, diagnose.main, video.main), LOADS, strict=True):
+        monkeypatch.setattr(f"torchrl_l2c2.experiment.{name}", diverged)
         with pytest.raises(SystemExit, match="error: reward is not finite at frame 5"):
-            module.main([str(folder)])
+            command([str(folder)])
 
 
 def test_evaluate_refuses_what_cannot_be(folder, tmp_path):

@@ -7,8 +7,8 @@ import struct
 import pytest
 import torch
 
-from torchrl_l2c2.experiment import checkpoints
-from torchrl_l2c2.experiment.checkpoints import (
+from torchrl_l2c2.experiment.run import checkpoints
+from torchrl_l2c2.experiment.run.checkpoints import (
     FORMAT_VERSION,
     HEADER,
     MAGIC,
@@ -18,9 +18,9 @@ from torchrl_l2c2.experiment.checkpoints import (
     load_newest,
     save_checkpoint,
 )
-from torchrl_l2c2.experiment.config import ExperimentConfig
-from torchrl_l2c2.experiment.files import append_line
-from torchrl_l2c2.experiment.folder import begin_folder
+from torchrl_l2c2.experiment.run.files import append_line
+from torchrl_l2c2.experiment.run.folder import begin_folder
+from torchrl_l2c2.experiment.settings.config import ExperimentConfig
 
 STATE = {"weights": torch.arange(100.0), "episode": 7, "names": ["a", "b"]}
 
@@ -160,7 +160,9 @@ def test_a_line_that_the_disk_has_no_room_for_is_taken_back(tmp_path, monkeypatc
             return super().write(content[:2])
 
     monkeypatch.setattr(
-        "torchrl_l2c2.experiment.files.open", lambda path, *_, **__: Full(path, "ab"), raising=False
+        "torchrl_l2c2.experiment.run.files.open",
+        lambda path, *_, **__: Full(path, "ab"),
+        raising=False,
     )
     with pytest.raises(OSError, match="No space left on device: this could not be written"):
         append_line(path, "another\n")

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from tests.test_sweep import alive, episodes, numbers, runs, said, start, wait_until
-from torchrl_l2c2.experiment.checkpoints import list_checkpoints
-from torchrl_l2c2.experiment.reports import read_runs, sweep_summary
+from torchrl_l2c2.experiment.analysis.reports import read_runs, sweep_summary
+from torchrl_l2c2.experiment.run.checkpoints import list_checkpoints
 
 SWEEP = ("-m", "seed=0,1,2,3", "task.episodes=40", "compile=false", "checkpoint_interval=0")
 

@@ -32,9 +32,9 @@ from torchrl_l2c2.experiment import (
     UniformReplayConfig,
     make_env,
 )
-from torchrl_l2c2.experiment.collection import play_episodes
-from torchrl_l2c2.experiment.frames import Frame, stack_frames
-from torchrl_l2c2.experiment.rollouts import RolloutCollector
+from torchrl_l2c2.experiment.collect.episodes import play_episodes
+from torchrl_l2c2.experiment.collect.rollouts import RolloutCollector
+from torchrl_l2c2.experiment.envs.frames import Frame, stack_frames
 
 HOPPER = TaskConfig("hopper", "pybullet_envs_gymnasium:HopperBulletEnv-v0", noise_scale=0.001)
 

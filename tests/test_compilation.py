@@ -5,7 +5,8 @@ import torch
 from torch._inductor import config as inductor_config
 from torch._inductor.utils import run_and_get_code
 
-from torchrl_l2c2.experiment.compilation import CompilerError, compiled, compiler_available
+from torchrl_l2c2.experiment.errors import CompilerError
+from torchrl_l2c2.experiment.learn.compilation import compiled, compiler_available
 
 pytestmark = pytest.mark.skipif(not compiler_available(), reason="no C++ compiler")
 

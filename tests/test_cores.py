@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.cores import RECORDS, makespan, recorded, report, sweep
-from torchrl_l2c2.experiment.reports import read_records
+from torchrl_l2c2.experiment.analysis.reports import read_records
 
 ROOT = Path(__file__).parents[1]
 

@@ -10,13 +10,9 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchrl_l2c2 import Neighborhood
-from torchrl_l2c2.experiment import (
-    AdamConfig,
-    Experiment,
-    ExperimentConfig,
-    TaskConfig,
-)
-from torchrl_l2c2.experiment.settings import SettingError
+from torchrl_l2c2.experiment import AdamConfig, Experiment, ExperimentConfig, TaskConfig
+from torchrl_l2c2.experiment.agents.build import make_agent
+from torchrl_l2c2.experiment.settings.fields import SettingError
 from torchrl_l2c2.optim.adaterm import adaterm
 from torchrl_l2c2.transforms.neighbors import draw_neighbors
 from torchrl_l2c2.updaters import t_soft_update
@@ -56,14 +52,13 @@ def trained(chosen, folder=None):
 def test_a_copy_of_the_policy_acts_as_the_policy_does(monkeypatch, name):
     """The same bits: it has the trained parameters whenever it plays, and explores by itself."""
     numbers, result, updates = trained(config(name))
-    make_agent = ExperimentConfig.make_agent
 
-    def copying(self, env):
-        agent = make_agent(self, env)
+    def copying(config, env):
+        agent = make_agent(config, env)
         agent.act_on_cpu()
         return agent
 
-    monkeypatch.setattr(ExperimentConfig, "make_agent", copying)
+    monkeypatch.setattr("torchrl_l2c2.experiment.run.experiment.make_agent", copying)
     copied_numbers, copied_result, _ = trained(config(name))
     assert updates > 0 and copied_result == result
     assert all(torch.equal(a, b) for a, b in zip(copied_numbers, numbers, strict=True))

@@ -29,8 +29,8 @@ from torchrl_l2c2.experiment import (
     load_policy,
     make_env,
 )
-from torchrl_l2c2.experiment.diagnose import _names, _runs, main
-from torchrl_l2c2.experiment.diagnosis import (
+from torchrl_l2c2.experiment.agents.build import make_agent
+from torchrl_l2c2.experiment.analysis.diagnosis import (
     THRESHOLDS,
     Diagnosis,
     TermShare,
@@ -41,12 +41,15 @@ from torchrl_l2c2.experiment.diagnosis import (
     value_function,
     write_page,
 )
-from torchrl_l2c2.experiment.diagnosis.film import film
-from torchrl_l2c2.experiment.diagnosis.page import page
-from torchrl_l2c2.experiment.diagnosis.run import _batch
+from torchrl_l2c2.experiment.analysis.diagnosis.film import film
+from torchrl_l2c2.experiment.analysis.diagnosis.names import run_folders, run_names
+from torchrl_l2c2.experiment.analysis.diagnosis.page import page
+from torchrl_l2c2.experiment.analysis.diagnosis.run import _batch
+from torchrl_l2c2.experiment.cli.diagnose import main
 from torchrl_l2c2.experiment.errors import SimulatorError
-from torchrl_l2c2.experiment.files import make_folder_of, write_json
-from torchrl_l2c2.experiment.learner import Learner
+from torchrl_l2c2.experiment.learn.learner import Learner
+from torchrl_l2c2.experiment.learn.replay import make_replay
+from torchrl_l2c2.experiment.run.files import make_folder_of, write_json
 from torchrl_l2c2.metrics import action_variation, previous_action_gain
 
 STEPS = torch.arange(100.0)
@@ -197,7 +200,7 @@ class TestWords:
 
     def test_every_threshold_of_the_rules_is_documented(self):
         """With the number that the rules use."""
-        from torchrl_l2c2.experiment.diagnosis import words
+        from torchrl_l2c2.experiment.analysis.diagnosis import words
 
         constants = {name: value for name, value in vars(words).items() if name.isupper()}
         del constants["THRESHOLDS"]
@@ -355,7 +358,7 @@ def test_the_value_function_is_the_losss(algorithm, heads):
     config = ExperimentConfig(
         task=TaskConfig("task", "Pendulum-v1", episodes=1), algorithm=algorithm, compile=False
     )
-    loss = config.make_agent(config.task.make_env(0)).loss
+    loss = make_agent(config, make_env(config.task, 0)).loss
     observation, action = torch.randn(7, 3), torch.randn(7, 1)
     batch = TensorDict({"observation": observation, "action": action}, [7])
     value = value_function(loss)(observation, action)
@@ -449,14 +452,15 @@ class TestRun:
             task=task, algorithm=algorithm, replay=RolloutReplayConfig(batch_size=16)
         )
         env = make_env(task, 0)
-        agent, episode = config.make_agent(env), env.rollout(3, auto_reset=True)
+        agent, episode = make_agent(config, env), env.rollout(3, auto_reset=True)
         episode["next", "reward"] = torch.tensor([[1.0], [50.0], [-200.0]])
         monkeypatch.setattr(
-            "torchrl_l2c2.experiment.diagnosis.run.play_episodes", lambda *_, **__: [episode]
+            "torchrl_l2c2.experiment.analysis.diagnosis.run.play_episodes",
+            lambda *_, **__: [episode],
         )
         learned, read = [], _batch(agent, config, env, 3)
         learner = Learner(
-            agent, config.make_replay(), reward_factor=0.01, compile=False, skip_nonfinite=False
+            agent, make_replay(config), reward_factor=0.01, compile=False, skip_nonfinite=False
         )
         monkeypatch.setattr(learner.replay, "extend", learned.append)
         learner.remember(agent.normalization.normalized(episode))
@@ -478,7 +482,7 @@ class TestRun:
         def missing(*args, **kwargs):
             raise error
 
-        monkeypatch.setattr("torchrl_l2c2.experiment.diagnosis.run.play_pictures", missing)
+        monkeypatch.setattr("torchrl_l2c2.experiment.analysis.diagnosis.run.play_pictures", missing)
         assert diagnose_run(run, episodes=1).pictures == []
 
 
@@ -577,11 +581,11 @@ class TestCommand:
         tuned = L2C2Config(policy_distance="mean", lambda_min=10.0, lambda_max=1000.0)
         first = folder("0ddc7233/seed_0", regularizer=tuned)
         second = folder("none/seed_0", regularizer=NoRegularizerConfig())
-        assert _names([first, second]) == ["L2C2, means 10", "vanilla"]
+        assert run_names([first, second]) == ["L2C2, means 10", "vanilla"]
         third = folder("none/seed_1", regularizer=NoRegularizerConfig(), seed=1)
-        assert _names([first, third]) == ["L2C2, means 10/seed_0", "vanilla/seed_1"]
+        assert run_names([first, third]) == ["L2C2, means 10/seed_0", "vanilla/seed_1"]
         other = folder("sigma-2/seed_0", regularizer=replace(tuned, sigma=2.0))
-        assert _names([first, other]) == ["0ddc7233", "sigma-2"]
+        assert run_names([first, other]) == ["0ddc7233", "sigma-2"]
 
     def test_ctrl_c_is_one_line(self, run, monkeypatch, capsys):
         """Of every command that tells its errors so."""
@@ -589,7 +593,7 @@ class TestCommand:
         def stopped(*_, **__):
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("torchrl_l2c2.experiment.diagnose.diagnose_run", stopped)
+        monkeypatch.setattr("torchrl_l2c2.experiment.analysis.diagnosis.diagnose_run", stopped)
         with pytest.raises(SystemExit) as ended:
             main([str(run)])
         assert ended.value.code == 130 and capsys.readouterr().err == "interrupted.\n"
@@ -611,12 +615,12 @@ class TestCommand:
         for name in ("a", "b/seed_1", "b/seed_0"):
             (tmp_path / "above" / name).mkdir(parents=True)
             (tmp_path / "above" / name / "config.json").touch()
-        assert _runs([str(tmp_path / "above"), str(run)]) == [
+        assert run_folders([str(tmp_path / "above"), str(run)]) == [
             *(str(tmp_path / "above" / name) for name in ("a", "b/seed_0", "b/seed_1")),
             str(run),
         ]
         with pytest.raises(SystemExit):
             main([str(tmp_path / "above"), "--names", "one"])
         assert "--names: one for each of the 3 runs" in capsys.readouterr().err
-        with pytest.raises(SystemExit, match=r"^error: a run is named twice"):
+        with pytest.raises(SystemExit, match=r"^error: A run is named twice"):
             main([str(run), str(run)])

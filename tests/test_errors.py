@@ -8,16 +8,16 @@ import pytest
 import torch
 from processes import ROOT, run_train
 
-from torchrl_l2c2.experiment.checkpoints import CheckpointError
-from torchrl_l2c2.experiment.command import _tell
+from torchrl_l2c2.experiment.cli.train import _tell
 from torchrl_l2c2.experiment.errors import (
     MissingPackageError,
     SimulatorError,
     UserError,
     told_in_a_line,
 )
-from torchrl_l2c2.experiment.lock import FolderInUseError
-from torchrl_l2c2.experiment.settings import SettingError
+from torchrl_l2c2.experiment.run.checkpoints import CheckpointError
+from torchrl_l2c2.experiment.run.lock import FolderInUseError
+from torchrl_l2c2.experiment.settings.fields import SettingError
 
 TOLD = [
     UserError("a mistake"),
@@ -103,7 +103,7 @@ def test_help_may_have_no_reader():
 def test_what_is_not_there_is_told_before_torch_is_imported(tmp_path, setting, told):
     """Which takes many seconds."""
     program = (
-        "import sys\nfrom torchrl_l2c2.experiment.command import main\n"
+        "import sys\nfrom torchrl_l2c2.experiment.cli.train import main\n"
         "try:\n    main()\nfinally:\n    print('torch' in sys.modules)"
     )
     settings = ("task=gymnasium", "task.env_id=Pendulum-v1", setting)
@@ -121,11 +121,14 @@ def test_what_is_not_there_is_told_before_torch_is_imported(tmp_path, setting, t
 # A regularizer and an algorithm of a user's own, which a line each makes known to the command.
 OWN = """
 import sys
-from torchrl_l2c2.experiment.algorithms import ALGORITHMS, PPORPEConfig
-from torchrl_l2c2.experiment.command import main
-from torchrl_l2c2.experiment.regularizers import REGULARIZERS
-from torchrl_l2c2.experiment.regularizers.base import RegularizerConfig
-from torchrl_l2c2.experiment.settings import settings
+from torchrl_l2c2.experiment.agents.build import make_algorithm
+from torchrl_l2c2.experiment.agents.ppo_rpe import make_ppo_rpe
+from torchrl_l2c2.experiment.agents.regularizers import wrap
+from torchrl_l2c2.experiment.settings.algorithms import ALGORITHMS, PPORPEConfig
+from torchrl_l2c2.experiment.cli.train import main
+from torchrl_l2c2.experiment.settings.regularizers import REGULARIZERS
+from torchrl_l2c2.experiment.settings.regularizers import RegularizerConfig
+from torchrl_l2c2.experiment.settings.fields import settings
 
 BUG = sys.argv.pop()
 
@@ -134,37 +137,39 @@ class OwnRegularizer(RegularizerConfig):
     'A regularizer.'
     name: str = "own"
 
-    def wrap(self, loss):
-        from torchrl_l2c2 import RegularizedLoss
+@wrap.register
+def own_regularizer(config: OwnRegularizer, loss):
+    from torchrl_l2c2 import RegularizedLoss
 
-        class OwnLoss(RegularizedLoss):
-            def __init__(self, base_loss):
-                self.declare_networks(["actor_network"])
-                self.declare_terms(policy=["loss_own"])
-                if BUG == "constructor":
-                    raise ValueError("not the mode of 1999")
-                if BUG == "call":
-                    len(5)
+    class OwnLoss(RegularizedLoss):
+        def __init__(self, base_loss):
+            self.declare_networks(["actor_network"])
+            self.declare_terms(policy=["loss_own"])
+            if BUG == "constructor":
+                raise ValueError("not the mode of 1999")
+            if BUG == "call":
+                len(5)
 
-            def policy_regularizer(self, tensordict):
-                if BUG == "term":
-                    raise RuntimeError("cannot reallocate the plan")
-                terms = super().policy_regularizer(tensordict)
-                states = tensordict.select("observation")[None]
-                _, mean = self.policies_at(tensordict, states)
-                return terms.set("loss_own", mean.loc.square().mean())
+        def policy_regularizer(self, tensordict):
+            if BUG == "term":
+                raise RuntimeError("cannot reallocate the plan")
+            terms = super().policy_regularizer(tensordict)
+            states = tensordict.select("observation")[None]
+            _, mean = self.policies_at(tensordict, states)
+            return terms.set("loss_own", mean.loc.square().mean())
 
-        return OwnLoss(loss)
+    return OwnLoss(loss)
 
 @settings
 class OwnAlgorithm(PPORPEConfig):
     'An algorithm.'
     name: str = "own"
 
-    def make_agent(self, env, regularizer, optimizer):
-        agent = super().make_agent(env, regularizer, optimizer)
-        agent.policy.register_forward_pre_hook(limp)
-        return agent
+@make_algorithm.register
+def own_algorithm(config: OwnAlgorithm, env, regularizer, optimizer):
+    agent = make_ppo_rpe(config, env, regularizer, optimizer)
+    agent.policy.register_forward_pre_hook(limp)
+    return agent
 
 def limp(policy, inputs):
     if BUG == "policy":

@@ -36,11 +36,11 @@ from torchrl_l2c2.experiment import (
     UniformReplayConfig,
     make_env,
 )
+from torchrl_l2c2.experiment.analysis.reports import read_runs
+from torchrl_l2c2.experiment.envs.frames import check_finite
 from torchrl_l2c2.experiment.errors import SimulatorError
-from torchrl_l2c2.experiment.evaluate import LateTests, evaluate_policy
-from torchrl_l2c2.experiment.frames import check_finite
-from torchrl_l2c2.experiment.regularizers import LCPConfig
-from torchrl_l2c2.experiment.reports import read_runs
+from torchrl_l2c2.experiment.run.evaluation import LateTests, evaluate_policy
+from torchrl_l2c2.experiment.settings.regularizers import LCPConfig
 
 ROOT = Path(__file__).parent.parent
 TASKS = {

@@ -26,22 +26,22 @@ from torchrl_l2c2.experiment import (
     SACConfig,
     TaskConfig,
 )
-from torchrl_l2c2.experiment.composition import (
+from torchrl_l2c2.experiment.cli.composition import (
     CONF,
     check_budget,
     check_folders,
     check_preset,
     preset_used,
 )
-from torchrl_l2c2.experiment.config import GROUPS
-from torchrl_l2c2.experiment.manual import manual, page
-from torchrl_l2c2.experiment.regularizers import (
+from torchrl_l2c2.experiment.cli.manual import manual, page
+from torchrl_l2c2.experiment.settings.config import GROUPS
+from torchrl_l2c2.experiment.settings.fields import SettingError, describe
+from torchrl_l2c2.experiment.settings.regularizers import (
     BEGIN_WITH_PRESET,
     REGULARIZERS,
     preset_settings,
 )
-from torchrl_l2c2.experiment.settings import SettingError, describe
-from torchrl_l2c2.experiment.tasks import FIELD_TASKS, PAPER_TASKS, TASKS
+from torchrl_l2c2.experiment.settings.tasks import FIELD_TASKS, PAPER_TASKS, TASKS
 from torchrl_l2c2.presets import KINDS, preset
 
 ROOT = Path(__file__).parent.parent
@@ -243,11 +243,33 @@ def test_the_fields_table_has_the_zoos_settings_where_these_learn(task, algorith
     assert composed("experiment=field_table", *chosen) == expected
 
 
-@pytest.mark.parametrize("preset", ["rl_zoo", "baselines", "field"])
-def test_a_preset_without_settings_of_a_task_is_refused(preset):
+@pytest.mark.parametrize(
+    ("preset", "algorithm", "known"),
+    [
+        ("rl_zoo", "ppo", "any task with algorithm=sac, hopper_v5_ppo"),
+        ("baselines", "sac", "any task with algorithm=ppo: choose"),
+        ("field", "ppo", "hopper_v5_ppo, hopper_v5_sac"),
+    ],
+)
+def test_a_preset_without_settings_of_a_task_is_refused(preset, algorithm, known):
     """And not left at the defaults."""
-    with pytest.raises(SettingError, match="preset must have settings of task=swingup with algo"):
-        check_preset(composed(f"preset={preset}", "algorithm=ppo"), preset)
+    with pytest.raises(SettingError, match=f"preset must have settings of task=swingup.*{known}"):
+        check_preset(composed(f"preset={preset}", f"algorithm={algorithm}"), preset)
+
+
+@pytest.mark.parametrize(
+    ("preset", "algorithm", "named"),
+    [("baselines", "ppo", "hopper_v5"), ("rl_zoo", "sac", "walker2d_v5")],
+)
+def test_a_general_preset_gives_any_task_the_settings_of_a_named_one(preset, algorithm, named):
+    """A MuJoCo-like task of a user's own needs no other settings."""
+    chosen = [f"preset={preset}", f"algorithm={algorithm}"]
+    values = composed(*chosen, "task=gymnasium", "task.env_id=Reacher-v5")
+    check_preset(values, preset)
+    own, expected = ExperimentConfig.from_dict(values), composed(*chosen, f"task={named}")
+    assert own.task.env_id == "Reacher-v5"
+    known = ExperimentConfig.from_dict(expected)
+    assert replace(own, task=known.task) == known and own.task.frames == known.task.frames
 
 
 def test_episodes_beside_a_presets_frames_are_refused():
@@ -358,8 +380,9 @@ def test_the_papers_tasks_have_the_papers_noise(task):
 
 
 def test_every_setting_says_what_it_is():
-    """In the help of the command and on the page of the docs, which is made of the same."""
-    text, written = " ".join(manual(10_000).split()), page()
+    """In a line of the command's help, once, and with its whole text on the page of the docs."""
+    text, written = manual(), page()
+    assert len(text.splitlines()) <= 150
     for group, choices in {"": {"": ExperimentConfig()}, **GROUPS}.items():
         for chosen in choices.values():
             described = describe(type(chosen))
@@ -369,15 +392,16 @@ def test_every_setting_says_what_it_is():
             }
             for name, (_, meaning) in described.items():
                 prefix = f"{group}." if group else ""
-                assert f"{prefix}{name}=" in text and " ".join(meaning.split()) in text
+                assert text.count(f"\n  {prefix}{name}=") == 1
                 assert f"| `{prefix}{name}` |" in written
+                assert meaning.replace("|", "\\|") in written
     assert (ROOT / "docs" / "settings.md").read_text() == written, "write it anew"
 
 
 def test_settings_are_read_without_torch():
     """So that help and errors come at once."""
     code = (
-        "import sys, torchrl_l2c2.experiment.command as command; command.register()\n"
+        "import sys, torchrl_l2c2.experiment.cli.train as command; command.register()\n"
         "from torchrl_l2c2.experiment import ExperimentConfig; ExperimentConfig()\n"
         "assert not {'torch', 'torchrl', 'tensordict', 'gymnasium'} & sys.modules.keys()"
     )

@@ -25,9 +25,10 @@ from torchrl_l2c2.experiment import (
     TaskConfig,
     evaluate_policy,
 )
-from torchrl_l2c2.experiment.environments import control_rate
-from torchrl_l2c2.experiment.export import export_policy, main
-from torchrl_l2c2.experiment.trained import load_policy
+from torchrl_l2c2.experiment.analysis.export import export_policy
+from torchrl_l2c2.experiment.cli.export import main
+from torchrl_l2c2.experiment.envs.environments import control_rate
+from torchrl_l2c2.experiment.run.policies import load_policy
 
 onnxruntime = pytest.importorskip("onnxruntime")
 ROOT = Path(__file__).parents[1]
@@ -278,7 +279,7 @@ def test_a_folder_that_cannot_be_written_to_is_refused_before_anything_is_played
     pendulum, tmp_path, monkeypatch
 ):
     """A file is no folder; the run's own folder is the default."""
-    monkeypatch.setattr("torchrl_l2c2.experiment.export.play_episodes", None)
+    monkeypatch.setattr("torchrl_l2c2.experiment.analysis.export.play_episodes", None)
     (tmp_path / "file").touch()
     with pytest.raises(SystemExit, match=r"error: the folder '.*file' cannot be written to"):
         main([str(pendulum[1]), "--output", str(tmp_path / "file")])
@@ -286,6 +287,6 @@ def test_a_folder_that_cannot_be_written_to_is_refused_before_anything_is_played
 
 def test_without_the_extra_it_says_how_to_get_it(pendulum, monkeypatch):
     """Before anything is played."""
-    monkeypatch.setattr("torchrl_l2c2.experiment.export.find_spec", lambda name: None)
+    monkeypatch.setattr("torchrl_l2c2.experiment.analysis.export.find_spec", lambda name: None)
     with pytest.raises(ImportError, match=r'onnxscript is missing: pip install "torchrl-l2c2\[exp'):
         export_policy(pendulum[1])

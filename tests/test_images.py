@@ -22,7 +22,7 @@ from torchrl_l2c2.experiment import (
     UniformReplayConfig,
     make_env,
 )
-from torchrl_l2c2.experiment.trained import load_policy
+from torchrl_l2c2.experiment.run.policies import load_policy
 
 INF = float("inf")
 

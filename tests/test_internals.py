@@ -28,8 +28,7 @@ from torchrl.modules import (
 from torchrl.objectives import ClipPPOLoss
 
 from torchrl_l2c2 import ObservationNoise, make_actor, make_critic
-from torchrl_l2c2.experiment._torch_internals import marked_as_compiling
-from torchrl_l2c2.experiment._torchrl_internals import (
+from torchrl_l2c2.experiment.agents._torchrl_internals import (
     RowWriter,
     TraceableClipPPOLoss,
     first_observation,
@@ -40,6 +39,7 @@ from torchrl_l2c2.experiment._torchrl_internals import (
     simulator_of,
     stored_tensors,
 )
+from torchrl_l2c2.experiment.learn._torch_internals import marked_as_compiling
 
 logging.getLogger("torchrl").setLevel(logging.ERROR)
 CAPACITY = 6

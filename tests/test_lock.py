@@ -8,12 +8,12 @@ import time
 
 import pytest
 
-from torchrl_l2c2.experiment.lock import FolderInUseError, lock_folder, wait_for_folder
+from torchrl_l2c2.experiment.run.lock import FolderInUseError, lock_folder, wait_for_folder
 
 CONTENDER = """
 import sys
 from pathlib import Path
-from torchrl_l2c2.experiment.lock import FolderInUseError, lock_folder
+from torchrl_l2c2.experiment.run.lock import FolderInUseError, lock_folder
 class Run: pass
 run, folder = Run(), Path(sys.argv[1])
 print("ready", flush=True)

@@ -6,8 +6,8 @@ from importlib.util import find_spec
 import pytest
 
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig, TaskConfig
-from torchrl_l2c2.experiment.config import GROUPS
-from torchrl_l2c2.experiment.settings import SettingError
+from torchrl_l2c2.experiment.settings.config import GROUPS
+from torchrl_l2c2.experiment.settings.fields import SettingError
 
 TASK = TaskConfig("pendulum", "Pendulum-v1", episodes=2, max_steps=40)
 
@@ -23,7 +23,7 @@ def trained(folder, logger):
 def test_mlflow_has_every_episode(tmp_path, monkeypatch):
     """With the number of frames as the step; a second run in the process is one of its own."""
     mlflow = pytest.importorskip("mlflow")
-    monkeypatch.setattr("torchrl_l2c2.experiment.loggers.TRACKING_URI", None)
+    monkeypatch.setattr("torchrl_l2c2.experiment.run.metrics_log.TRACKING_URI", None)
     trained(tmp_path / "other", "mlflow")
     rows = trained(tmp_path / "run", "mlflow")
     client = mlflow.MlflowClient((tmp_path / "run" / "mlruns").as_uri())
@@ -54,7 +54,7 @@ def test_wandb_has_every_episode(tmp_path, monkeypatch):
 def test_a_logger_that_is_not_installed_is_refused_with_what_to_do(tmp_path, monkeypatch, name):
     """Before there is a folder."""
     monkeypatch.setattr(
-        "torchrl_l2c2.experiment.loggers.find_spec",
+        "torchrl_l2c2.experiment.run.metrics_log.find_spec",
         lambda package: None if package == name else find_spec(package),
     )
     with pytest.raises(SettingError, match=rf"logger.name '{name}' needs .*torchrl-l2c2\[{name}\]"):

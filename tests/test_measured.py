@@ -26,13 +26,13 @@ from torchrl_l2c2.experiment import (
     UniformReplayConfig,
     make_env,
 )
-from torchrl_l2c2.experiment.algorithms.normalization import Normalization
-from torchrl_l2c2.experiment.checkpoints import list_checkpoints
-from torchrl_l2c2.experiment.environments import NOISE_SEED
-from torchrl_l2c2.experiment.evaluate import LateTests
-from torchrl_l2c2.experiment.learner import MOST_SKIPPED
-from torchrl_l2c2.experiment.optimizers import anneal
-from torchrl_l2c2.experiment.tasks import Budget
+from torchrl_l2c2.experiment.agents.normalization import Normalization
+from torchrl_l2c2.experiment.agents.optimizers import anneal, make_optimizer
+from torchrl_l2c2.experiment.envs.environments import NOISE_SEED
+from torchrl_l2c2.experiment.learn.learner import MOST_SKIPPED
+from torchrl_l2c2.experiment.run.checkpoints import list_checkpoints
+from torchrl_l2c2.experiment.run.evaluation import LateTests
+from torchrl_l2c2.experiment.settings.tasks import Budget
 
 PENDULUM = TaskConfig("pendulum", "Pendulum-v1", noise_scale=0.01, episodes=2, max_steps=40)
 
@@ -58,7 +58,7 @@ def test_tests_play_episodes_of_their_own(monkeypatch):
     """Training, tests on the way, by which the best policy is chosen, and the test at the end."""
     seeds = []
     monkeypatch.setattr(
-        "torchrl_l2c2.experiment.evaluate.make_env",
+        "torchrl_l2c2.experiment.run.evaluation.make_env",
         lambda task, seed: seeds.append(seed) or make_env(task, seed),
     )
     run = Experiment(small(evaluate_every=2, late_share=0.0))
@@ -237,7 +237,7 @@ def test_a_late_share_is_one_episode_at_least():
 def test_a_training_that_goes_beyond_its_end_has_no_negative_learning_rate():
     """As a last rollout does."""
     config = AdamConfig(linear=True)
-    optimizer = config.make([torch.nn.Parameter(torch.ones(1))])
+    optimizer = make_optimizer(config, [torch.nn.Parameter(torch.ones(1))])
     anneal(config, optimizer, 1.2)
     assert optimizer.param_groups[0]["lr"] == 0.0
 

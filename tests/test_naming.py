@@ -17,8 +17,8 @@ from torchrl_l2c2.experiment import (
     TD3Config,
     UniformReplayConfig,
 )
-from torchrl_l2c2.experiment.config import GROUPS
-from torchrl_l2c2.experiment.naming import LONGEST, run_name
+from torchrl_l2c2.experiment.settings.config import GROUPS
+from torchrl_l2c2.experiment.settings.naming import LONGEST, run_name
 
 SWINGUP = GROUPS["task"]["swingup"]
 

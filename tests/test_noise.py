@@ -8,6 +8,7 @@ import pytest
 import torch
 from torchrl.envs import ExplorationType, GymEnv, TransformedEnv, set_exploration_type
 
+from studies.noise import UniformNoise, main, noise_table, play_with_noise
 from torchrl_l2c2.experiment import (
     AdamConfig,
     Experiment,
@@ -17,10 +18,9 @@ from torchrl_l2c2.experiment import (
     RolloutReplayConfig,
     TaskConfig,
 )
-from torchrl_l2c2.experiment.evaluate import evaluate_policy
-from torchrl_l2c2.experiment.noise import UniformNoise, main, noise_table, play_with_noise
-from torchrl_l2c2.experiment.reports import read_runs
-from torchrl_l2c2.experiment.trained import load_policy
+from torchrl_l2c2.experiment.analysis.reports import read_runs
+from torchrl_l2c2.experiment.run.evaluation import evaluate_policy
+from torchrl_l2c2.experiment.run.policies import load_policy
 
 
 class TestUniformNoise:

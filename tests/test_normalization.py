@@ -6,7 +6,7 @@ import torch
 from gymnasium.wrappers.utils import RunningMeanStd
 from tensordict import TensorDict
 
-from torchrl_l2c2.experiment.algorithms.normalization import Moments, Normalization
+from torchrl_l2c2.experiment.agents.normalization import Moments, Normalization
 
 
 def rollout(steps, ends=(), seed=0):

@@ -7,8 +7,8 @@ from tensordict.utils import assert_close
 from torchrl.objectives import SoftUpdate, TD3Loss
 
 from torchrl_l2c2 import CAPSLoss, L2C2Loss, RegularizedLoss
-from torchrl_l2c2.experiment.algorithms.agent import Agent
-from torchrl_l2c2.experiment.update import make_update
+from torchrl_l2c2.experiment.agents.agent import Agent
+from torchrl_l2c2.experiment.learn.update import make_update
 
 
 class Stillness(RegularizedLoss):

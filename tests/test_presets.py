@@ -11,6 +11,8 @@ from tensordict import TensorDict
 from torch.distributions import Normal
 
 from torchrl_l2c2.experiment import ExperimentConfig
+from torchrl_l2c2.experiment.agents.build import make_agent
+from torchrl_l2c2.experiment.envs.environments import make_env
 
 
 def agent_of(task, algorithm, *more):
@@ -20,7 +22,7 @@ def agent_of(task, algorithm, *more):
         )
     )
     torch.manual_seed(0)
-    return config, config.make_agent(config.make_env())
+    return config, make_agent(config, make_env(config.task, config.seed))
 
 
 def batch_of(agent, size, observations, actions):

@@ -10,7 +10,7 @@ import torch
 from small import ALGORITHMS
 
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig, TaskConfig
-from torchrl_l2c2.experiment.process import ProcessState
+from torchrl_l2c2.experiment.run.process import ProcessState
 
 
 def draw():
@@ -75,7 +75,7 @@ def test_memory_that_was_freed_is_not_handed_out_anew():
     """Page faults of tensors that come and go together: thousands, and in the end next to none."""
     code = """
 import random, resource, torch
-from torchrl_l2c2.experiment.process import keep_freed_memory
+from torchrl_l2c2.experiment.run.process import keep_freed_memory
 random.seed(0)
 sizes = [random.randint(1, 12) << 20 for _ in range(12)]
 def faults():

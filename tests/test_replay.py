@@ -27,10 +27,11 @@ from torchrl_l2c2.experiment import (
     TD3Config,
     UniformReplayConfig,
 )
-from torchrl_l2c2.experiment._torchrl_internals import load_replay_state, replay_state
-from torchrl_l2c2.experiment.compilation import compiler_available
-from torchrl_l2c2.experiment.settings import SettingError
-from torchrl_l2c2.experiment.update import ReplayUpdate, make_update
+from torchrl_l2c2.experiment.agents._torchrl_internals import load_replay_state, replay_state
+from torchrl_l2c2.experiment.learn.compilation import compiler_available
+from torchrl_l2c2.experiment.learn.replay import make_buffer, make_replay
+from torchrl_l2c2.experiment.learn.update import ReplayUpdate, make_update
+from torchrl_l2c2.experiment.settings.fields import SettingError
 
 logging.getLogger("torchrl").setLevel(logging.ERROR)
 
@@ -103,13 +104,13 @@ def same(found, expected, **tolerance):
 
 def test_priorities_are_on_the_cpu_wherever_the_batches_are():
     """TorchRL would put its trees where the storage is."""
-    sampler = PrioritizedReplayConfig(capacity=50, batch_size=8).make(0, 1).sampler
+    sampler = make_buffer(PrioritizedReplayConfig(capacity=50, batch_size=8), 0, 1).sampler
     assert sampler._tree_device_from_storage(SimpleNamespace(device="cuda:0")).type == "cpu"
 
 
 def test_errors_of_0_are_drawn_with_every_exponent():
     """(1e-8) ** 4 is 1e-32; to the sixth power it would be 0 in single precision."""
-    replay = PrioritizedReplayConfig(capacity=8, batch_size=8, alpha=4.0).make(0, 1)
+    replay = make_buffer(PrioritizedReplayConfig(capacity=8, batch_size=8, alpha=4.0), 0, 1)
     replay.extend(TensorDict({"row": torch.arange(4)}, [4]))
     replay.update_priority(torch.arange(4), torch.zeros(4))
     assert set(replay.sample()["row"].tolist()) == {0, 1, 2, 3}
@@ -298,8 +299,8 @@ def scale_rates(optimizer, factor):
 
 def test_priorities_need_a_torch_with_which_torchrls_trees_load(monkeypatch):
     """The error names the versions and the setting that works without them."""
-    monkeypatch.setattr("torchrl.data.replay_buffers.samplers.SumSegmentTreeFp32", None)
+    monkeypatch.setattr("torchrl_l2c2.experiment.learn.replay.SumSegmentTreeFp32", None)
     needed = r"'prioritized' needs .* torch 2\.14 or newer, got torch \S+\. Set replay=uniform"
     with pytest.raises(SettingError, match=needed):
-        PAPER.make_replay()
-    assert len(replace(PAPER, replay=UniformReplayConfig()).make_replay()) == 0
+        make_replay(PAPER)
+    assert len(make_replay(replace(PAPER, replay=UniformReplayConfig()))) == 0

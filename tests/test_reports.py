@@ -16,16 +16,8 @@ import numpy as np
 import pytest
 from scipy.stats import mannwhitneyu, trim_mean
 
-from torchrl_l2c2.experiment import (
-    ExperimentConfig,
-    L2C2Config,
-    PPOConfig,
-    PPORPEConfig,
-)
-from torchrl_l2c2.experiment.differences import differences, fingerprint
-from torchrl_l2c2.experiment.finished import TESTS, FinishedRun, finished_run
-from torchrl_l2c2.experiment.regularizers import REGULARIZERS
-from torchrl_l2c2.experiment.reports import (
+from torchrl_l2c2.experiment import ExperimentConfig, L2C2Config, PPOConfig, PPORPEConfig
+from torchrl_l2c2.experiment.analysis.reports import (
     comparison_table,
     draw_learning_curves,
     draw_plane,
@@ -36,12 +28,11 @@ from torchrl_l2c2.experiment.reports import (
     write_records,
     write_report,
 )
-from torchrl_l2c2.experiment.reports.__main__ import main
-from torchrl_l2c2.experiment.reports.comparison import known_tests, summary
-from torchrl_l2c2.experiment.reports.groups import baseline_of, group_records, over_tasks
-from torchrl_l2c2.experiment.reports.measures import measures_table
-from torchrl_l2c2.experiment.reports.records import merge
-from torchrl_l2c2.experiment.reports.statistics import (
+from torchrl_l2c2.experiment.analysis.reports.comparison import known_tests, summary
+from torchrl_l2c2.experiment.analysis.reports.groups import baseline_of, group_records, over_tasks
+from torchrl_l2c2.experiment.analysis.reports.measures import measures_table
+from torchrl_l2c2.experiment.analysis.reports.records import merge
+from torchrl_l2c2.experiment.analysis.reports.statistics import (
     bootstrap_interval,
     curve_band,
     interquartile_mean,
@@ -49,9 +40,13 @@ from torchrl_l2c2.experiment.reports.statistics import (
     mean_and_deviation,
     probability_of_improvement,
 )
-from torchrl_l2c2.experiment.reports.tables import settings_notes
-from torchrl_l2c2.experiment.tasks import TASKS
-from torchrl_l2c2.experiment.versions import code_commit
+from torchrl_l2c2.experiment.analysis.reports.tables import settings_notes
+from torchrl_l2c2.experiment.cli.report import main
+from torchrl_l2c2.experiment.run.finished import TESTS
+from torchrl_l2c2.experiment.run.folder import code_commit
+from torchrl_l2c2.experiment.settings.identity import differences, fingerprint
+from torchrl_l2c2.experiment.settings.regularizers import REGULARIZERS
+from torchrl_l2c2.experiment.settings.tasks import TASKS
 
 ROOT = Path(__file__).parents[1]
 METHODS = {
@@ -398,29 +393,11 @@ class TestSettings:
         """So that runs of before pool with those of now."""
         plain = make_config(regularizer="l2c2").to_dict()
         code = fingerprint(plain)
-        monkeypatch.setattr("torchrl_l2c2.experiment.config.NEUTRAL_SETTINGS", {})
+        monkeypatch.setattr("torchrl_l2c2.experiment.settings.identity._metadata", dict)
         assert fingerprint(plain) != code
         monkeypatch.undo()
         plain["regularizer"]["policy_distance"] = "mean"
         assert fingerprint(plain) != code
-
-    def test_a_run_of_before_a_setting_is_as_that_was_then(self, tmp_path):
-        """And not as its default is by now: it is no run of today's, and no two are pooled."""
-        today = make_config(episodes=2, test_episodes=2)
-        then = make_config(episodes=2, test_episodes=2, algorithm=PPORPEConfig(reduction="mean"))
-        for name, config in (("now", today), ("then", then), ("older", today)):
-            make_run(tmp_path / name, config, 1.0, 0.1)
-        older = tmp_path / "older" / "config.json"
-        config = json.loads(older.read_text())
-        del config["algorithm"]["reduction"], config["device"]
-        older.write_text(json.dumps(config))
-        found = {name: FinishedRun.read(tmp_path / name) for name in ("now", "then", "older")}
-        told = {name: run.record for name, run in found.items()}
-        assert told["older"].settings == told["then"].settings != told["now"].settings
-        assert told["older"].differences.split() == ["algorithm.reduction=mean", "task.episodes=2"]
-        assert told["now"].differences == "task.episodes=2"
-        assert finished_run(tmp_path / "older", then.to_dict()) is not None
-        assert finished_run(tmp_path / "older", today.to_dict()) is None
 
     def test_differences_are_from_the_defaults_of_what_is_chosen_by_name(self):
         """Another replay's own defaults are none; a task of one's own is its id."""
@@ -779,7 +756,7 @@ def test_a_report_that_cannot_be_drawn_leaves_none(tmp_path, monkeypatch):
     def fail(*_):
         raise ValueError("no picture")
 
-    monkeypatch.setattr("torchrl_l2c2.experiment.reports.report.draw_plane", fail)
+    monkeypatch.setattr("torchrl_l2c2.experiment.analysis.reports.report.draw_plane", fail)
     with pytest.raises(ValueError, match="no picture"):
         write_report(tmp_path / "report", records)
     assert not (tmp_path / "report").exists()

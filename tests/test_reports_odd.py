@@ -8,11 +8,16 @@ import pytest
 
 from tests.test_reports import make_config, make_run
 from torchrl_l2c2.experiment import L2C2Config, PPOConfig
-from torchrl_l2c2.experiment.reports import find_runs, finished_run, read_runs, result_lines
-from torchrl_l2c2.experiment.reports.comparison import comparison_table
-from torchrl_l2c2.experiment.reports.figures import styles
-from torchrl_l2c2.experiment.reports.groups import baseline_of, group_records
-from torchrl_l2c2.experiment.reports.records import read_records, write_records
+from torchrl_l2c2.experiment.analysis.reports import (
+    find_runs,
+    finished_run,
+    read_runs,
+    result_lines,
+)
+from torchrl_l2c2.experiment.analysis.reports.comparison import comparison_table
+from torchrl_l2c2.experiment.analysis.reports.figures import styles
+from torchrl_l2c2.experiment.analysis.reports.groups import baseline_of, group_records
+from torchrl_l2c2.experiment.analysis.reports.records import read_records, write_records
 
 METHODS = ("none", "caps", "cats")
 GAINS = {gain: L2C2Config(lambda_min=gain, lambda_max=100 * gain) for gain in (0.1, 1.0)}

@@ -31,23 +31,22 @@ from torchrl_l2c2.experiment import (
     TaskConfig,
     UniformReplayConfig,
 )
-from torchrl_l2c2.experiment.checkpoints import (
+from torchrl_l2c2.experiment.analysis.reports import find_runs, finished_run, read_runs
+from torchrl_l2c2.experiment.cli.train import _end_logged, run
+from torchrl_l2c2.experiment.errors import OtherRunError, warnings_told
+from torchrl_l2c2.experiment.run.checkpoints import (
     CheckpointError,
     list_checkpoints,
     load_checkpoint,
     save_checkpoint,
 )
-from torchrl_l2c2.experiment.command import _end_logged, run
-from torchrl_l2c2.experiment.config import GROUPS
-from torchrl_l2c2.experiment.continuation import check_same_settings
-from torchrl_l2c2.experiment.differences import fingerprint
-from torchrl_l2c2.experiment.errors import OtherRunError, warnings_told
-from torchrl_l2c2.experiment.files import write_json
-from torchrl_l2c2.experiment.naming import run_name
-from torchrl_l2c2.experiment.progress import say
-from torchrl_l2c2.experiment.reports import find_runs, finished_run, read_runs, results
-from torchrl_l2c2.experiment.saved import as_it_was
-from torchrl_l2c2.experiment.trained import load_policy
+from torchrl_l2c2.experiment.run.continuation import check_same_settings
+from torchrl_l2c2.experiment.run.files import write_json
+from torchrl_l2c2.experiment.run.policies import load_policy
+from torchrl_l2c2.experiment.run.progress import say
+from torchrl_l2c2.experiment.settings.config import GROUPS
+from torchrl_l2c2.experiment.settings.identity import fingerprint
+from torchrl_l2c2.experiment.settings.naming import run_name
 
 ROOT = Path(__file__).parent.parent
 SWINGUP = TaskConfig(episodes=6, max_steps=60)
@@ -201,7 +200,7 @@ def test_a_finished_run_that_goes_on_is_unfinished(ended, monkeypatch, steps):
 
     with monkeypatch.context() as patched, contextlib.suppress(KeyboardInterrupt):
         write = until_it_is_killed(write_json)
-        patched.setattr("torchrl_l2c2.experiment.folder.write_json", write)
+        patched.setattr("torchrl_l2c2.experiment.run.folder.write_json", write)
         patched.setattr(Path, "unlink", until_it_is_killed(Path.unlink))
         Experiment(longer, ended).close()
     assert finished_run(ended, longer.to_dict()) is None
@@ -264,19 +263,6 @@ def test_a_setting_that_is_new_and_off_leaves_a_run_finished(ended):
     assert finished_run(ended, small().to_dict()) is not None
     longer = small(task=replace(small().task, episodes=7))
     assert finished_run(ended, longer.to_dict()) is None
-
-
-def test_a_run_is_finished_when_all_of_its_files_are_there(tmp_path, monkeypatch):
-    """Killed while its picture is drawn, it is not."""
-
-    def draw(runs, path):
-        assert runs[0].record.episodes == 6 and not (tmp_path / "evaluation.json").exists()
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
-        patched.setattr(results, "draw_learning_curves", draw)
-        finished(tmp_path)
-    assert finished_run(tmp_path, small().to_dict()) is None
 
 
 def test_what_only_training_reads_is_told_when_that_is_over(trained):
@@ -500,20 +486,14 @@ def test_a_setting_that_a_checkpoint_does_not_know_is_named(tmp_path):
         check_same_settings(saved, small().to_dict())
 
 
-def test_a_removed_setting_that_changed_nothing_may_be_there():
-    """A run of before continues, and its policy is loaded."""
-    now = small().to_dict()
-    saved = {**now, "workers": "processes"}
-    check_same_settings(saved, now)
-    assert ExperimentConfig.from_dict(as_it_was(saved)) == small()
-
-
 def test_a_setting_that_changes_nothing_may_be_new():
     """A checkpoint of before is continued where the run goes on as it was; not otherwise."""
     saved = small().to_dict()
     del saved["regularizer"]["policy_distance"]
     check_same_settings(saved, small().to_dict())
-    with pytest.raises(OtherRunError, match=r"regularizer.policy_distance=hellinger, not mean"):
+    with pytest.raises(
+        OtherRunError, match=r"policy_distance=none, as it is a setting since, not mean"
+    ):
         now = small(regularizer=L2C2Config(policy_distance="mean"))
         check_same_settings(saved, now.to_dict())
 
@@ -553,7 +533,7 @@ def test_a_full_disk_names_the_file_and_the_last_good_checkpoint(tmp_path, monke
             raise full
         return open(path, *arguments, **options)
 
-    monkeypatch.setattr("torchrl_l2c2.experiment.files.open", no_room, raising=False)
+    monkeypatch.setattr("torchrl_l2c2.experiment.run.files.open", no_room, raising=False)
     message = rf"No space left.*{file}'\. Last good checkpoint: .*checkpoint_00000001.pt"
     with pytest.raises(OSError, match=message):
         experiment.train()

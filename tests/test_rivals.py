@@ -53,7 +53,7 @@ from torchrl_l2c2.experiment import (
     TaskConfig,
     UniformReplayConfig,
 )
-from torchrl_l2c2.experiment.compilation import compiler_available
+from torchrl_l2c2.experiment.learn.compilation import compiler_available
 from torchrl_l2c2.gains import gradient_shares
 from torchrl_l2c2.objectives.cats import cats_term
 from torchrl_l2c2.objectives.grad_caps import grad_caps_term

@@ -13,6 +13,7 @@ from gymnasium import spaces
 from tensordict import TensorDict
 from torchrl.envs import ExplorationType, set_exploration_type
 
+from studies.noise import play_with_noise
 from torchrl_l2c2 import make_actor
 from torchrl_l2c2.experiment import (
     AdamConfig,
@@ -24,15 +25,14 @@ from torchrl_l2c2.experiment import (
     PPOConfig,
     RolloutReplayConfig,
     TaskConfig,
-    evaluate,
     load_policy,
     make_env,
 )
-from torchrl_l2c2.experiment.diagnosis.run import value_function
-from torchrl_l2c2.experiment.evaluate import evaluate_policy
-from torchrl_l2c2.experiment.noise import play_with_noise
-from torchrl_l2c2.experiment.rollouts import RolloutCollector
-from torchrl_l2c2.experiment.signals import Interrupted
+from torchrl_l2c2.experiment.analysis.diagnosis.run import value_function
+from torchrl_l2c2.experiment.cli import evaluate
+from torchrl_l2c2.experiment.collect.rollouts import RolloutCollector
+from torchrl_l2c2.experiment.run.evaluation import evaluate_policy
+from torchrl_l2c2.experiment.run.signals import Interrupted
 from torchrl_l2c2.metrics import action_rate, saturation
 
 NOISY = TaskConfig("pendulum", "Pendulum-v1", noise_scale=0.1, max_steps=9)
@@ -251,7 +251,7 @@ def test_a_bound_on_one_side_clips_what_is_deployed_too():
 def test_a_test_with_samples_gives_the_task_clipped_actions():
     """As training does; they are what is measured."""
     run = experiment(MOODY, clip_actions=True, log_scale=0.0)
-    env = run.config.make_env()
+    env = make_env(run.config.task, run.config.seed)
     result = evaluate_policy(run.agent.policy, env, 1, sampled=True)
     taken = torch.from_numpy(np.stack(env._env.unwrapped.taken))
     assert taken.max() == np.float32(0.2) and taken.min() == np.float32(-0.1)

@@ -535,21 +535,6 @@ def test_only_the_first_of_several_processes_draws_as_it_did() -> None:
         assert ppo.regularization.updates == 1
 
 
-@pytest.mark.parametrize("algorithm, updates", [(rsl.L2C2PPO, 3), (rsl.CATSPPO, 0)])
-def test_checkpoints_of_older_versions_are_resumed(algorithm: type[PPO], updates: int) -> None:
-    """They name a coefficient instead of the method; another regularizer's is a beginning."""
-    saved = update_and_save(make(rsl.L2C2PPO))
-    generator = saved["regularization_state_dict"]["generator"]
-    older = {"coefficient": "l2c2_coeff", "updates": 3, "generator": generator}
-    saved["regularization_state_dict"] = older
-    ppo = make(algorithm, regularizer_cfg={"ramp_updates": 4})
-    ppo.load(saved, None, strict=True)
-    assert ppo.regularization.updates == updates
-    assert ppo.regularization.loss.regularizer_gain == updates / 4
-    if updates:
-        assert ppo.regularization.neighbors.generator.get_state().equal(generator)
-
-
 def update_and_save(ppo: PPO) -> dict[str, Any]:
     update(collected(ppo))
     return copy.deepcopy(ppo.save())

@@ -24,10 +24,13 @@ from torchrl_l2c2.experiment import (
     TD3Config,
     make_env,
 )
-from torchrl_l2c2.experiment.algorithms.agent import Agent
-from torchrl_l2c2.experiment.regularizers import REGULARIZERS
-from torchrl_l2c2.experiment.regularizers.base import GainConfig
-from torchrl_l2c2.experiment.update import make_update
+from torchrl_l2c2.experiment.agents.agent import Agent
+from torchrl_l2c2.experiment.agents.build import make_algorithm
+from torchrl_l2c2.experiment.agents.optimizers import make_optimizer
+from torchrl_l2c2.experiment.agents.regularizers import add_regularizer, neighborhood_of
+from torchrl_l2c2.experiment.learn.replay import make_buffer
+from torchrl_l2c2.experiment.learn.update import make_update
+from torchrl_l2c2.experiment.settings.regularizers import REGULARIZERS, GainConfig
 
 OF_PPO_RPE = {
     "kappa": 0.25,
@@ -44,7 +47,7 @@ OF_PPO_RPE = {
 
 def agent_of(algorithm, env_id="Pendulum-v1"):
     env = make_env(TaskConfig("task", env_id), 0)
-    return algorithm.make_agent(env, NoRegularizerConfig(), AdamConfig())
+    return make_algorithm(algorithm, env, NoRegularizerConfig(), AdamConfig())
 
 
 def normal():
@@ -101,12 +104,12 @@ def test_the_discount_and_the_pace_of_the_targets(kind):
 
 def test_those_of_replay_and_optimizers():
     """By what TorchRL's sampler and the optimizers have."""
-    sampler = PrioritizedReplayConfig(alpha=0.3, beta=0.9).make(0, 1).sampler
+    sampler = make_buffer(PrioritizedReplayConfig(alpha=0.3, beta=0.9), 0, 1).sampler
     assert (sampler._alpha, sampler._beta) == (0.3, 0.9)
     parameters = [torch.nn.Parameter(torch.ones(1))]
-    adam = AdamConfig(betas=(0.5, 0.6), eps=1e-3).make(parameters).defaults
+    adam = make_optimizer(AdamConfig(betas=(0.5, 0.6), eps=1e-3), parameters).defaults
     assert (adam["betas"], adam["eps"]) == ((0.5, 0.6), 1e-3)
-    adaterm = AdaTermConfig(beta=0.5, nu_min=3.0).make(parameters).defaults
+    adaterm = make_optimizer(AdaTermConfig(beta=0.5, nu_min=3.0), parameters).defaults
     assert (adaterm["beta"], adaterm["nu_min"]) == (0.5, 3.0)
 
 
@@ -143,9 +146,9 @@ def test_gradients_are_scaled_down_to_their_norm(norm):
 )
 def test_those_of_a_regularizer(config, attributes):
     """Two runs of the same settings agree also where these are dropped."""
-    loss = config.add_to(normal())
+    loss = add_regularizer(normal(), config)
     assert {name: getattr(loss, name) for name in attributes} == attributes
-    if config.neighborhood is not None:
+    if neighborhood_of(config) is not None:
         assert loss.l2c2_neighborhood.max_step == 2.0
 
 
@@ -156,7 +159,7 @@ def test_those_of_a_regularizer(config, attributes):
 )
 def test_one_gain_scales_every_term_of_the_policy(config):
     """Otherwise ramps and targets would change nothing."""
-    loss, batch, found = config.add_to(normal()), transitions(6), []
+    loss, batch, found = add_regularizer(normal(), config), transitions(6), []
     batch["previous_observation"] = batch["observation"] + 0.1
     if config.name == "asap":  # whose prediction is the policy's at first
         for parameter in loss.asap_predictor.parameters():

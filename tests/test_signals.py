@@ -6,7 +6,7 @@ import signal
 import pytest
 
 from torchrl_l2c2.experiment.errors import ChildFailedError, SimulatorError
-from torchrl_l2c2.experiment.signals import Terminated, stop_on_signals
+from torchrl_l2c2.experiment.run.signals import Terminated, stop_on_signals
 
 
 @pytest.mark.parametrize(

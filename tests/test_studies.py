@@ -37,11 +37,11 @@ from studies.protocol import readings, until
 from studies.targets import gain_targets_table
 from tests.test_reports import cells, make_config, make_run
 from torchrl_l2c2.experiment import CATSConfig, L2C2Config, PPOConfig, PPORPEConfig, SACConfig
-from torchrl_l2c2.experiment.optimizers import AdamConfig
-from torchrl_l2c2.experiment.reports import group_records, read_records, read_runs
-from torchrl_l2c2.experiment.reports.comparison import improvement
-from torchrl_l2c2.experiment.reports.records import merge
-from torchrl_l2c2.experiment.tasks import TASKS
+from torchrl_l2c2.experiment.analysis.reports import group_records, read_records, read_runs
+from torchrl_l2c2.experiment.analysis.reports.comparison import improvement
+from torchrl_l2c2.experiment.analysis.reports.records import merge
+from torchrl_l2c2.experiment.settings.optimizers import AdamConfig
+from torchrl_l2c2.experiment.settings.tasks import TASKS
 
 
 def read(folder):

@@ -23,7 +23,9 @@ from torchrl_l2c2.experiment import (
     TaskConfig,
     make_env,
 )
-from torchrl_l2c2.experiment.command import run
+from torchrl_l2c2.experiment.agents.build import make_agent
+from torchrl_l2c2.experiment.cli.train import run
+from torchrl_l2c2.experiment.envs.environments import time_limit
 from torchrl_l2c2.experiment.errors import SimulatorError
 
 INF = float("inf")
@@ -65,7 +67,7 @@ def still(monkeypatch, **arguments):
 def observed(chosen):
     """What the run's own collector shows of a task, which steps it without TorchRL's specs."""
     env = make_env(chosen, 0)
-    policy = ExperimentConfig(algorithm=PPORPEConfig(squash="none")).make_agent(env).policy
+    policy = make_agent(ExperimentConfig(algorithm=PPORPEConfig(squash="none")), env).policy
     episode = EpisodeCollector(env, policy, frames_per_batch=3).rollout()
     assert env.observation_spec["observation"].dtype == torch.float32
     assert episode["observation"].dtype == episode["next", "observation"].dtype == torch.float32
@@ -363,10 +365,10 @@ def test_noise_is_not_what_a_policy_draws_with_the_same_seed(monkeypatch):
 
 def test_an_episode_is_as_long_as_the_task_is_registered():
     """Pendulum's 200 steps; the paper's tasks have their own; a setting goes before."""
-    assert TaskConfig("pendulum", "Pendulum-v1").time_limit == 200
-    limits = {name: chosen.time_limit for name, chosen in PAPER_TASKS.items()}
+    assert time_limit(TaskConfig("pendulum", "Pendulum-v1")) == 200
+    limits = {name: time_limit(chosen) for name, chosen in PAPER_TASKS.items()}
     assert limits == {"swingup": 1000, "reacher": 150, "hopper": 1000, "ant": 1000}
-    assert TaskConfig("pendulum", "Pendulum-v1", max_steps=7).time_limit == 7
+    assert time_limit(TaskConfig("pendulum", "Pendulum-v1", max_steps=7)) == 7
     run = experiment("ppo", TaskConfig("pendulum", "Pendulum-v1", episodes=1))
     assert run.train()[0]["length"] == 200 and run.test().lengths == [200]
 

@@ -20,7 +20,7 @@ from torchrl_l2c2.experiment import (
     TaskConfig,
     UniformReplayConfig,
 )
-from torchrl_l2c2.experiment.settings import SettingError
+from torchrl_l2c2.experiment.settings.fields import SettingError
 from torchrl_l2c2.objectives.tchebycheff import (
     TchebycheffLoss,
     smooth_tchebycheff,

@@ -25,6 +25,7 @@ from torchrl_l2c2.experiment import (
     TaskConfig,
     TD3Config,
 )
+from torchrl_l2c2.experiment.agents.build import make_algorithm
 from torchrl_l2c2.gains import gradient_shares
 
 PENDULUM = TaskConfig("pendulum", "Pendulum-v1", episodes=2, max_steps=40)
@@ -160,7 +161,7 @@ def test_actions_of_several_ranges_are_told_of_td3s_noise():
 
 
 def make_td3(env):
-    return TD3Config(hidden=(8,)).make_agent(env, NoRegularizerConfig(), AdamConfig())
+    return make_algorithm(TD3Config(hidden=(8,)), env, NoRegularizerConfig(), AdamConfig())
 
 
 def test_gradient_shares_are_the_quotients_of_the_norms():
@@ -210,7 +211,7 @@ def test_frozen_parameters_have_no_part_in_a_share():
 @pytest.fixture
 def measured_soon(monkeypatch):
     """After 15 updates, not 100, it is told which regularizer is faint."""
-    monkeypatch.setattr("torchrl_l2c2.experiment.learner.MEASURED_AFTER", 15)
+    monkeypatch.setattr("torchrl_l2c2.experiment.learn.learner.MEASURED_AFTER", 15)
 
 
 def many_updates(name, regularizer, updates=20):
@@ -264,5 +265,5 @@ def test_looking_for_a_faint_regularizer_changes_no_number(monkeypatch, measured
         return torch.cat([p.detach().flatten() for p in run.agent.loss.state_dict().values()])
 
     looked = parameters()
-    monkeypatch.setattr("torchrl_l2c2.experiment.learner.MEASURED_AFTER", 10**9)
+    monkeypatch.setattr("torchrl_l2c2.experiment.learn.learner.MEASURED_AFTER", 10**9)
     assert torch.equal(looked, parameters())

@@ -26,8 +26,8 @@ from torchrl_l2c2.experiment import (
     TD3Config,
     UniformReplayConfig,
 )
-from torchrl_l2c2.experiment.compilation import compiler_available
-from torchrl_l2c2.experiment.regularizers import REGULARIZERS
+from torchrl_l2c2.experiment.learn.compilation import compiler_available
+from torchrl_l2c2.experiment.settings.regularizers import REGULARIZERS
 
 pytestmark = pytest.mark.skipif(not compiler_available(), reason="no C++ compiler")
 

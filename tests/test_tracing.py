@@ -6,8 +6,8 @@ from torch.optim import SGD, Adam
 from torch.optim.lr_scheduler import StepLR
 
 from torchrl_l2c2 import AdaTerm
-from torchrl_l2c2.experiment.compilation import compiled, compiler_available
-from torchrl_l2c2.experiment.tracing import traceable_step
+from torchrl_l2c2.experiment.learn.compilation import compiled, compiler_available
+from torchrl_l2c2.experiment.learn.tracing import traceable_step
 
 GRADIENTS = [torch.tensor([3.0, -0.1]), torch.tensor([-1.0, 0.2]), torch.tensor([0.5, 0.0])]
 

@@ -10,8 +10,9 @@ import pytest
 from processes import run_train
 
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig, PPORPEConfig, TaskConfig
-from torchrl_l2c2.experiment.trained import load_policy
-from torchrl_l2c2.experiment.video import main, play_pictures, record_video
+from torchrl_l2c2.experiment.analysis.video import play_pictures, record_video
+from torchrl_l2c2.experiment.cli.video import main
+from torchrl_l2c2.experiment.run.policies import load_policy
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
 pytest.importorskip("pygame")

@@ -15,10 +15,10 @@ from pydantic import TypeAdapter
 from small import own_nodes
 
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig
-from torchrl_l2c2.experiment.composition import CONF, composing, folder_named, register
-from torchrl_l2c2.experiment.config import GROUPS
+from torchrl_l2c2.experiment.cli.composition import CONF, composing, folder_named, register
 from torchrl_l2c2.experiment.errors import UserError
-from torchrl_l2c2.experiment.settings import SettingError, describe
+from torchrl_l2c2.experiment.settings.config import GROUPS
+from torchrl_l2c2.experiment.settings.fields import SettingError, describe
 
 
 @pytest.fixture(scope="module")

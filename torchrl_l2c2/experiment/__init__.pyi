@@ -1,10 +1,14 @@
-from .algorithms import DQNConfig, PPOConfig, PPORPEConfig, SACConfig, TD3Config
-from .collection import EpisodeCollector
-from .config import ExperimentConfig, LoggerConfig
-from .environments import make_env
-from .evaluate import Evaluation, evaluate_policy
-from .optimizers import AdamConfig, AdaTermConfig
-from .regularizers import (
+from .analysis.diagnosis import diagnose, findings, write_page
+from .collect.episodes import EpisodeCollector
+from .collect.workers import MultiEpisodeCollector
+from .envs.environments import make_env
+from .run.evaluation import Evaluation, evaluate_policy
+from .run.experiment import Experiment
+from .run.policies import load_policy
+from .settings.algorithms import DQNConfig, PPOConfig, PPORPEConfig, SACConfig, TD3Config
+from .settings.config import ExperimentConfig, LoggerConfig
+from .settings.optimizers import AdamConfig, AdaTermConfig
+from .settings.regularizers import (
     ASAPConfig,
     CAPSConfig,
     CATSConfig,
@@ -14,11 +18,8 @@ from .regularizers import (
     NoRegularizerConfig,
     SR2LConfig,
 )
-from .replay import PrioritizedReplayConfig, RolloutReplayConfig, UniformReplayConfig
-from .tasks import FIELD_TASKS, PAPER_TASKS, TASKS, TaskConfig
-from .trained import load_policy
-from .training import Experiment
-from .workers import MultiEpisodeCollector
+from .settings.replay import PrioritizedReplayConfig, RolloutReplayConfig, UniformReplayConfig
+from .settings.tasks import FIELD_TASKS, PAPER_TASKS, TASKS, TaskConfig
 
 __all__ = [
     "FIELD_TASKS",
@@ -49,7 +50,10 @@ __all__ = [
     "TD3Config",
     "TaskConfig",
     "UniformReplayConfig",
+    "diagnose",
     "evaluate_policy",
+    "findings",
     "load_policy",
     "make_env",
+    "write_page",
 ]

@@ -1,6 +1,8 @@
-"""``python -m torchrl_l2c2.experiment task=hopper``: the experiments, without a clone."""
+"""``python -m torchrl_l2c2.experiment task=hopper``, short for ``python -m torchrl_l2c2 train``."""
 
-from torchrl_l2c2.experiment.command import main
+import sys
+
+from torchrl_l2c2.experiment.cli.main import main
 
 if __name__ == "__main__":
-    main()
+    main(["train", *sys.argv[1:]])

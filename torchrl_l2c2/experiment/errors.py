@@ -35,6 +35,10 @@ class ChildFailedError(RuntimeError):
     """A compiler or a worker process failed, perhaps because a signal ended it."""
 
 
+class CompilerError(ChildFailedError):
+    """The compiler failed: of its hundreds of lines the one that says why."""
+
+
 # What fails outside of the program: a simulator, a process, the numbers of a training, a disk.
 OUTSIDE = (SimulatorError, ChildFailedError, FloatingPointError, OSError)
 # PyTorch has no class for a lack of CPU memory.

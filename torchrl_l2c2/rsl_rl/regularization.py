@@ -17,9 +17,6 @@ from torchrl_l2c2.objectives import RegularizedLoss
 from torchrl_l2c2.rsl_rl.networks import VALID, write_parameters
 from torchrl_l2c2.transforms import NeighborTransform
 
-# Older checkpoints name a coefficient instead of the method.
-_METHODS = {"l2c2_coeff": "l2c2", "cats_lambda_temporal": "cats"}
-
 
 class Regularization:
     """A regularized loss with the interface of rsl_rl's symmetry extension.
@@ -107,8 +104,7 @@ class Regularization:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores the result of :meth:`state_dict`; ignores the state of another method."""
-        older = _METHODS.get(state["coefficient"]) if "coefficient" in state else self.method
-        if state.get("method", older) != self.method:
+        if state["method"] != self.method:
             return
         self.updates = state["updates"]
         self._set_progress()

@@ -1,0 +1,216 @@
+"""Observations and rewards by their running statistics, and the policy that acts behind them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.envs import ExplorationType
+from torchrl.envs.utils import exploration_type
+
+from torchrl_l2c2.experiment.envs.frames import PREVIOUS
+
+LARGEST = 10.0  # what is normalized is clipped to it, either way
+EPSILON = 1e-8  # added to variances
+
+
+class Normalization(nn.Module):
+    r"""Running statistics of observations and rewards, and what is normalized by them.
+
+    .. math::
+        s \to \frac{s - \mathrm{mean}(s)}{\sqrt{\mathrm{var}(s) + 10^{-8}}}, \qquad
+        r \to \frac{r}{\sqrt{\mathrm{var}(R) + 10^{-8}}}, \qquad R_t = \gamma R_{t-1} + r_t,
+
+    both clipped to 10, as ``VecNormalize`` of Stable-Baselines3 does. Rewards keep their sign and
+    their zero: where an episode ends by itself, taking a mean from them, as TorchRL's
+    ``VecNormV2`` would, changes what is best.
+
+    The statistics that observations are normalized by stay as they are until :meth:`follow`:
+    a whole rollout is played and learned from with the same ones, so that ``s`` and ``s'`` are
+    normalized alike and likelihoods are those of the policy that acted. A ``state_dict`` holds all.
+
+    Args:
+        size (int): numbers in an observation.
+
+    Keyword Args:
+        observations (bool): whether they are normalized.
+        rewards (bool): whether they are.
+        gamma (float): the discount, from 0 to 1. Larger values sum more rewards to :math:`R`.
+        streams (int): simulators that are played at once, at least 1; each has an :math:`R`.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> norm = Normalization(1, observations=True, rewards=False, gamma=0.9, streams=1)
+        >>> seen, false = torch.tensor([[1.0], [3.0]]), torch.zeros(2, 1, dtype=torch.bool)
+        >>> following = {"observation": seen, "reward": torch.ones(2, 1), "done": false}
+        >>> (before,) = norm([TensorDict({"observation": seen, "next": following}, [2])])
+        >>> norm.follow()
+        >>> before["observation"].flatten().tolist()
+        [1.0, 3.0]
+        >>> norm.normalize(seen).flatten().round().tolist()
+        [-1.0, 1.0]
+    """
+
+    mean: Tensor
+    scale: Tensor
+    returns: Tensor
+
+    def __init__(
+        self, size: int, *, observations: bool, rewards: bool, gamma: float, streams: int
+    ) -> None:
+        super().__init__()
+        self._observations, self._rewards, self._gamma = observations, rewards, gamma
+        self.register_buffer("mean", torch.zeros(size))
+        self.register_buffer("scale", torch.ones(size))
+        self.register_buffer("returns", torch.zeros(streams, dtype=torch.float64))
+        self.seen, self.gained = Moments(size), Moments(1)
+
+    def normalize(self, observation: Tensor) -> Tensor:
+        """Observations ``[*B, F]`` by the statistics that are in use."""
+        if not self._observations:
+            return observation
+        scaled: Tensor = (observation - self.mean) / self.scale
+        return scaled.clamp(-LARGEST, LARGEST)
+
+    @torch.no_grad()
+    def forward(self, rollout: Sequence[TensorDictBase]) -> list[TensorDictBase]:
+        """A rollout's frames normalized, after its rewards are counted in.
+
+        Args:
+            rollout (sequence of TensorDictBase): frames ``[T]`` of each stream, with
+                ``"observation"`` and, under ``"next"``, that, ``"reward"`` and ``"done"``.
+
+        Returns:
+            list: copies with both observations and the reward normalized.
+        """
+        device = self.mean.device
+        if self._rewards:
+            sums = [self._discounted(i, frames) for i, frames in enumerate(rollout)]
+            self.gained.update(torch.cat(sums).unsqueeze(-1).to(device))
+        if self._observations:
+            self.seen.update(torch.cat([f["observation"] for f in rollout]).to(device))
+        return [self.normalized(frames) for frames in rollout]
+
+    @torch.no_grad()
+    def normalized(self, frames: TensorDictBase) -> TensorDictBase:
+        """A copy of frames with both observations and the reward normalized; nothing is counted."""
+        copied = frames.copy()
+        for key in ("observation", ("next", "observation"), PREVIOUS):
+            if key not in frames.keys(True):
+                continue
+            copied.set(key, self.normalize(frames[key].to(self.mean.device)))
+        if self._rewards:
+            scaled = frames["next", "reward"].to(self.mean.device) / self.gained.scale.float()
+            copied.set(("next", "reward"), scaled.clamp(-LARGEST, LARGEST))
+        return copied
+
+    def follow(self) -> None:
+        """From here on observations are normalized by all that were counted."""
+        if self._observations:
+            self.mean.copy_(self.seen.mean)
+            self.scale.copy_(self.seen.scale)
+
+    def _discounted(self, stream: int, frames: TensorDictBase) -> Tensor:
+        total, sums = self.returns[stream].item(), []
+        rewards, done = frames["next", "reward"], frames["next", "done"]
+        for reward, ends in zip(rewards.flatten().tolist(), done.flatten().tolist(), strict=True):
+            total = self._gamma * total + reward
+            sums.append(total)
+            if ends:
+                total = 0.0
+        self.returns[stream] = total
+        return torch.tensor(sums, dtype=torch.float64)
+
+
+class Moments(nn.Module):
+    """Mean and variance of everything that was counted; 0 and 1 at first.
+
+    Args:
+        size (int): of what is counted.
+
+    Examples:
+        >>> import torch
+        >>> moments = Moments(1)
+        >>> for part in ([[1.0], [3.0]], [[5.0]]):
+        ...     moments.update(torch.tensor(part))
+        >>> moments.mean.round(decimals=2).item(), moments.var.round(decimals=2).item()
+        (3.0, 2.67)
+    """
+
+    mean: Tensor
+    var: Tensor
+    count: Tensor
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
+        self.register_buffer("var", torch.ones(size, dtype=torch.float64))
+        # Of the first guess: it is forgotten with the first values.
+        self.register_buffer("count", torch.tensor(1e-4, dtype=torch.float64))
+
+    @property
+    def scale(self) -> Tensor:
+        """The standard deviation."""
+        deviation: Tensor = (self.var + EPSILON).sqrt()
+        return deviation
+
+    def update(self, values: Tensor) -> None:
+        """Counts values ``[N, F]`` in, by the parallel form of Welford's algorithm (Chan 1983)."""
+        values = values.double()
+        number, mean = len(values), values.mean(0)
+        total = self.count + number
+        apart = mean - self.mean
+        squares = self.var * self.count + values.var(0, unbiased=False) * number
+        self.var.copy_((squares + apart.square() * self.count * number / total) / total)
+        self.mean.add_(apart * number / total)
+        self.count.copy_(total)
+
+
+class ActingPolicy(TensorDictModuleBase):
+    """A policy of normalized observations, for those that a task shows and the actions it takes.
+
+    Args:
+        policy (TensorDictModule): reads a normalized ``"observation"``.
+        normalization (Normalization, optional): of its observations. Default: they are as shown.
+        low (Tensor, optional): lower bounds of the mean action. Default: none.
+        high (Tensor, optional): upper bounds. Samples go beyond, as their likelihood is that of
+            the unclipped action: who plays them clips them.
+    """
+
+    low: Tensor | None
+    high: Tensor | None
+
+    def __init__(
+        self,
+        policy: TensorDictModule,
+        normalization: Normalization | None,
+        low: Tensor | None = None,
+        high: Tensor | None = None,
+    ) -> None:
+        super().__init__()
+        self.in_keys, self.out_keys = list(policy.in_keys), list(policy.out_keys)
+        self.policy, self.normalization = policy, normalization
+        self.register_buffer("low", low, persistent=False)
+        self.register_buffer("high", high, persistent=False)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes what the policy writes."""
+        seen = tensordict.get("observation")
+        if self.normalization is not None:
+            seen = self.normalization.normalize(seen)
+        written = self.policy(TensorDict({"observation": seen}, tensordict.batch_size))
+        for key in self.out_keys:
+            tensordict.set(key, written.get(key))
+        if exploration_type() is not ExplorationType.RANDOM:
+            tensordict.set("action", self.taken(tensordict.get("action")))
+        return tensordict
+
+    def taken(self, action: Tensor) -> Tensor:
+        """The action that the task gets: a sample ``[*B, A]``, clipped into the bounds."""
+        if self.low is None or self.high is None:
+            return action
+        return torch.maximum(torch.minimum(action, self.high), self.low)

@@ -1,0 +1,96 @@
+"""Proximal policy optimization with a clipped ratio."""
+
+from __future__ import annotations
+
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.envs import EnvBase
+from torchrl.modules import ValueOperator
+from torchrl.objectives.value import GAE
+
+from torchrl_l2c2.experiment.agents._torchrl_internals import TraceableClipPPOLoss
+from torchrl_l2c2.experiment.agents.agent import Agent
+from torchrl_l2c2.experiment.agents.networks import (
+    check_actions,
+    clip_bounds,
+    normal_actor,
+    orthogonal,
+    perceptron,
+    sharing,
+)
+from torchrl_l2c2.experiment.agents.normalization import ActingPolicy, Normalization
+from torchrl_l2c2.experiment.agents.optimizers import make_optimizer
+from torchrl_l2c2.experiment.agents.regularizers import add_regularizer
+from torchrl_l2c2.experiment.errors import UserError
+from torchrl_l2c2.experiment.settings.algorithms import PPOConfig
+from torchrl_l2c2.experiment.settings.optimizers import OptimizerConfig
+from torchrl_l2c2.experiment.settings.regularizers import RegularizerConfig
+
+
+def make_ppo(
+    config: PPOConfig, env: EnvBase, regularizer: RegularizerConfig, optimizer: OptimizerConfig
+) -> Agent:
+    """Builds PPO; the arguments are those of :func:`~.build.make_algorithm`."""
+    check_actions(env, config.name, continuous=True, squashed=not config.clip_actions)
+    activation = {"tanh": nn.Tanh, "relu": nn.ReLU}[config.activation]
+    actor = normal_actor(
+        env, config.hidden, activation, squash=not config.clip_actions, log_scale=config.log_scale
+    )
+    critic = ValueOperator(perceptron(env, 1, config.hidden, activation))
+    if config.orthogonal:
+        orthogonal(actor, last=0.01)
+        orthogonal(critic, last=1.0)
+    loss = TraceableClipPPOLoss(
+        actor,
+        critic,
+        clip_epsilon=config.clip_epsilon,
+        entropy_coeff=config.entropy_coeff,
+        entropy_bonus=config.entropy_coeff > 0,
+        critic_coeff=config.critic_coeff,
+        loss_critic_type="l2",
+        normalize_advantage=True,
+    )
+    loss = add_regularizer(loss, regularizer)
+    advantage = GAE(
+        gamma=config.gamma,
+        lmbda=config.gae_lambda,
+        value_network=sharing(critic, loss.critic_network_params),
+    )
+    normalization = _normalization(config, env)
+    return Agent(
+        loss,
+        policy=_acting(config, sharing(actor, loss.actor_network_params), normalization, env),
+        optimizer=make_optimizer(optimizer, loss.parameters()),
+        advantage=advantage,
+        max_grad_norm=config.max_grad_norm,
+        policy_terms=frozenset({"loss_objective", "loss_entropy"}),
+        normalization=normalization,
+    )
+
+
+def _normalization(config: PPOConfig, env: EnvBase) -> Normalization | None:
+    if not (config.normalize_observations or config.normalize_rewards):
+        return None
+    shape = env.observation_spec["observation"].shape
+    if len(shape) != 1:
+        raise UserError(
+            "algorithm.normalize_observations and normalize_rewards are of tasks that show one "
+            f"vector, this one shows an image of shape {tuple(shape)}: set both to false."
+        )
+    return Normalization(
+        shape[0],
+        observations=config.normalize_observations,
+        rewards=config.normalize_rewards,
+        gamma=config.gamma,
+        streams=config.num_envs or 1,
+    )
+
+
+def _acting(
+    config: PPOConfig, policy: TensorDictModule, normalization: Normalization | None, env: EnvBase
+) -> TensorDictModule:
+    """The policy for the task, with normalization and clipping inside."""
+    if normalization is None and not config.clip_actions:
+        return policy
+    bounds = clip_bounds(env) if config.clip_actions else ()
+    return ActingPolicy(policy, normalization, *bounds)

@@ -1,0 +1,1 @@
+"""Finished runs: tables, curves, diagnosis, export and video."""

@@ -1,0 +1,350 @@
+"""What is measured of a policy: what it does in test episodes, and how steep it is there."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+from torchrl.data import Bounded, TensorSpec
+from torchrl.envs import EnvBase, ExplorationType, GymWrapper, set_exploration_type
+
+from torchrl_l2c2._checks import check_positive_int, check_real
+from torchrl_l2c2.experiment.envs.environments import control_rate, untransformed
+from torchrl_l2c2.experiment.envs.frames import check_finite
+from torchrl_l2c2.experiment.errors import UserError
+from torchrl_l2c2.experiment.run.evaluation import LEAST_STEPS, measure
+from torchrl_l2c2.metrics import action_variation, local_lipschitz, noise_sensitivity
+from torchrl_l2c2.neighborhood import Neighborhood
+
+Value = Callable[[Tensor, Tensor], Tensor]
+"""Observations ``[N, *F]`` and actions ``[N, *A]`` to values, ``[N]`` or of several heads."""
+
+SAMPLES = 16  # actions drawn at a state to see how far they spread
+SAMPLED_STATES = 256
+SAME_PLACE = 0.25  # of the standard deviation of every coordinate within the episode
+STEPS_AT_ONCE = 128  # whose neighbors are in memory together: they may be images
+
+
+@dataclass(frozen=True)
+class TermShare:
+    """How much of a loss one of its terms is; NaN where it is not known.
+
+    Attributes:
+        added: whether a regularizer has added it.
+        size: its part of the sum of all terms' sizes, late in training.
+        gradient: the norm of its gradient relative to that of the loss's own terms.
+    """
+
+    added: bool
+    size: float = math.nan
+    gradient: float = math.nan
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What was measured of a policy, for words and pictures.
+
+    Attributes:
+        name: of the policy.
+        measures: means over the episodes: return, length, the paper's action variation, and the
+            field's measures as :func:`~torchrl_l2c2.experiment.evaluate_policy` names them.
+        actions: mean actions of the first episode, ``[T, A]``.
+        low: lower bounds of the actions, ``[A]``; of those that were seen, where there are none.
+        high: upper bounds, likewise.
+        bounded: whether the bounds are the task's.
+        observations: of the first episode, ``[T, F]``.
+        policy_lipschitz: local Lipschitz constants of the mean action there, ``[T]``; NaN where
+            the observation does not move.
+        value_lipschitz: those of the value function; ``None`` without one.
+        distance: of the neighbors from their states, the largest :math:`|u_i|`, ``[T * K]``.
+        neighborhood: that the neighbors were drawn from.
+        unmoved: share of the steps in which a coordinate does not change at all, ``[F]``.
+        noise_scale: standard deviation of the noise that sensitivity was measured with.
+        noise_action: root mean square change of the action by this noise.
+        noise_share: the part of the action's mean squared change from step to step that such
+            noise, drawn anew at every step, makes alone.
+        spread: standard deviation of the policy's samples, clipped into their bounds, of half the
+            actions' range; 0 for a deterministic policy, NaN for discrete actions.
+        rate: actions per second; ``None`` where it is not known.
+        shares: of the loss's terms.
+        entries: what the coordinates of an observation are called.
+        pictures: of every state of the first episode, ``[H, W, 3]``; may be empty.
+        task: a run's, by its id; empty where it is not known.
+    """
+
+    name: str
+    measures: dict[str, float]
+    actions: Tensor
+    low: Tensor
+    high: Tensor
+    bounded: bool
+    observations: Tensor
+    policy_lipschitz: Tensor
+    value_lipschitz: Tensor | None
+    distance: Tensor
+    neighborhood: Neighborhood
+    unmoved: Tensor
+    noise_scale: float
+    noise_action: float
+    noise_share: float
+    spread: float
+    rate: float | None = None
+    shares: Mapping[str, TermShare] = field(default_factory=dict)
+    entries: Sequence[str] = ()
+    pictures: Sequence[Any] = ()
+    task: str = ""
+
+    @property
+    def range(self) -> Tensor:
+        """Width of the actions' range, ``[A]``; never 0."""
+        return (self.high - self.low).clamp_min(torch.finfo(self.low.dtype).eps)
+
+    @property
+    def relative(self) -> Tensor:
+        """The actions ``[T, A]`` with their range as the unit."""
+        return (self.actions - self.low) / self.range
+
+    @property
+    def gain(self) -> Tensor:
+        """The gain that L2C2 applies at the distances, ``[T * K]``."""
+        return self.neighborhood.gain(self.distance + self.neighborhood.epsilon)
+
+    def worst(self, number: int = 5) -> list[int]:
+        """Steps with the largest local Lipschitz constants of the policy, from the worst on.
+
+        No two are within a fiftieth of the episode or within ``SAME_PLACE``, so that one place is
+        not listed twice.
+        """
+        left = self.policy_lipschitz.nan_to_num(-math.inf).clone()
+        left[left <= 0.0] = -math.inf
+        found: list[int] = []
+        apart = max(1, len(left) // 50)
+        while len(found) < number and left.max() > -math.inf:
+            step = int(left.argmax())
+            found.append(step)
+            left[max(0, step - apart + 1) : step + apart] = -math.inf
+            away = (self.observations - self.observations[step]).abs()
+            left[(away <= SAME_PLACE * self.observations.std(0)).all(1)] = -math.inf
+        return found
+
+
+@torch.no_grad()
+def diagnose(
+    policy: TensorDictModule,
+    env: EnvBase,
+    *,
+    name: str = "policy",
+    episodes: int = 3,
+    max_steps: int = 1000,
+    neighborhood: Neighborhood | None = None,
+    num_neighbors: int = 16,
+    value: Value | None = None,
+    noise_scale: float = 0.01,
+    seed: int = 0,
+) -> Diagnosis:
+    """Plays test episodes with any TorchRL actor, and measures what its shaking is made of.
+
+    Args:
+        policy (TensorDictModule): reads one observation and writes the action, its mean under
+            ``ExplorationType.DETERMINISTIC`` and a sample under ``RANDOM``.
+        env (EnvBase): a single environment, seeded by who made it.
+
+    Keyword Args:
+        name (str): what it is called beside others. Default ``"policy"``.
+        episodes (int): how many, at least 1. The measures are means over them, all else is of the
+            first. Default 3.
+        max_steps (int): longest episode. Default 1000.
+        neighborhood (Neighborhood, optional): where local Lipschitz constants are taken. Default:
+            ``Neighborhood()``.
+        num_neighbors (int): of every state, at least 1; more find steeper places. Default 16.
+        value (callable, optional): observations ``[N, *F]`` and actions ``[N, *A]`` to values, to
+            see how steep the value function is. Default: none is looked at.
+        noise_scale (float): standard deviation of the noise on observations that the policy's
+            sensitivity is measured with, greater than 0. Default .01.
+        seed (int): of neighbors, noise and samples. Default 0.
+
+    Returns:
+        Diagnosis: for :func:`~.words.findings` and :func:`~.page.write_page`.
+
+    Raises:
+        TypeError: the environment is none of TorchRL's.
+        ValueError: the environment is a batch of several, the policy reads more than one of its
+            observations, or an episode is shorter than four steps.
+        FloatingPointError: an observation, an action or a reward is not finite.
+
+    Examples:
+        >>> from torchrl.envs import GymEnv
+        >>> from torchrl_l2c2 import make_actor
+        >>> env = GymEnv("Pendulum-v1", max_episode_steps=20)
+        >>> found = diagnose(make_actor(3, env.action_spec), env, episodes=1)
+        >>> found.actions.shape, found.policy_lipschitz.shape, found.rate
+        (torch.Size([20, 1]), torch.Size([20]), 20.0)
+    """
+    check_positive_int("episodes", episodes)
+    check_real("noise_scale", noise_scale, above=0)
+    key = _observed(policy, env)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        played = [env.rollout(max_steps, policy).detach() for _ in range(episodes)]
+    lengths = [len(episode) for episode in played]
+    if min(lengths) < LEAST_STEPS:
+        raise UserError(
+            f"an episode of {min(lengths)} steps is too short to be diagnosed: it needs "
+            f"{LEAST_STEPS}. Give a larger max_steps, or a policy that lasts longer."
+        )
+    for episode in played:
+        check_finite(episode, 0, test=True, observation=key, action=env.action_key)
+    first = played[0]
+    actions = _flat(first[env.action_key])
+    low, high, bounded = _bounds(env.action_spec, actions)
+    generator = torch.Generator().manual_seed(seed)
+
+    def act(observation: Tensor) -> Tensor:
+        return _act(policy, observation, key, env.action_key)
+
+    near = Neighborhood() if neighborhood is None else neighborhood
+    steepness = _steepness(first, key, env.action_key, act, value, near, num_neighbors, generator)
+    states, following = first[key], first["next", key]
+    sensitivity = noise_sensitivity(act, states, noise_scale, generator=generator).item()
+    change = actions.diff(dim=0).square().sum(-1).mean().item()
+    return Diagnosis(
+        name=name,
+        measures=_means(played, env),
+        actions=actions,
+        low=low,
+        high=high,
+        bounded=bounded,
+        observations=_flat(states),
+        **steepness,
+        neighborhood=near,
+        unmoved=(_flat(states) == _flat(following)).float().mean(0),
+        noise_scale=noise_scale,
+        noise_action=math.sqrt(2 * sensitivity),
+        # Two independent draws differ by twice the variance of one.
+        noise_share=4 * sensitivity / change if change else 0.0,
+        spread=_spread(policy, states, key, env, low, high, seed),
+        rate=control_rate(env) if isinstance(untransformed(env), GymWrapper) else None,
+        entries=[f"{key}[{i}]" for i in range(_flat(states).shape[1])],
+    )
+
+
+def _observed(policy: TensorDictModule, env: EnvBase) -> NestedKey:
+    if not isinstance(env, EnvBase):
+        raise TypeError(
+            f"env must be an environment of TorchRL, got {env!r}: torchrl.envs.GymEnv(id) makes "
+            "one, GymWrapper(env) one of Gymnasium's."
+        )
+    if env.batch_size:
+        raise ValueError(
+            f"one environment is diagnosed, got a batch of {tuple(env.batch_size)}: give the one "
+            "that it is made of."
+        )
+    if len(keys := list(policy.in_keys)) != 1:
+        raise ValueError(
+            f"the policy must read one observation, this one reads {keys}: join them with "
+            "torchrl.envs.CatTensors."
+        )
+    return keys[0]
+
+
+def _act(
+    policy: TensorDictModule, observation: Tensor, key: NestedKey, action_key: NestedKey
+) -> Tensor:
+    """Mean actions ``[N, A]`` at observations ``[N, *F]``."""
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        rows = TensorDict({key: observation}, observation.shape[:1])
+        return _flat(policy(rows)[action_key])
+
+
+def _steepness(
+    episode: TensorDictBase,
+    key: NestedKey,
+    action_key: NestedKey,
+    act: Callable[[Tensor], Tensor],
+    value: Value | None,
+    near: Neighborhood,
+    num_neighbors: int,
+    generator: torch.Generator,
+) -> dict[str, Any]:
+    """Distances, and local Lipschitz constants along an episode, some of its steps at a time."""
+    found: dict[str, list[Tensor]] = {"policy": [], "value": [], "distance": []}
+    for part in episode.split(STEPS_AT_ONCE):
+        state, action = part[key].float(), part[action_key]
+        neighbor, distance = near.sample(state, part["next", key].float(), num_neighbors, generator)
+        rows = neighbor.flatten(0, 1)
+        places = state.flatten(1), neighbor.flatten(2)
+        found["distance"].append((distance - near.epsilon).flatten())
+        found["policy"].append(_constants(places, act(state), act(rows)))
+        if value is not None:
+            repeated = action.repeat_interleave(num_neighbors, 0)
+            here, there = value(state, action), value(rows, repeated)
+            found["value"].append(_constants(places, here, there))
+    return {
+        "policy_lipschitz": torch.cat(found["policy"]),
+        "value_lipschitz": torch.cat(found["value"]) if value is not None else None,
+        "distance": torch.cat(found["distance"]),
+    }
+
+
+def _constants(places: tuple[Tensor, Tensor], here: Tensor, there: Tensor) -> Tensor:
+    """Local Lipschitz constants from a function's values at states and at their neighbors."""
+    rows = _flat(there).unflatten(0, places[1].shape[:2])
+    return local_lipschitz(places[0].cpu(), places[1].cpu(), _flat(here), rows)
+
+
+def _means(played: Sequence[TensorDictBase], env: EnvBase) -> dict[str, float]:
+    each: list[dict[str, float]] = []
+    for episode in played:
+        actions = _flat(episode[env.action_key])
+        each.append(
+            {
+                "return": episode["next", "reward"].sum().item(),
+                "length": float(len(episode)),
+                "action_variation": action_variation(actions).item(),
+                **measure(actions, env.action_spec),
+            }
+        )
+    return {name: statistics.fmean(one[name] for one in each) for name in each[0]}
+
+
+def _bounds(spec: TensorSpec, actions: Tensor) -> tuple[Tensor, Tensor, bool]:
+    """Of the task, else of what was seen."""
+    if isinstance(spec, Bounded) and spec.dtype.is_floating_point:
+        low, high = (bound.flatten().float().cpu() for bound in (spec.space.low, spec.space.high))
+        if low.isfinite().all() and high.isfinite().all():
+            return low, high, True
+    return actions.amin(0), actions.amax(0), False
+
+
+def _spread(
+    policy: TensorDictModule,
+    states: Tensor,
+    key: NestedKey,
+    env: EnvBase,
+    low: Tensor,
+    high: Tensor,
+    seed: int,
+) -> float:
+    if not env.action_spec.dtype.is_floating_point:
+        return math.nan
+    apart = -(-len(states) // SAMPLED_STATES)
+    rows = states[::apart].repeat_interleave(SAMPLES, 0)
+    with torch.random.fork_rng(devices=[]), set_exploration_type(ExplorationType.RANDOM):
+        torch.manual_seed(seed)
+        drawn = policy(TensorDict({key: rows}, rows.shape[:1]))[env.action_key]
+    # Some policies leave it to the task to clip them.
+    drawn = _flat(env.action_spec.project(drawn))
+    half = ((high - low) / 2).clamp_min(torch.finfo(low.dtype).eps)
+    deviation = (drawn / half).unflatten(0, (-1, SAMPLES)).std(1)
+    return float(deviation.square().mean().sqrt())
+
+
+def _flat(tensor: Tensor) -> Tensor:
+    """One row for every step."""
+    return tensor.reshape(len(tensor), -1).float().cpu()

@@ -1,0 +1,265 @@
+"""Pictures of diagnoses: one of each for every policy, on the same axes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrl_l2c2.experiment.analysis.diagnosis.measured import Diagnosis
+from torchrl_l2c2.experiment.analysis.reports.figures import drawn, subplots
+from torchrl_l2c2.metrics import amplitude_spectrum
+
+WIDTH = 4.6  # inches, of every picture
+ZOOM = 60  # steps that are shown close by
+MOST_ACTIONS = 4  # that are drawn: those that change most
+COLORS = ("#1f5fa8", "#c0562b", "#2a7f62", "#8a6d1d")
+WORST = "#c2182b"
+BINS = 40
+
+
+def draw_actions(diagnoses: Sequence[Diagnosis]) -> list[bytes]:
+    """Mean actions over an episode, and close by where they change most; SVG, one for each."""
+    return [_draw(2, 3.6, _actions, one) for one in diagnoses]
+
+
+def draw_together(diagnoses: Sequence[Diagnosis]) -> bytes:
+    """The first episodes' actions, a row for every policy on the same axes; SVG."""
+    figure, axes = subplots(1, len(diagnoses), (2 * WIDTH, 0.5 + 1.6 * len(diagnoses)))
+    for axis in axes[1:]:
+        axis.sharex(axes[0])
+        axis.sharey(axes[0])
+    for axis, one in zip(axes, diagnoses, strict=True):
+        for place, number in enumerate(busiest(one)):
+            axis.plot(one.actions[:, number].numpy(), **_line(place, number))
+        total, variation = (one.measures[name] for name in ("return", "action_variation"))
+        title = f"{one.name}: return {total:.4g}, action variation {variation:.2g}"
+        axis.set_title(title, fontsize=10, parse_math=False)
+        axis.set_ylabel("action")
+        axis.grid(alpha=0.25)
+        _legend(axis, one)  # Policies differ in which actions change most.
+    axes[-1].set_xlabel("step")
+    return drawn(figure)
+
+
+def draw_spectra(diagnoses: Sequence[Diagnosis]) -> list[bytes]:
+    """Amplitudes of the frequencies that the actions are made of, as shares of their range."""
+    spectra = [
+        amplitude_spectrum(one.relative[:, busiest(one)], one.rate or 1.0) for one in diagnoses
+    ]
+    top = max(float(amplitudes[1:].max()) for _, amplitudes in spectra) or 1.0
+
+    return [
+        _draw(1, 2.4, _spectrum, one, *each, top)
+        for one, each in zip(diagnoses, spectra, strict=True)
+    ]
+
+
+def draw_steepness(diagnoses: Sequence[Diagnosis]) -> list[bytes]:
+    """Local Lipschitz constants along the episode, and where among its states; worst marked."""
+    policy = _limits(one.policy_lipschitz for one in diagnoses)
+    value = _limits(one.value_lipschitz for one in diagnoses if one.value_lipschitz is not None)
+
+    return [_draw(3, 6.8, _steepness, one, policy, value) for one in diagnoses]
+
+
+def draw_neighborhoods(diagnoses: Sequence[Diagnosis]) -> list[bytes]:
+    """Histograms of the neighbors' distances and of the gain that is applied there."""
+    return [_draw(2, 3.8, _neighborhood, one) for one in diagnoses]
+
+
+def draw_shares(diagnoses: Sequence[Diagnosis]) -> list[bytes]:
+    """Bars of how much of the loss, and of its gradient, every term is."""
+    return [_draw(1, 0.9 + 0.32 * len(one.shares), _shares, one) for one in diagnoses]
+
+
+def busiest(one: Diagnosis) -> list[int]:
+    """The actions that change most, in their order."""
+    change = one.relative.diff(dim=0).abs().mean(0)
+    return sorted(change.topk(min(MOST_ACTIONS, len(change))).indices.tolist())
+
+
+def _actions(axes: Sequence[Any], one: Diagnosis) -> None:
+    change = one.relative.diff(dim=0).abs().sum(1)
+    sums = change.unfold(0, min(ZOOM, len(change)), 1).sum(1)
+    start = int(sums.argmax())
+    end = min(start + ZOOM, len(one.actions) - 1)
+    for axis, marker in zip(axes, (None, "."), strict=True):
+        for place, number in enumerate(busiest(one)):
+            steps = range(len(one.actions))
+            axis.plot(steps, one.actions[:, number].numpy(), marker=marker, **_line(place, number))
+        if one.bounded:
+            for bound in {*one.low.tolist(), *one.high.tolist()}:
+                axis.axhline(bound, color="black", linewidth=0.6, linestyle=":")
+        axis.set_ylabel("action")
+    if end - start < len(one.actions) - 1:
+        axes[0].axvspan(start, end, color=WORST, alpha=0.12, linewidth=0)
+    axes[1].set_xlim(start, end)
+    axes[1].set_ylim(axes[0].get_ylim())
+    axes[1].set_xlabel("step, where it changes most")
+    _legend(axes[0], one)
+
+
+def _spectrum(
+    axes: Sequence[Any], one: Diagnosis, frequencies: Tensor, amplitudes: Tensor, top: float
+) -> None:
+    (axis,) = axes
+    for place, number in enumerate(busiest(one)):
+        heights = amplitudes[1:, place].clamp_min(1e-9).numpy()
+        axis.plot(frequencies[1:].numpy(), heights, **_line(place, number))
+    axis.set_yscale("log")
+    axis.set_ylim(top * 1e-4, top * 1.5)
+    axis.set_xlabel("cycles per step" if one.rate is None else "hertz")
+    axis.set_ylabel("amplitude, of the range")
+    _legend(axis, one)
+
+
+def _steepness(
+    axes: Sequence[Any], one: Diagnosis, policy: tuple[float, float], value: tuple[float, float]
+) -> None:
+    over_time, of_value, plane = axes
+    _along(over_time, one.policy_lipschitz, one, policy, "policy")
+    if one.value_lipschitz is None:
+        of_value.text(0.5, 0.5, "no value function", ha="center", transform=of_value.transAxes)
+    else:
+        _along(of_value, one.value_lipschitz, one, value, "value")
+    of_value.set_xlabel("step")
+    _plane(plane, one, policy)
+
+
+def _along(
+    axis: Any, constants: Tensor, one: Diagnosis, limits: tuple[float, float], name: str
+) -> None:
+    axis.plot(range(len(constants)), constants.numpy(), color=COLORS[0], linewidth=0.7)
+    for place, step in enumerate(one.worst(), 1):
+        axis.plot([step], [constants[step]], "o", color=WORST, markersize=4)
+        axis.annotate(
+            str(place),
+            (step, float(constants[step])),
+            xytext=(3, 3),
+            textcoords="offset points",
+            color=WORST,
+            fontsize=8,
+        )
+    axis.set_yscale("log")
+    axis.set_ylim(limits[0] / 2, limits[1] * 3)
+    axis.set_ylabel(f"{name}, constant")
+
+
+def _plane(axis: Any, one: Diagnosis, limits: tuple[float, float]) -> None:
+    """The episode's states in the plane that holds most of them."""
+    from matplotlib.colors import LogNorm
+
+    states = one.observations
+    spread = states.std(0)
+    states = (states - states.mean(0)) / torch.where(spread > 0.0, spread, 1.0)
+    directions = torch.linalg.svd(states, full_matrices=False).Vh[:2]
+    x, y = (states @ directions.T).T if len(directions) > 1 else (states[:, 0], states[:, 0])
+    order = one.policy_lipschitz.nan_to_num().argsort()
+    dots = axis.scatter(
+        *(x[order].numpy(), y[order].numpy()),
+        c=one.policy_lipschitz.nan_to_num(limits[0])[order].clamp_min(limits[0]).numpy(),
+        norm=LogNorm(*limits),
+        cmap="viridis",
+        s=7,
+        linewidths=0,
+        rasterized=True,
+    )
+    for place, step in enumerate(one.worst(), 1):
+        axis.plot(*([x[step]], [y[step]]), "o", mfc="none", color=WORST, markersize=7)
+        axis.annotate(
+            str(place),
+            (float(x[step]), float(y[step])),
+            xytext=(5, 4),
+            textcoords="offset points",
+            color=WORST,
+            fontsize=8,
+        )
+    axis.set_xlabel("states, first principal direction")
+    axis.set_ylabel("second")
+    bar = axis.figure.colorbar(
+        dots,
+        ax=axis,
+        label="policy, constant",
+        location="bottom",
+        aspect=40,
+        ticks=[limits[0], math.sqrt(limits[0] * limits[1]), limits[1]],
+        format="%.2g",
+    )
+    bar.minorticks_off()
+
+
+def _neighborhood(axes: Sequence[Any], one: Diagnosis) -> None:
+    near = one.neighborhood
+    distance, gain = one.distance[one.distance.isfinite()], one.gain
+    axes[0].hist(distance.numpy(), bins=BINS, range=(0.0, near.radius), color=COLORS[0])
+    axes[0].set_xlabel("distance max |u|")
+    low, high = near.lambda_min, near.lambda_max
+    edges = torch.logspace(math.log10(low), math.log10(high), BINS + 1, dtype=torch.float64)
+    applied = gain[gain > 0.0].double()  # Beyond max_step there is none.
+    axes[1].hist(applied.clamp(edges[0], edges[-1]).numpy(), bins=edges.numpy(), color=COLORS[2])
+    axes[1].set_xscale("log")
+    for bound in (low, high):
+        axes[1].axvline(bound, color="black", linewidth=0.8, linestyle=":")
+    axes[1].axvline(gain.mean(), color=WORST, linewidth=1.2)
+    axes[1].set_xlabel(f"applied gain between its bounds (dotted); mean {gain.mean():.3g} (red)")
+    for axis in axes:
+        axis.set_yticks([])
+
+
+def _shares(axes: Sequence[Any], one: Diagnosis) -> None:
+    (axis,), names = axes, list(one.shares)[::-1]
+    kinds = (("size", "of the loss's size", COLORS[0]), ("gradient", "gradient", COLORS[1]))
+    for kind, label, color in kinds:
+        values = [getattr(one.shares[name], kind) for name in names]
+        if all(map(math.isnan, values)):
+            continue
+        height = 0.4 if kind == "size" else -0.4
+        axis.barh(names, values, height, align="edge", label=label, color=color)
+        for place, value in enumerate(values):
+            if not math.isnan(value):
+                told = f" {_percent(value)}"
+                axis.annotate(told, (value, place + height / 2), va="center", fontsize=8)
+    axis.margins(x=0.2)
+    axis.set_xlabel("share")
+    axis.legend(frameon=False, fontsize=8, loc="best")
+
+
+def _percent(value: float) -> str:
+    """A share with two digits, without an exponent where it is large.
+
+    Examples:
+        >>> [_percent(value) for value in (0.0012, 0.123, 0.999, 1.53)]
+        ['0.12%', '12%', '100%', '153%']
+    """
+    return f"{100 * value:.2g}%" if value < 0.995 else f"{100 * value:.0f}%"
+
+
+def _draw(down: int, height: float, fill: Callable[..., None], *of: Any) -> bytes:
+    figure, axes = subplots(1, down, (WIDTH, height))
+    for axis in axes:
+        axis.grid(alpha=0.25)
+    fill(axes, *of)
+    return drawn(figure)
+
+
+def _limits(constants: Iterable[Tensor]) -> tuple[float, float]:
+    """Of all policies together; the lower hundredth is left out."""
+    known = [each[each.isfinite() & (each > 0.0)] for each in constants]
+    together = torch.cat([*known, torch.empty(0)])
+    if not len(together):
+        return 1.0, 10.0
+    low, high = together.quantile(0.01).item(), together.max().item()
+    return low, max(high, low * 1.01)
+
+
+def _line(place: int, number: int) -> dict[str, Any]:
+    return {"color": COLORS[place], "linewidth": 0.9, "markersize": 3, "label": f"action[{number}]"}
+
+
+def _legend(axis: Any, one: Diagnosis) -> None:
+    if one.actions.shape[1] > 1:
+        axis.legend(frameon=False, fontsize=8, ncols=2, loc="best")

@@ -1,0 +1,75 @@
+"""What tables and pictures call a method, its color and its place among the others."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from torchrl_l2c2.experiment.settings.regularizers import REGULARIZERS, L2C2Config
+
+# In the order of tables: name and color.
+METHODS = {
+    "none": ("vanilla", "#777777"),
+    "caps": ("CAPS", "#d95f02"),
+    "l2c2": ("L2C2", "#1b6ca8"),
+    "l2c2_paper": ("L2C2, the paper's", "#6fa8dc"),
+    "l2c2_policy": ("L2C2, beta=0", "#7570b3"),
+    "l2c2_mean": ("L2C2, means", "#2a9d8f"),
+    "l2c2_ramp": ("L2C2, means, ramp", "#0b3d66"),
+    "l2c2_constant": ("L2C2, constant", "#1b6ca8"),
+    "cats": ("CATS", "#b0416b"),
+    "grad_caps": ("Grad-CAPS", "#8a6d1d"),
+    "asap": ("ASAP", "#4b6f44"),
+    "sr2l": ("SR2L", "#444444"),
+    "lcp": ("LCP", "#9c755f"),
+}
+
+DISTANCES = {"hellinger": "Hellinger", "mean": "means", "mse": "mse", "kl": "KL"}
+
+
+def method_name(method: str) -> str:
+    """How a method is called in tables and pictures; its own name where the paper has none."""
+    return METHODS.get(method, (method, ""))[0]
+
+
+def name_with_settings(method: str, settings: Mapping[str, str | None]) -> tuple[str, set[str]]:
+    """How a method is called with settings of its own, and which of them the name tells.
+
+    L2C2 is told by its distance and its gain, or what this follows: by itself it is the paper's,
+    with Hellinger's and the paper's gains, whatever else it may be elsewhere.
+
+    Args:
+        method (str): its name.
+        settings (Mapping): what differs from its defaults, as records have it.
+
+    Examples:
+        >>> name_with_settings("l2c2", {"regularizer.beta": "0.5"})
+        ('L2C2', set())
+        >>> own = {"regularizer.policy_distance": "mse", "regularizer.lambda_min": "0.3"}
+        >>> name_with_settings("l2c2_ramp", own)[0]
+        'L2C2, mse 0.3, ramp'
+        >>> own |= {"regularizer.gain": "target", "regularizer.gain_target": "0.1"}
+        >>> name_with_settings("l2c2", own)[0]
+        'L2C2, mse, target 0.1'
+    """
+    usual = REGULARIZERS.get(method)
+    own = {k.removeprefix("regularizer."): v for k, v in settings.items() if v is not None}
+    if not isinstance(usual, L2C2Config) or not {"policy_distance", "lambda_min"} & own.keys():
+        return method_name(method), set()
+    distance = DISTANCES[own.get("policy_distance", usual.policy_distance)]
+    gain, edge = own.get("gain", usual.gain), own.get("lambda_min", f"{usual.lambda_min:g}")
+    told = {"policy_distance", "gain"}
+    if gain == "target":
+        told, name = told | {"gain_target"}, f"{distance}, {gain} {own.get('gain_target')}"
+    else:
+        told, name = told | {"lambda_min"}, f"{distance} {edge}{', ramp' if gain == 'ramp' else ''}"
+        ratio = float(own.get("lambda_max", usual.lambda_max)) / float(edge)
+        if math.isclose(ratio, usual.lambda_max / usual.lambda_min):
+            told.add("lambda_max")  # The paper's ratio goes without saying.
+    return f"L2C2, {name}", {f"regularizer.{setting}" for setting in told}
+
+
+def method_order(method: str) -> tuple[int, str]:
+    """Sorts the paper's methods as the paper does, others behind them by name."""
+    known = list(METHODS)
+    return (known.index(method) if method in known else len(known), method)

@@ -1,0 +1,179 @@
+"""Test episodes as the simulator draws them, as a video.
+
+``python -m torchrl_l2c2 video FOLDER`` records a run's policy.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+
+from torchrl_l2c2.experiment.agents._torchrl_internals import simulator_of
+from torchrl_l2c2.experiment.collect.episodes import play_episodes
+from torchrl_l2c2.experiment.envs.environments import control_rate, make_env, untransformed
+from torchrl_l2c2.experiment.errors import MissingPackageError, UserError
+from torchrl_l2c2.experiment.run.files import make_folder_of
+from torchrl_l2c2.experiment.run.policies import load_policy, seed_of_test
+from torchrl_l2c2.experiment.run.process import ProcessState
+from torchrl_l2c2.experiment.settings.tasks import TaskConfig
+
+Picture = NDArray[np.uint8]
+# Of the files that H.264, the encoder's default, fits into.
+ENDINGS = (".avi", ".m4v", ".mkv", ".mov", ".mp4")
+
+
+def check_video(path: str | Path | None = None) -> None:
+    """Refuses to record what could not be written afterwards.
+
+    Args:
+        path (str or Path, optional): of the file, where it is known; its folder is made.
+
+    Raises:
+        ImportError: the ``video`` extra is missing.
+        ValueError: the file's ending is none of a video's.
+        OSError: its folder cannot be written to.
+    """
+    if find_spec("imageio_ffmpeg") is None:
+        raise MissingPackageError(
+            'imageio-ffmpeg is missing: pip install "torchrl-l2c2[video]" brings it.'
+        )
+    if path is None:
+        return
+    if Path(path).suffix.lower() not in ENDINGS:
+        raise UserError(f"a video's file ends in {', '.join(ENDINGS)}, got {str(path)!r}.")
+    make_folder_of(path)
+
+
+def check_pictures(task: TaskConfig) -> None:
+    """Refuses a task that draws no pictures, by drawing its first one.
+
+    Raises:
+        ValueError: it has no pictures.
+        SimulatorError: it fails at drawing, for lack of a graphics library for example.
+    """
+    with _without_a_screen(), ProcessState(0):
+        make_env(task, 0, render=True).close()
+
+
+def record_video(
+    run: str | Path,
+    path: str | Path | None = None,
+    *,
+    episodes: int = 1,
+    seed: int | None = None,
+    noise_scale: float | None = None,
+    best: bool = False,
+) -> Path:
+    """Writes a video of test episodes with a run's mean policy, at the speed of simulated time.
+
+    Args:
+        run (str or Path): a run's folder.
+        path (str or Path, optional): of the file; its ending, ``.mp4``, ``.m4v``, ``.mkv``,
+            ``.mov`` or ``.avi``, says what it is. Default: ``video.mp4`` in the folder.
+
+    Keyword Args:
+        episodes (int): how many, one after the other, at least 1. Default 1.
+        seed (int, optional): of the environment and its noise. Default: that of the run's test, so
+            that these are its first episodes.
+        noise_scale (float, optional): of the environment's noise. Default: the task's.
+        best (bool): whether to take ``policy_best.pt``. Default ``False``.
+
+    Returns:
+        Path: of the file.
+
+    Raises:
+        ImportError: the ``video`` extra is missing.
+        ValueError: the task draws no pictures, fewer than one episode, or a file with another
+            ending.
+        FileNotFoundError: the folder holds no run, or no policy yet.
+        OSError: the file cannot be written.
+    """
+    check_video(path)
+    if episodes < 1:
+        raise UserError(f"episodes must be at least 1, got {episodes}.")
+    path = Path(path or Path(run) / "video.mp4")
+    played = play_pictures(run, episodes, seed=seed, noise_scale=noise_scale, best=best)
+    rate = played[0][2]
+    write_video(path, [picture for _, seen, _ in played for picture in seen], rate or 30.0)
+    return path
+
+
+def play_pictures(
+    run: str | Path,
+    episodes: int,
+    *,
+    seed: int | None = None,
+    noise_scale: float | None = None,
+    best: bool = False,
+) -> list[tuple[TensorDictBase, list[Picture], float | None]]:
+    """Test episodes with the pictures of every state, and the pictures per second.
+
+    The arguments are those of :func:`record_video`.
+
+    Returns:
+        list: of each, the episode ``[T]``; its ``T + 1`` pictures, from the reset on; their rate,
+        or ``None`` where the simulator does not say.
+    """
+    with _without_a_screen():
+        # Within, as some tasks draw from the global generators where they are made.
+        with ProcessState(seed_of_test(run, seed)):
+            policy, env, max_steps = load_policy(
+                run, seed=seed, noise_scale=noise_scale, best=best, render=True
+            )
+            simulator: Any = simulator_of(untransformed(env))
+            played = [
+                (episode, list(simulator.render()), control_rate(env))
+                for episode in play_episodes(policy, env, episodes, max_steps=max_steps)
+            ]
+        env.close()
+    return played
+
+
+def write_video(path: Path, pictures: Sequence[Picture], rate: float) -> None:
+    """Encodes pictures ``[H, W, 3]`` of bytes; the file is there when it is whole.
+
+    Raises:
+        OSError: it could not be written.
+    """
+    import imageio_ffmpeg
+
+    height, width, _ = pictures[0].shape
+    partial = path.with_name(f".partial_{path.name}")
+    writer = imageio_ffmpeg.write_frames(
+        str(partial),
+        (width, height),
+        fps=rate,
+        macro_block_size=2,  # an odd side is stretched by a pixel, which the encoder needs
+        ffmpeg_log_level="error",
+    )
+    try:
+        writer.send(None)
+        for picture in pictures:
+            writer.send(np.ascontiguousarray(picture))
+        writer.close()
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _without_a_screen() -> Iterator[None]:
+    """MuJoCo and SDL look for a screen unless told otherwise."""
+    known = {"MUJOCO_GL": "egl", "SDL_VIDEODRIVER": "dummy"}
+    told = (
+        {} if "DISPLAY" in os.environ else {k: v for k, v in known.items() if k not in os.environ}
+    )
+    os.environ.update(told)
+    try:
+        yield
+    finally:
+        for name in told:
+            del os.environ[name]

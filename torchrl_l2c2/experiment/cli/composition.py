@@ -1,0 +1,284 @@
+"""What Hydra composes of ``conf/`` and the settings' own defaults, and what a run reads of it."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import re
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from difflib import get_close_matches
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from hydra.core.config_store import ConfigStore
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException, OverrideParseException
+from hydra.types import RunMode
+from omegaconf.errors import OmegaConfBaseException
+
+from torchrl_l2c2.experiment.settings.config import GROUPS, STEERING, ExperimentConfig
+from torchrl_l2c2.experiment.settings.fields import SettingError, describe
+from torchrl_l2c2.experiment.settings.naming import run_name
+from torchrl_l2c2.experiment.settings.regularizers import BEGIN_WITH_PRESET, preset_settings
+from torchrl_l2c2.presets import KINDS, preset
+
+PACKAGE = Path(__file__).parents[2]
+# Beside the package in a clone, within it when installed.
+CONF = next(folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if folder.is_dir())
+
+# What a method is chosen by.
+ALSO_CALLED = {"method": ["regularizer"], "methods": ["regularizer"]}
+
+
+def register() -> None:
+    """Gives Hydra every choice of every group, from the settings' own defaults.
+
+    ``conf/`` holds what combines them.
+    """
+    store = ConfigStore.instance()
+    for group, choices in GROUPS.items():
+        for name, chosen in choices.items():
+            store.store(group=group, name=name, node=_node(chosen))
+    for name, algorithm in product(BEGIN_WITH_PRESET, KINDS):
+        node = {"regularizer": preset_settings(name, algorithm)}
+        store.store(group="regularizer_preset", name=f"{name}_{algorithm}", node=node)
+    unknown = dict.fromkeys(("env_id", "noise_scale", "max_steps", "solved_at"))
+    any_task = {"name": "${task.env_id}", **unknown}
+    store.store(
+        group="task", name="gymnasium", node={**_node(GROUPS["task"]["swingup"]), **any_task}
+    )
+    config = dataclasses.asdict(ExperimentConfig())
+    store.store(name="settings", node={name: config[name] for name in describe(ExperimentConfig)})
+
+
+def _node(chosen: Any) -> dict[str, Any]:
+    values = {k: list(v) if isinstance(v, tuple) else v for k, v in vars(chosen).items()}
+    if not hasattr(chosen, "usual_replay"):
+        return values
+    usual = [
+        {"override /replay@_global_.replay": chosen.usual_replay},
+        {"override /optimizer@_global_.optimizer": chosen.usual_optimizer},
+    ]
+    return {"defaults": [*usual, "_self_"], **values}
+
+
+def read(values: dict[str, Any]) -> tuple[ExperimentConfig, Path]:
+    """A run's settings, and its folder: what Hydra was told, or one below ``outputs``.
+
+    Args:
+        values (dict): the configuration.
+
+    Raises:
+        SettingError: a setting that cannot be.
+    """
+    chosen = HydraConfig.get()
+    check_preset(values, chosen.runtime.choices.get("preset"))
+    for name in ("outputs", "resume"):
+        values[name] = folder_named(name, values[name])
+    config = ExperimentConfig.from_dict(values)
+    check_budget(config, chosen.overrides.task)
+    multirun = chosen.mode == RunMode.MULTIRUN
+    if multirun:
+        check_folders(chosen, values["outputs"])
+    folder = chosen.sweep.subdir if multirun else chosen.run.dir
+    if folder == ".":
+        return config, Path(values["outputs"]) / run_name(config)
+    return config, Path(chosen.runtime.output_dir)
+
+
+def check_preset(values: dict[str, Any], name: str | None) -> None:
+    """Refuses a task and an algorithm that a preset has no settings of.
+
+    Raises:
+        SettingError: with those that it has.
+    """
+    if values.get("preset") != "???":  # What they replace.
+        return
+    folder, prefix = CONF / "preset", f"{name}_"
+    general = (path.stem.removeprefix(prefix) for path in folder.glob(f"general/{prefix}*.yaml"))
+    known = [f"any task with algorithm={each}" for each in sorted(general)]
+    known += sorted(path.stem for path in (folder / str(name)).glob("*.yaml"))
+    task, algorithm = values["task"]["name"], values["algorithm"]["name"]
+    raise SettingError(
+        "preset",
+        f"must have settings of task={task} with algorithm={algorithm}, and {name} has those of "
+        f"{', '.join(known)}: choose one of these, or preset=none.",
+    )
+
+
+def check_budget(config: ExperimentConfig, given: Sequence[str]) -> None:
+    """Refuses episodes beside frames, as a preset has them, by which the length goes then.
+
+    Args:
+        config (ExperimentConfig): the settings.
+        given (Sequence of str): what the command line says.
+
+    Raises:
+        SettingError: with what to give instead.
+    """
+    episodes = any(each.startswith("task.episodes=") for each in given)
+    if episodes and config.task.frames is not None:
+        raise SettingError(
+            "task.episodes",
+            f"is not read where there is task.frames, here {config.task.frames}: give "
+            "task.frames=... instead, or task.frames=null beside it.",
+        )
+
+
+def check_folders(chosen: Any, outputs: str) -> None:
+    """Refuses Hydra's names for where runs go, which a sweep does not read.
+
+    Args:
+        chosen (HydraConf): what Hydra was told.
+        outputs (str): where the sweep's runs go.
+
+    Raises:
+        SettingError: with what to give instead.
+    """
+    whole = chosen.sweep.subdir == "." and chosen.sweep.dir != outputs
+    for name, given in {
+        "hydra.sweep.dir": chosen.sweep.dir if whole else None,
+        "hydra.run.dir": None if chosen.run.dir == "." else chosen.run.dir,
+    }.items():
+        if given is not None:
+            raise SettingError(
+                name, f"is not where a sweep's runs go, got {given!r}: give outputs={given}."
+            )
+
+
+@contextmanager
+def composing() -> Iterator[None]:
+    """Ends with a line where Hydra cannot compose what it was given.
+
+    Hydra would print several, or a traceback, and exit; as it does where ``HYDRA_FULL_ERROR`` is
+    set by the user.
+
+    Raises:
+        SystemExit: with that line.
+    """
+    shown = "HYDRA_FULL_ERROR" in os.environ
+    os.environ.setdefault("HYDRA_FULL_ERROR", "1")
+    try:
+        yield
+    except (HydraException, OmegaConfBaseException, ValueError) as error:
+        if shown:
+            raise
+        sys.exit(f"error: {refusal(error)}")
+    except OSError as error:  # Of a folder that Hydra makes, before anything runs in it.
+        if shown or error.filename is None:
+            raise
+        sys.exit(f"error: {error.filename!r} cannot be made ({error.strerror}); choose another.")
+    finally:
+        if not shown:
+            os.environ.pop("HYDRA_FULL_ERROR", None)
+
+
+def refusal(error: Exception) -> str:
+    """What Hydra, or OmegaConf, refuses, in a line; of a name that there is not what was meant."""
+    if found := re.match("Could not override '([^']+)'", str(error)):
+        return unknown_setting(found[1])
+    if "group override must be" in str(error) or "${regularizer}_${algorithm}" in str(error):
+        return f"{', '.join(GROUPS)} are each chosen by name; regularizer=none has none ({error})."
+    said = " ".join(str(error).partition("\nConfig search path:")[0].split())
+    if found := re.search(r"Could not find '(\w+)/([^']+)'", said):
+        return f"{said}{_choice_meant(*found.groups())}"
+    if "=~" in said:
+        return f"{said}. No shell expands this ~: write $HOME."
+    if isinstance(error, OverrideParseException):
+        return f"{said}. A value with other signs stands in quotes within quotes: 'name=\"a b\"'."
+    return said
+
+
+def _choice_meant(group: str, name: str) -> str:
+    near = get_close_matches(name, GROUPS.get(group, ()), 1)
+    meant = f"; did you mean {group}={near[0]}?" if near else "."
+    ids = f" An id of Gymnasium's: task=gymnasium task.env_id={name}." if group == "task" else ""
+    return meant + ids
+
+
+def unknown_setting(name: str) -> str:
+    """Whose setting a name is, or the one that is most like it.
+
+    Examples:
+        >>> unknown_setting("task.epsodes")
+        'task.epsodes is not a setting; did you mean task.episodes? --help lists every setting.'
+        >>> unknown_setting("algorithm.num_envs")
+        'algorithm.num_envs is only a setting of algorithm=ppo.'
+        >>> unknown_setting("sigma")
+        'sigma is not a setting; did you mean regularizer.sigma? --help lists every setting.'
+        >>> unknown_setting("methods")
+        'methods is not a setting; did you mean regularizer? --help lists every setting.'
+    """
+    group, _, setting = name.partition(".")
+    settings = {
+        (each, choice): {field.name for field in dataclasses.fields(of)}
+        for each, choices in GROUPS.items()
+        for choice, of in choices.items()
+    }
+    if having := [of[1] for of, names in settings.items() if of[0] == group and setting in names]:
+        chosen = f"{group}={' or '.join(having)}"
+        return f"{name} is only a setting of {chosen}.{_two_commands(group, having)}"
+    known = {*STEERING, *(field.name for field in dataclasses.fields(ExperimentConfig))}
+    known |= {f"{of[0]}.{each}" for of, names in settings.items() for each in names}
+    near = sorted(each for each in known if each.endswith(f".{name}"))
+    near = near or ALSO_CALLED.get(name) or get_close_matches(name, sorted(known), 1)
+    meant = f"; did you mean {near[0]}?" if near else "."
+    return f"{name} is not a setting{meant} --help lists every setting."
+
+
+def _two_commands(group: str, having: Sequence[str]) -> str:
+    """What to do in a sweep over choices of which only some have a setting."""
+    prefix = f"{group}="
+    swept = next((each for each in sys.argv if each.startswith(prefix) and "," in each), "")
+    choices = swept.removeprefix(prefix).split(",") if swept else []
+    lacking = [choice for choice in choices if choice not in having]
+    if not lacking or len(lacking) == len(choices):
+        return ""
+    others = ",".join(choice for choice in choices if choice in having)
+    return (
+        f" Run two commands: with {prefix}{','.join(lacking)} and without the setting, then with "
+        f"{prefix}{others} and with it."
+    )
+
+
+def folder_named(setting: str, given: Any) -> str | None:
+    """A folder, which may be named by a number; of ``resume`` there need be none.
+
+    Raises:
+        SettingError: another value.
+    """
+    if setting == "resume" and given is None:
+        return None
+    named = str(given) if type(given) in (int, float) else given
+    if not isinstance(named, str) or not named:
+        raise SettingError(setting, f"must be a folder, got {given!r}.")
+    return named
+
+
+def preset_used(config: ExperimentConfig) -> str | None:
+    """The preset that the regularizer's settings begin with, or that there is none; in a line."""
+    regularizer, algorithm = config.regularizer, config.algorithm.name
+    if regularizer.name not in BEGIN_WITH_PRESET:
+        return None
+    method, _ = BEGIN_WITH_PRESET[regularizer.name]
+    if algorithm not in KINDS:
+        return (
+            f"regularizer={regularizer.name}: there is no preset for {algorithm}; the settings are "
+            "the paper's, or given"
+        )
+    begins = preset_settings(regularizer.name, algorithm)
+    chosen = ", ".join(f"{name}={getattr(regularizer, name)}" for name in begins)
+    where = preset(method, algorithm)
+    origin = f"{where.evidence}, on {where.tasks}" if where.evidence else "its authors' settings"
+    return f"regularizer={regularizer.name}: {chosen} (the preset for {algorithm}: {origin})"
+
+
+def tell_sweep() -> None:
+    """Says where the configuration is that of a comparison, and this is but one run of it."""
+    chosen = HydraConfig.get()
+    if chosen.sweeper.params:
+        sweeps = " ".join(f"{name}={value}" for name, value in chosen.sweeper.params.items())
+        print(f"one run of the comparison {sweeps}: add -m for all of it", flush=True)

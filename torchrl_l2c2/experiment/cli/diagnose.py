@@ -1,0 +1,71 @@
+"""``diagnose``: writes a page that shows why policies shake."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from torchrl_l2c2.experiment.errors import told_in_a_line
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measures runs, writes the page, and prints the findings."""
+    parser = _parser()
+    chosen = parser.parse_args(arguments)
+    if chosen.episodes < 1:
+        parser.error(f"--episodes must be at least 1, got {chosen.episodes}")
+    if len(set(chosen.names or ())) < len(chosen.names or ()):
+        parser.error(f"--names: each run needs one of its own, got {chosen.names}")
+    if chosen.actions and not chosen.actions.endswith(".svg"):
+        parser.error(f"--actions must be an SVG file, named FILE.svg, got {chosen.actions}")
+    with told_in_a_line():
+        from torchrl_l2c2.experiment.analysis import diagnosis
+        from torchrl_l2c2.experiment.envs.environments import TEST_SEED
+        from torchrl_l2c2.experiment.run.files import make_folder_of, write_atomically
+
+        folders = diagnosis.run_folders(chosen.folders)
+        if chosen.names and len(chosen.names) != len(folders):
+            parser.error(f"--names: one for each of the {len(folders)} runs, got {chosen.names}")
+        # Before anything is played that could be lost.
+        for given in filter(None, (chosen.output, chosen.actions)):
+            make_folder_of(given)
+        diagnoses = [
+            diagnosis.diagnose_run(
+                folder,
+                name=name,
+                episodes=chosen.episodes,
+                seed=TEST_SEED if chosen.seed is None else chosen.seed,
+                noise_scale=chosen.noise,
+                best=chosen.best,
+                with_pictures=not chosen.no_video,
+            )
+            for folder, name in zip(
+                folders, chosen.names or diagnosis.run_names(folders), strict=True
+            )
+        ]
+        path = Path(chosen.output or Path(chosen.folders[0]) / "diagnosis.html")
+        diagnosis.write_page(path, diagnoses)
+        if chosen.actions:
+            write_atomically(chosen.actions, diagnosis.draw_together(diagnoses))
+    compared = "\n".join(diagnosis.comparison(diagnoses))
+    parts = [*map(diagnosis.summary, diagnoses), compared, f"page: {path}"]
+    print("\n\n".join(filter(None, parts)))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m torchrl_l2c2 diagnose",
+        description="Writes one page that shows why the policies of runs shake.",
+    )
+    add = parser.add_argument
+    add("folders", nargs="+", metavar="FOLDER", help="run folders, or folders that hold runs")
+    add("--names", nargs="+", help="names of the runs (default: what tells them apart)")
+    add("--output", help="the page (default: diagnosis.html in the first folder)")
+    add("--actions", help="an SVG file for the actions of all runs, row by row (default: none)")
+    add("--episodes", type=int, default=3, help="episodes that measures are averaged over (3)")
+    add("--seed", type=int, help="random seed, the same for all runs (default: 1000003)")
+    add("--noise", type=float, help="standard deviation of the noise (default: the task's)")
+    add("--best", action="store_true", help="policy_best.pt instead of policy.pt")
+    add("--no-video", action="store_true", help="no film of the task, which is faster")
+    return parser

@@ -1,0 +1,109 @@
+"""``evaluate``: plays test episodes with a run's policy."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from torchrl_l2c2.experiment.errors import told_in_a_line
+
+if TYPE_CHECKING:
+    from torchrl_l2c2.experiment.run.evaluation import Evaluation
+
+COLUMNS = ("return_mean", "return_std", "action_variation_mean", "action_variation_std")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Plays test episodes and prints their summary: JSON, or a table of several noise levels."""
+    parser = _parser()
+    chosen = parser.parse_args(arguments)
+    if chosen.record and chosen.sampled:
+        parser.error("--record shows mean actions; leave it or --sampled out")
+    levels = chosen.noise or [None]
+    with told_in_a_line():
+        from torchrl_l2c2.experiment.analysis.video import check_video, record_video
+        from torchrl_l2c2.experiment.run.files import make_folder_of, to_json, write_json
+
+        # Before anything is played that could be lost.
+        if chosen.record:
+            check_video(chosen.record)
+        if chosen.output:
+            make_folder_of(chosen.output)
+        played = {level: _play(chosen, level) for level in levels}
+        if len(played) == 1:
+            print(to_json(played[levels[0]].summary()), flush=True)
+        else:
+            print(_table(played), flush=True)
+        if chosen.record:
+            record_video(
+                chosen.folder,
+                chosen.record,
+                seed=chosen.seed,
+                noise_scale=levels[0],
+                best=chosen.best,
+            )
+        if chosen.output:
+            tests = [{"noise": level, **test.to_dict()} for level, test in played.items()]
+            written = tests[0] if len(tests) == 1 else {"tests": tests}
+            write_json(Path(chosen.output), {"arguments": vars(chosen), **written})
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m torchrl_l2c2 evaluate",
+        description="Plays test episodes with a run's policy.",
+    )
+    add = parser.add_argument
+    add("folder", help="a run's folder, finished or not")
+    add("--episodes", type=int, default=100, help="number of episodes (default: 100)")
+    add("--seed", type=int, help="random seed (default: the seed of the run's test)")
+    add(
+        "--noise",
+        type=float,
+        nargs="+",
+        metavar="LEVEL",
+        help="standard deviations of the noise on observations, such as 0 0.05 0.1; several make a "
+        "table (default: the task's)",
+    )
+    add("--sampled", action="store_true", help="act with samples, as in training")
+    add("--best", action="store_true", help="policy_best.pt instead of policy.pt")
+    add("--output", help="a JSON file for the summary and every episode")
+    add("--record", metavar="VIDEO", help="a file such as test.mp4: a video of the first episode")
+    return parser
+
+
+def _play(chosen: argparse.Namespace, noise: float | None) -> Evaluation:
+    from torchrl_l2c2.experiment.run.evaluation import evaluate_policy
+    from torchrl_l2c2.experiment.run.policies import load_policy, seed_of_test
+    from torchrl_l2c2.experiment.run.process import ProcessState
+
+    with ProcessState(seed_of_test(chosen.folder, chosen.seed)):
+        # Within, as some tasks draw from the global generators where they are made.
+        policy, env, max_steps = load_policy(
+            chosen.folder, seed=chosen.seed, noise_scale=noise, best=chosen.best
+        )
+        result = evaluate_policy(
+            policy,
+            env,
+            chosen.episodes,
+            max_steps=max_steps,
+            sampled=chosen.sampled,
+            progress=True,
+        )
+    env.close()
+    return result
+
+
+def _table(played: dict[float | None, Evaluation]) -> str:
+    """The summary of every noise level, a line each."""
+    lines = [f"{'noise':>8}  {'return':>20}  {'action variation':>20}"]
+    for level, test in played.items():
+        summary = test.summary()
+        total, total_std, variation, variation_std = (float(summary[name]) for name in COLUMNS)
+        lines.append(
+            f"{level:>8g}  {total:>10.1f} ({total_std:>7.1f})  {variation:>10.3f} "
+            f"({variation_std:>7.3f})"
+        )
+    return "\n".join(lines)

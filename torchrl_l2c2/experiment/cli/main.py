@@ -1,0 +1,56 @@
+"""The command ``python -m torchrl_l2c2``, with its subcommands."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+
+from torchrl_l2c2._version import __version__
+
+# Name: module, what it does. Each module has a ``main(arguments)``.
+COMMANDS = {
+    "train": ("train", "trains a run; task=hopper seed=1, for example"),
+    "evaluate": ("evaluate", "plays test episodes, also with noise on the observations"),
+    "diagnose": ("diagnose", "writes a page that shows why policies shake"),
+    "report": ("report", "tables and learning curves of runs"),
+    "export": ("export", "writes a policy as ONNX and as a torch.export program"),
+    "video": ("video", "records test episodes"),
+    "settings": ("manual", "prints every setting as Markdown"),
+}
+HELP = (
+    f"torchrl_l2c2 {__version__}: policies that do not shake, for TorchRL\n\n"
+    "usage: python -m torchrl_l2c2 COMMAND ...\n\n"
+    + "\n".join(f"  {name:10}{text}" for name, (_, text) in COMMANDS.items())
+    + "\n\nCOMMAND --help lists the options of a command. In Python: help(torchrl_l2c2.smooth).\n"
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Runs a subcommand.
+
+    Args:
+        arguments (sequence of str, optional): the subcommand and its options. Default: the command
+            line's.
+
+    Raises:
+        SystemExit: with one line if the subcommand is unknown or a package is missing.
+    """
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if not given or given[0] in ("-h", "--help"):
+        print(HELP, end="")
+        return
+    name, rest = given[0], given[1:]
+    if name not in COMMANDS:
+        hint = f" Write: train {' '.join(given)}" if "=" in name else ""
+        sys.exit(f"error: Expected one of {', '.join(COMMANDS)}, got {name!r}.{hint}")
+    try:
+        command = import_module(f"torchrl_l2c2.experiment.cli.{COMMANDS[name][0]}")
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("torchrl_l2c2"):
+            raise
+        sys.exit(
+            f"error: {name} needs the package {error.name}. In a clone of the repository, run: "
+            'pip install -e ".[experiment]"'
+        )
+    command.main(rest)

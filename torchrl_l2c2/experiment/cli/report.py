@@ -1,0 +1,99 @@
+"""``report``: tables and learning curves of runs."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from torchrl_l2c2.experiment.errors import UserError, told_in_a_line
+
+if TYPE_CHECKING:
+    from torchrl_l2c2.experiment.run.finished import FinishedRun, Record
+
+DESCRIPTION = """\
+Reads every finished run below folders, prints a table of them, and writes a report: tables,
+statistics and pictures, as one page, as Markdown, SVG and JSON.
+"""
+EXAMPLES = """\
+examples:
+  python -m torchrl_l2c2 report outputs
+  python -m torchrl_l2c2 report outputs --csv runs.csv
+  python -m torchrl_l2c2 report --from runs.csv --output report
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Does what the command line says; an error is one line."""
+    parser = _parser()
+    chosen = parser.parse_args(arguments)
+    if bool(chosen.folders) == bool(chosen.records):
+        parser.error("name folders of runs, or files of records with --from")
+    if chosen.records and chosen.csv:
+        parser.error("--csv writes records of folders; --from has them already")
+    with told_in_a_line():
+        _report(chosen)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m torchrl_l2c2 report",
+        description=DESCRIPTION,
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("folders", nargs="*", metavar="FOLDER", help="of runs, at any depth, e.g. outputs/swingup")
+    add(
+        "--from",
+        dest="records",
+        nargs="+",
+        metavar="CSV",
+        help="records of runs instead of their folders",
+    )
+    add(
+        "--output",
+        metavar="FOLDER",
+        help="of the report (default: report/ in the first folder; with --from or --csv there is a "
+        "report only if this is given)",
+    )
+    add("--csv", metavar="CSV", help="file that gets a line for every run, or its newer line")
+    return parser
+
+
+def _report(chosen: argparse.Namespace) -> None:
+    from torchrl_l2c2.experiment.analysis.reports.records import merge, read_records, write_records
+    from torchrl_l2c2.experiment.analysis.reports.report import write_report
+    from torchrl_l2c2.experiment.analysis.reports.results import printed_table
+
+    records, runs, notes = _read(chosen)
+    written = []
+    if chosen.csv:
+        write_records(chosen.csv, merge(read_records(chosen.csv), records))
+        written.append(f"records: {chosen.csv}")
+    if chosen.output or not (chosen.records or chosen.csv):
+        folder = Path(chosen.output or Path(chosen.folders[0]) / "report")
+        written.append(f"report: {write_report(folder, records, runs, notes)}")
+    # Last: who reads but the first lines of it has the files all the same.
+    print("\n\n".join([printed_table(records), *notes, *written]))
+
+
+def _read(
+    chosen: argparse.Namespace,
+) -> tuple[Sequence[Record], Sequence[FinishedRun], Sequence[str]]:
+    from torchrl_l2c2.experiment.analysis.reports.records import merge, read_records
+    from torchrl_l2c2.experiment.analysis.reports.runs import find_runs
+
+    if chosen.folders:
+        found = find_runs(chosen.folders, required=True)
+        return [run.record for run in found.runs], found.runs, found.notes
+    for file in chosen.records:
+        if not Path(file).exists():
+            raise FileNotFoundError(f"there is no file {file!r}; make it with --csv.")
+    records = merge([], chain.from_iterable(map(read_records, chosen.records)))
+    if not records:
+        named = ", ".join(map(repr, chosen.records))
+        raise UserError(f"no record of a run in {named}; make them with --csv.")
+    return records, [], []

@@ -1,0 +1,349 @@
+"""What the jobs of a sweep and the process that began it tell each other, on whatever machines.
+
+A folder beside the runs' holds it: whether the sweep is to stop, and which jobs run, have finished
+and failed. A file for each, as several machines cannot add to one.
+"""
+
+from __future__ import annotations
+
+import _thread
+import atexit
+import contextlib
+import hashlib
+import itertools
+import json
+import math
+import os
+import shutil
+import signal
+import socket
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig
+
+from torchrl_l2c2.experiment.errors import UserError, told_in_a_line
+from torchrl_l2c2.experiment.run.files import make_folder
+from torchrl_l2c2.experiment.run.signals import FINISHING, SAME_SIGNAL_SECONDS, terminate
+from torchrl_l2c2.experiment.settings.fields import SettingError
+
+VARIABLE = "TORCHRL_L2C2_SWEEP"  # of the environment, which a launcher's processes inherit
+POLL_SECONDS = 0.2
+REMOTE_POLL_SECONDS = 2.0  # of a file system that hundreds of machines may share
+LOST = "lost with its process or machine, or still running"
+GUARD = Path(__file__).with_name("guard.py")
+
+
+class Sweep:
+    """A sweep, as the process that began it and its jobs see it.
+
+    Attributes:
+        begun_by: the process that began it, with its machine.
+        overrides: of its command.
+        begun_here: the one that this process began; ``None`` where it began none.
+        job_is_here: whether a job runs in this process.
+    """
+
+    begun_here: Sweep | None = None
+    job_is_here = False
+    _following = False
+
+    def __init__(self, folder: Path, begun_by: tuple[str, int], overrides: Sequence[str]) -> None:
+        self._folder, self.begun_by, self.overrides = folder, begun_by, overrides
+
+    @classmethod
+    def of_this_job(cls) -> Sweep:
+        """The sweep that this job belongs to.
+
+        Raises:
+            UserError: the launcher told the job nothing of it, or its folder is nowhere here.
+        """
+        if VARIABLE not in os.environ:
+            raise UserError(f"the launcher passes no {VARIABLE} on to the jobs' environment.")
+        folder, (host, process), overrides, _ = json.loads(os.environ[VARIABLE])
+        if not Path(folder).parent.is_dir():
+            raise UserError(
+                f"{str(Path(folder).parent)!r} is not on {socket.gethostname()}: choose an outputs "
+                "folder on a file system that all machines share."
+            )
+        return cls(Path(folder), (host, process), overrides)
+
+    @property
+    def is_remote(self) -> bool:
+        """Whether another program started this process, as a cluster does, and may do so again."""
+        host, process = self.begun_by
+        return host != socket.gethostname() or process not in (os.getpid(), os.getppid())
+
+    @property
+    def stopped_by(self) -> int | None:
+        """The signal that stopped it; ``None`` where it goes on."""
+        try:
+            return int((self._folder / "stopped").read_text())
+        except OSError:
+            # A job that was still to come, of a sweep that has ended.
+            return None if self._folder.is_dir() else signal.SIGTERM
+
+    def stop(self, signal_number: int) -> None:
+        """No job is to begin any more; those that train are to save and end."""
+        if self.stopped_by is None:
+            self._put("stopped", str(signal_number))
+
+    def share(self, outputs: Path) -> None:
+        """Has what jobs tell below a folder that all their machines see; before any begins.
+
+        Raises:
+            OSError: it cannot be written to.
+        """
+        stopped, self._folder = self.stopped_by, make_folder(outputs) / f".{self._folder.name}"
+        self._folder.mkdir()
+        self.publish()
+        if stopped is not None:
+            self.stop(stopped)
+
+    def publish(self) -> None:
+        """Tells processes that are born from now on of it."""
+        told = [str(self._folder), self.begun_by, [*self.overrides], os.getcwd()]
+        os.environ[VARIABLE] = json.dumps(told)
+
+    def end(self) -> None:
+        """Nothing is told any more, and what still runs somewhere is to save and end."""
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def add_failure(self, number: int, job: str, reason: str) -> None:
+        """Keeps why a job failed until the sweep's end."""
+        self._put(f"failed_{number:06d}", json.dumps([job, reason]))
+        self._ended(number)
+
+    @property
+    def failures(self) -> list[tuple[str, str]]:
+        """Jobs that failed or did not end, with the reason in one line."""
+        failed = {number: (job, reason) for number, (job, reason) in self._all("failed")}
+        if self.stopped_by is None:
+            lost = f"{LOST}; the same command continues it"
+            failed |= {number: (job, lost) for number, job in self._all("running")}
+        return [failed[number] for number in sorted(failed)]
+
+    def claim(self, number: int, folder: Path) -> None:
+        """Keeps a run's folder for one job of the sweep.
+
+        Raises:
+            SettingError: another job has it, whose results it would take the place of.
+        """
+        claim = self._folder / f"claim_{hashlib.sha256(str(folder).encode()).hexdigest()[:16]}"
+        try:
+            # Of two that begin at once, one makes it.
+            with open(claim, "x") as file:
+                file.write(str(number))
+        except FileExistsError:
+            if (other := claim.read_text()) != str(number):
+                raise SettingError(
+                    "outputs",
+                    f"must be another for job {number} than for job {other} of the sweep, which "
+                    f"both have {folder}: they have the same settings, or differ in such as name "
+                    "no folder (how long is trained and tested, threads, ...). Leave one out, "
+                    "sweep over outputs, too, or give two commands.",
+                ) from None
+        except FileNotFoundError:  # The sweep has ended.
+            return
+
+    def add_finished(self, number: int, folder: Path, seconds: float) -> None:
+        """Keeps where a finished run lies, and how long it took, until the sweep's end."""
+        self._put(f"finished_{number:06d}", json.dumps([str(folder), seconds]))
+
+    @property
+    def finished(self) -> list[Path]:
+        """Folders of the runs that are finished, by this sweep or before."""
+        return [Path(folder) for _, (folder, _) in self._all("finished")]
+
+    def standing(self, number: int, params: Mapping[str, str]) -> str:
+        """Where a sweep stands when a job begins, such as ``"run 3 of 72, about 4.1 h left"``.
+
+        Args:
+            number (int): of the job, from 1.
+            params (Mapping): sweeps of the configuration, by setting.
+        """
+        try:
+            tasks = [job.get("task") for job in list_jobs(self.overrides, params)]
+        except HydraException:  # A glob, which stands for as many as Hydra finds.
+            return f"run {number}"
+        seconds: dict[str | None, list[float]] = defaultdict(list)
+        for finished, (_, each) in self._all("finished"):
+            if math.isfinite(each):
+                seconds[tasks[finished]].append(each)
+        place = f"run {number} of {len(tasks)}"
+        if not seconds:
+            return place
+        # A task takes many times as long as another; one that is still to come, their mean.
+        of_task = {task: statistics.fmean(each) for task, each in seconds.items()}
+        usual = statistics.fmean(of_task.values())
+        left = sum(of_task.get(task, usual) for task in tasks[number - 1 :])
+        return f"{place}, {_about(left / max(1, len(self._all('running'))))} left"
+
+    @contextlib.contextmanager
+    def job(self, number: int, job: str) -> Iterator[bool]:
+        """A job of the sweep runs within it: a stop ends it in order, wherever it is.
+
+        Args:
+            number (int): of the job; the same one where it is begun again.
+            job (str): what it is called.
+
+        Yields:
+            bool: whether it was begun before, and lost.
+        """
+        begun_before = (self._folder / f"running_{number:06d}").exists()
+        self._put(f"running_{number:06d}", json.dumps(job))
+        if self.begun_by != (socket.gethostname(), os.getpid()):
+            self._follow()
+        Sweep.job_is_here = True
+        try:
+            yield begun_before
+            self._ended(number)
+        finally:
+            Sweep.job_is_here = False
+
+    def _ended(self, number: int) -> None:
+        (self._folder / f"running_{number:06d}").unlink(missing_ok=True)
+
+    def _put(self, name: str, content: str) -> None:
+        """Writes a file that is there whole or not at all, unless the sweep has ended."""
+        partial = self._folder / f".{name}.{socket.gethostname()}.{os.getpid()}"
+        with contextlib.suppress(FileNotFoundError):
+            partial.write_text(content)
+            partial.replace(self._folder / name)
+
+    def _all(self, kind: str) -> list[tuple[int, Any]]:
+        """What the jobs told, by their numbers."""
+        told = []
+        for path in sorted(self._folder.glob(f"{kind}_*")):
+            with contextlib.suppress(FileNotFoundError):  # A job that has just ended.
+                told.append((int(path.name.rpartition("_")[2]), json.loads(path.read_text())))
+        return told
+
+    def _follow(self) -> None:
+        """A stop reaches this process as SIGTERM, and it dies with the one that began the sweep.
+
+        Unless it is remote: whether it lives on is then for the program that started it.
+        """
+        signal.signal(signal.SIGTERM, terminate)
+        if Sweep._following:
+            return
+        Sweep._following = True
+        remote = self.is_remote
+
+        def follow() -> None:
+            told = False
+            while True:
+                time.sleep(REMOTE_POLL_SECONDS if remote else POLL_SECONDS)
+                if not remote and os.getppid() != self.begun_by[1]:
+                    os._exit(1)
+                if not told and Sweep.job_is_here and self.stopped_by is not None:
+                    told = True
+                    _thread.interrupt_main(signal.SIGTERM)
+
+        threading.Thread(target=follow, daemon=True).start()
+
+
+class ShareSweep(Callback):
+    """Puts what a sweep's jobs tell beside its runs, where every machine that runs one sees it."""
+
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        """Called by Hydra, once the folder is known and before its launcher starts.
+
+        Raises:
+            SystemExit: the folder cannot be written to; Hydra swallows other errors.
+        """
+        if Sweep.begun_here is not None:
+            with told_in_a_line():
+                Sweep.begun_here.share(Path(config.hydra.sweep.dir).absolute())
+
+
+def enter_folder() -> None:
+    """Goes where the sweep was begun, for launchers whose processes begin elsewhere."""
+    os.chdir(json.loads(os.environ[VARIABLE])[-1])
+
+
+def start_guard(mark: str) -> None:
+    """Starts what ends the processes with this mark in their environment when this one is gone."""
+    if not Path("/proc/self/environ").exists():
+        return
+    command = [sys.executable, "-I", "-S", str(GUARD), mark]
+    guard = subprocess.Popen(command, stdin=subprocess.PIPE)
+    assert guard.stdin is not None
+    # Before the launcher registers anything, hence after it at the end.
+    atexit.register(guard.stdin.close)
+
+
+def list_jobs(overrides: Sequence[str], params: Mapping[str, str]) -> list[dict[str, str]]:
+    """What a sweep chooses for each of its jobs: a product, where the command's go before.
+
+    Raises:
+        HydraException: a sweep that says by itself not of what: a glob, an interval.
+
+    Examples:
+        >>> jobs = list_jobs(["-m", "seed=0,1", "task=ant"], {"seed": "range(0,18)", "beta": "1,2"})
+        >>> [" ".join(f"{name}={value}" for name, value in job.items()) for job in jobs]
+        ['seed=0 beta=1', 'seed=0 beta=2', 'seed=1 beta=1', 'seed=1 beta=2']
+    """
+    given = {**params}
+    for override in overrides:
+        name, _, value = override.partition("=")
+        if not override.startswith("-"):
+            given[name] = value
+    parser = OverridesParser.create()
+    parsed = parser.parse_overrides([f"{name}={value}" for name, value in given.items()])
+    sweeps = [each for each in parsed if each.is_sweep_override()]
+    names = [each.get_key_element() for each in sweeps]
+    choices = itertools.product(*(each.sweep_string_iterator() for each in sweeps))
+    return [dict(zip(names, chosen, strict=True)) for chosen in choices]
+
+
+def _about(seconds: float) -> str:
+    hours = seconds / 3600
+    return f"about {hours:.1f} h" if hours >= 1 else f"about {max(1, round(60 * hours))} min"
+
+
+@contextlib.contextmanager
+def begin_sweep(overrides: Sequence[str] = ()) -> Iterator[Sweep]:
+    """Begins a sweep in this process: the first Ctrl-C or SIGTERM stops it in order.
+
+    Args:
+        overrides (sequence of str): of its command.
+    """
+    # Till it is known where the runs' folders are.
+    with tempfile.TemporaryDirectory(prefix="torchrl_l2c2_") as folder:
+        begun_by = (socket.gethostname(), os.getpid())
+        sweep, first = Sweep(Path(folder), begun_by, overrides), 0.0
+
+        def receive(number: int, frame: Any) -> None:
+            nonlocal first
+            if sweep.stopped_by is None:
+                first = time.monotonic()
+                sweep.stop(number)
+                if Sweep.job_is_here:  # and not training, where it has a handler of its own
+                    terminate(number, frame)
+                print(f"\n{FINISHING}; once more: at once", file=sys.stderr, flush=True)
+            elif time.monotonic() - first > SAME_SIGNAL_SECONDS:
+                terminate(number, frame)
+
+        start_guard(Path(folder).name)
+        sweep.publish()
+        Sweep.begun_here = sweep
+        previous = {n: signal.signal(n, receive) for n in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield sweep
+        finally:
+            sweep.end()
+            for number, handler in previous.items():
+                signal.signal(number, handler)
+            Sweep.begun_here = None

@@ -1,0 +1,359 @@
+"""``train``: settings from a shell, by Hydra, to a run and its result.
+
+``python train.py`` in a clone, ``python -m torchrl_l2c2 train`` anywhere.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+import traceback
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+
+from torchrl_l2c2.experiment.cli.composition import (
+    CONF,
+    composing,
+    preset_used,
+    read,
+    register,
+    tell_sweep,
+)
+from torchrl_l2c2.experiment.cli.manual import manual
+from torchrl_l2c2.experiment.cli.sweep import Sweep, begin_sweep, list_jobs
+from torchrl_l2c2.experiment.errors import (
+    UserError,
+    is_lack_of_memory,
+    is_told_in_a_line,
+    show_cause,
+    warnings_told,
+)
+from torchrl_l2c2.experiment.run.files import make_folder
+from torchrl_l2c2.experiment.run.metrics_log import check_installed
+from torchrl_l2c2.experiment.run.progress import log, say
+from torchrl_l2c2.experiment.run.signals import (
+    Interrupted,
+    Terminated,
+    keep_ctrl_c_from_children,
+    terminate,
+)
+from torchrl_l2c2.experiment.settings.config import ExperimentConfig
+from torchrl_l2c2.experiment.settings.fields import SettingError
+
+if TYPE_CHECKING:
+    from torchrl_l2c2.experiment.run.finished import FinishedRun
+
+# How long a file server may hold the lock of a machine that was lost.
+LOST_SECONDS = 180.0
+# Of conf/hydra/launcher/: the plugin, and the extra that brings it.
+LAUNCHERS = {
+    "ray_cluster": ("hydra_plugins.hydra_ray_launcher", "ray"),
+    "slurm_cluster": ("hydra_plugins.hydra_submitit_launcher", "slurm"),
+}
+
+OF_MEMORY = "algorithm.hidden, replay.capacity, replay.batch_size or threads"
+
+
+def check_launcher(arguments: Sequence[str]) -> None:
+    """Says which extra a launcher needs, where Hydra would say that it cannot be loaded."""
+    for name, (plugin, extra) in LAUNCHERS.items():
+        if f"hydra/launcher={name}" in arguments and find_spec(plugin) is None:
+            needed = f"pip install 'torchrl-l2c2[{extra}]'"
+            sys.exit(f"error: hydra/launcher={name} needs the extra {extra}: {needed}.")
+
+
+def check_sweep(arguments: Sequence[str]) -> None:
+    """Ends where a sweep has no job, several comparisons or an interval."""
+    try:
+        for comparison in OverridesParser.create().parse_overrides(
+            [each for each in arguments if each.lstrip("+").startswith("experiment=")]
+        ):
+            if comparison.is_sweep_override() or isinstance(comparison.value(), list):
+                sys.exit(
+                    f"error: {comparison.input_line}: each comparison has its own seeds and "
+                    "launcher, which a sweep over comparisons would leave out. Run a command for "
+                    "each of them."
+                )
+        empty = not list_jobs(arguments, {})
+    except HydraException as error:  # Of which Hydra itself says more, or finds what a glob is.
+        if "INTERVAL" in str(error):
+            sys.exit("error: an interval is nothing to sweep over: examples/search.py searches.")
+        return
+    if empty:
+        sys.exit(f"error: a sweep of no job: one of {' '.join(arguments)} has no value.")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Trains a run or a sweep.
+
+    Args:
+        arguments (sequence of str, optional): overrides and options of Hydra, which replace the
+            process's command line. Default: the command line.
+    """
+    if arguments is not None:
+        sys.argv[1:] = arguments  # Hydra reads it there.
+    if {"-h", "--help"} & set(sys.argv[1:]):  # Hydra's own help takes seconds to compose.
+        with _reader_may_leave():
+            print(manual(), end="", flush=True)
+        return
+    check_launcher(sys.argv)
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Nothing is reported unasked.
+    keep_ctrl_c_from_children()
+    signal.signal(signal.SIGTERM, terminate)
+    if "" not in sys.path:  # As with python -m: modules with tasks may lie here.
+        sys.path.append(os.getcwd())
+    register()
+    if not any(map(_asks_for_a_sweep, sys.argv[1:])):
+        with composing(), _reader_may_leave():
+            _main()
+            sys.stdout.flush()
+        return
+    check_sweep(sys.argv[1:])
+    with begin_sweep(sys.argv[1:]) as sweep:
+        try:
+            with composing():
+                _main()
+        except KeyboardInterrupt:
+            sweep.stop(signal.SIGINT)
+        finally:
+            tell_end(sweep)
+        stopped_by, failures = sweep.stopped_by, sweep.failures
+    sys.exit(bool(failures) if stopped_by is None else 128 + stopped_by)
+
+
+@contextmanager
+def _reader_may_leave() -> Iterator[None]:
+    """Ends in order where the output's reader has closed it, as in ``--help | head``."""
+    try:
+        yield
+    except BrokenPipeError:
+        # Python flushes once more when it ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+
+
+def _asks_for_a_sweep(argument: str) -> bool:
+    """Hydra takes the beginning of an option for the whole."""
+    begun = argument.startswith("--m") and "--multirun".startswith(argument)
+    return begun or argument in ("-m", "hydra.mode=MULTIRUN")
+
+
+def tell_end(sweep: Sweep) -> None:
+    """The last lines of a sweep: a table of its runs, what failed, and how to go on."""
+    if sweep.finished:
+        from torchrl_l2c2.experiment.analysis.reports import sweep_summary
+
+        print(sweep_summary(sweep.finished), flush=True)
+    for job, reason in sweep.failures:
+        print(f"failed: {job}: {reason}", file=sys.stderr)
+    if sweep.stopped_by is not None:
+        name = signal.Signals(sweep.stopped_by).name
+        print(f"{name} ended the sweep; the same command continues it.", file=sys.stderr)
+
+
+@hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
+def _main(values: DictConfig) -> None:
+    plain: Any = OmegaConf.to_container(values, resolve=True)
+    if HydraConfig.get().mode == RunMode.MULTIRUN:
+        _run_job(plain, Sweep.of_this_job())
+        return
+    try:
+        tell_sweep()
+        run(*read(plain), plain)
+    except Interrupted as interruption:
+        print(interruption, file=sys.stderr)
+        sys.exit(128 + interruption.signal_number)
+    except KeyboardInterrupt as interruption:  # Not while training, or a second one.
+        print("interrupted; the same command continues.", file=sys.stderr)
+        sys.exit(128 + (signal.SIGTERM if isinstance(interruption, Terminated) else signal.SIGINT))
+    except Exception as error:
+        _tell(error)
+        sys.exit(1)
+
+
+def _run_job(values: dict[str, Any], sweep: Sweep) -> None:
+    """A run that lets the sweep's other jobs go on when it fails."""
+    if sweep.stopped_by is not None:
+        return
+    number, job = HydraConfig.get().job.num, " ".join(HydraConfig.get().overrides.task)
+    try:
+        with sweep.job(number, job) as begun_before:
+            patience = LOST_SECONDS if begun_before else 0.0
+            config, folder = read(values)
+            sweep.claim(number, folder)
+            finished = run(config, folder, values, _standing(sweep), patience)
+            if finished is not None:
+                sweep.add_finished(number, finished.folder, finished.record.seconds)
+    except (Interrupted, KeyboardInterrupt) as interruption:
+        stopped_by = getattr(interruption, "signal_number", signal.SIGTERM)
+        if isinstance(interruption, Interrupted):
+            print(interruption, file=sys.stderr)
+        if sweep.is_remote and sweep.stopped_by is None:
+            # Its machine is wanted back. Ended so, the program that started it begins it again.
+            sys.exit(128 + stopped_by)
+        sweep.stop(stopped_by)
+    except Exception as error:
+        sweep.add_failure(number, job, _tell(error).splitlines()[0])
+
+
+def _standing(sweep: Sweep) -> str:
+    chosen = HydraConfig.get()
+    return sweep.standing(chosen.job.num + 1, chosen.sweeper.params or {})
+
+
+def _tell(error: Exception) -> str:
+    """Prints an error: one line, with the lines of a simulator that failed; a bug's traceback."""
+    if not is_told_in_a_line(error):
+        traceback.print_exception(error)
+        return "".join(traceback.format_exception_only(error)).strip()
+    show_cause(error)
+    told = str(error) or type(error).__name__
+    if isinstance(error, SettingError):
+        told += " --help lists every setting."
+    elif is_lack_of_memory(error):
+        told = f"{told.rstrip('.')}. There is no memory for it: choose smaller {OF_MEMORY}."
+    print(f"error: {told}", file=sys.stderr)
+    return told
+
+
+def run(
+    config: ExperimentConfig,
+    folder: Path,
+    values: dict[str, Any],
+    standing: str = "",
+    patience: float = 0.0,
+) -> FinishedRun | None:
+    """One run in its folder, its progress and its result, if it tests its policy.
+
+    Args:
+        config (ExperimentConfig): its settings.
+        folder (Path): of the run.
+        values (dict): the configuration, which says what the run goes on from.
+        standing (str): of the sweep that it belongs to; shown before its name and its progress.
+        patience (float): seconds to wait for a process that has its folder.
+    """
+    # Imported here: settings are checked, and the run is named, before torch is imported.
+    from torchrl_l2c2.experiment.envs.spaces import check_known
+    from torchrl_l2c2.experiment.run.continuation import check_elsewhere, tell_past
+    from torchrl_l2c2.experiment.run.finished import finished_run
+    from torchrl_l2c2.experiment.run.lock import wait_for_folder
+
+    check_elsewhere(values["resume"])
+    if not (folder / "evaluation.json").exists():
+        check_installed(config.logger.name)
+        check_known(config.task.env_id)
+    chosen = (config.task, config.algorithm, config.regularizer)
+    named = f"{', '.join(group.name for group in chosen)}, seed {config.seed}: {folder}"
+    print(f"{standing}: {named}" if standing else named, flush=True)
+    if (told := preset_used(config)) is not None:
+        print(told, flush=True)
+    from torchrl_l2c2.experiment.agents.build import check_device_found
+    from torchrl_l2c2.experiment.analysis.video import check_pictures, check_video, record_video
+
+    if not (folder / "evaluation.json").exists():
+        check_device_found(config.device)
+    video = folder / "video.mp4"
+    records = config.record and not video.exists()
+    if records:
+        check_video()
+        check_pictures(config.task)
+    _quieten()
+    wait_for_folder(folder, patience)
+    with _end_logged(folder):
+        finished = finished_run(folder, config.to_dict())
+        if finished is None:
+            finished = _train(config, folder, values, standing)
+        else:
+            print("finished before: its results follow; another seed= or outputs= begins anew.")
+            with warnings_told(partial(say, folder)):
+                tell_past(finished.config, config.to_dict())
+        if records:
+            record_video(folder, video)
+        if finished is not None:
+            _show(finished)
+    if video.exists():
+        print(f"video: {video}", flush=True)
+    return finished
+
+
+def _quieten() -> None:
+    """Libraries say nothing that a user of the command could act on."""
+    for chatty in ("torchrl", "matplotlib", "torch"):
+        logging.getLogger(chatty).setLevel(logging.ERROR)
+    warnings.simplefilter("ignore", FutureWarning)
+    warnings.filterwarnings("ignore", "No target network updater")
+
+
+def _train(
+    config: ExperimentConfig, folder: Path, values: dict[str, Any], standing: str
+) -> FinishedRun | None:
+    """Trains and tests a policy, or trains it alone where no test is asked for."""
+    from torchrl_l2c2.experiment.run.experiment import Experiment
+    from torchrl_l2c2.experiment.run.policies import save_policy
+    from torchrl_l2c2.experiment.run.process import keep_freed_memory
+
+    keep_freed_memory()
+    going_on = {name: values[name] for name in ("resume", "allow_other_versions")}
+    with (
+        warnings_told(partial(say, folder)),
+        closing(Experiment(config, folder, **going_on)) as experiment,
+    ):
+        if (told := preset_used(config)) is not None:
+            log(folder, told)
+        experiment.train(progress=standing or True)
+        if not config.test_episodes:
+            save_policy(experiment.agent.policy, folder / "policy.pt")
+            return None
+        tests = [experiment.test(sampled=s, progress=True) for s in (False, True)]
+        finished = experiment.finish(*tests)
+        from torchrl_l2c2.experiment.analysis.reports import (
+            result_lines,  # After it: not at start-up.
+        )
+
+        log(folder, f"finished:\n{result_lines(finished)}")
+        return finished
+
+
+def _show(finished: FinishedRun) -> None:
+    """The result, and a picture of how it was learned."""
+    from torchrl_l2c2.experiment.analysis.reports import draw_learning_curves, result_lines
+
+    print(result_lines(finished))
+    picture = finished.folder / "learning_curves.png"
+    if not picture.exists():
+        draw_learning_curves([finished], picture)
+    print(f"picture: {picture}", flush=True)
+
+
+@contextmanager
+def _end_logged(folder: Path) -> Iterator[None]:
+    """Writes the error that ends a run early into its ``train.log``.
+
+    A mistake of the user is only shown: it changes nothing in the folder, and makes none.
+    """
+    try:
+        yield
+    except UserError:
+        raise
+    except (KeyboardInterrupt, Exception) as error:
+        stopped = isinstance(error, KeyboardInterrupt | Interrupted)
+        told = [str(error) or "interrupted"] if stopped else traceback.format_exception(error)
+        with suppress(OSError):  # The error itself may be that there is no room.
+            if not stopped and not is_told_in_a_line(error):
+                make_folder(folder)
+            log(folder, "".join(told))
+        raise

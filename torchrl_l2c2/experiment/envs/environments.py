@@ -1,0 +1,199 @@
+"""The noisy tasks: Gymnasium environments with white noise on every observation."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import importlib
+import os
+import sys
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import torch
+from gymnasium.wrappers import RenderCollection
+from torchrl.envs import EnvBase, GymWrapper, TransformedEnv
+
+from torchrl_l2c2.experiment.envs.spaces import (
+    Env,
+    observing_image,
+    observing_vector,
+    taking_vector,
+    unknown_task,
+)
+from torchrl_l2c2.experiment.errors import CompilerError, SimulatorError, UserError
+from torchrl_l2c2.transforms import ObservationNoise
+
+if TYPE_CHECKING:
+    from torchrl_l2c2.experiment.settings.tasks import TaskConfig
+
+# Added to the seed of test episodes, so that they are not training episodes again.
+TEST_SEED = 1_000_003
+# Added to the seed of an environment for its noise: it is not to draw what the simulator, or the
+# policy with its samples, draws.
+NOISE_SEED = 7_919
+
+
+@contextlib.contextmanager
+def simulating(what: str) -> Iterator[None]:
+    """Makes errors of a task, or of the policy that acts in it, a :class:`SimulatorError`.
+
+    Args:
+        what (str): what failed and where: the beginning of the error's text.
+
+    Raises:
+        SimulatorError: something raised an error, or tried to end the process.
+        CompilerError: the policy could not be compiled, which is no fault of the task.
+    """
+    try:
+        yield
+    except CompilerError:
+        raise
+    except (Exception, SystemExit) as error:
+        told = " ".join(str(error).split())  # in a line, as it stands in one of a sweep's end
+        raise SimulatorError(f"{what}: {type(error).__name__}: {told}") from error
+
+
+def make_env(task: TaskConfig, seed: int, *, render: bool = False) -> EnvBase:
+    """Makes a task's environment, noisy and seeded.
+
+    Args:
+        task (TaskConfig): the Gymnasium id and the noise.
+        seed (int): of the simulator and, separately, of the noise.
+
+    Keyword Args:
+        render (bool): whether every state is drawn; the Gymnasium environment's ``render()`` gives
+            the pictures since its last call. Default ``False``.
+
+    Returns:
+        EnvBase: a ``GymWrapper`` that observes one vector, or image, of float32, transformed by
+            :class:`ObservationNoise` where there is noise.
+
+    Raises:
+        ValueError: an id that Gymnasium does not know, a task without a time limit, or one whose
+            observations or actions are not vectors of numbers, nor images where they are to be;
+            or one that draws no pictures, with ``render``.
+        SimulatorError: the environment itself raises an error when it is made or reset.
+    """
+    simulator = taking_vector(_make(task, render))
+    if task.images:
+        simulator = observing_image(simulator)
+    else:
+        simulator = observing_vector(simulator, flatten=task.flatten)
+    if render:
+        simulator = RenderCollection(simulator)
+    try:
+        with _explained(task), quiet_output():
+            env = GymWrapper(simulator)
+            env.reset()
+    except SimulatorError as error:
+        if render and isinstance(error.__cause__, NotImplementedError):  # Gymnasium's own render()
+            raise _draws_nothing(task) from error.__cause__
+        raise
+    env.set_seed(seed)
+    if not task.noise_scale:
+        return env
+    generator = torch.Generator().manual_seed(seed + NOISE_SEED)
+    return TransformedEnv(env, ObservationNoise(task.noise_scale, generator=generator))
+
+
+def time_limit(task: TaskConfig) -> int:
+    """Frames of a task's longest episode: its own setting, or what Gymnasium has registered.
+
+    Raises:
+        ValueError: neither is there, or Gymnasium does not know the task.
+    """
+    if task.max_steps is not None:
+        return task.max_steps
+    module, _, name = task.env_id.rpartition(":")
+    with _explained(task):
+        if module:
+            importlib.import_module(module)
+        registered = gymnasium.spec(name).max_episode_steps
+    if registered is None:
+        raise UserError(
+            f"task.env_id={task.env_id!r} is registered without a limit of its episodes: set "
+            "task.max_steps, for example to 1000."
+        )
+    return registered
+
+
+def untransformed(env: EnvBase) -> Any:
+    """The environment below TorchRL's transforms; itself where it has none."""
+    return getattr(env, "base_env", env)
+
+
+def control_rate(env: EnvBase) -> float | None:
+    """Actions per second of simulated time; ``None`` where the simulator does not say.
+
+    Args:
+        env (EnvBase): of :func:`make_env`, reset at least once.
+
+    Examples:
+        >>> from torchrl.envs import GymEnv
+        >>> control_rate(GymEnv("Pendulum-v1"))
+        20.0
+    """
+    simulator = untransformed(env).unwrapped
+    # MuJoCo's and the classic tasks; Bullet's; the cart pole.
+    for owner, name in (
+        (simulator, "dt"),
+        (getattr(simulator, "scene", None), "dt"),
+        (simulator, "tau"),
+    ):
+        if seconds := getattr(owner, name, None):
+            return round(1.0 / float(seconds), 6)
+    frames: float | None = simulator.metadata.get("render_fps")
+    return frames
+
+
+def _make(task: TaskConfig, render: bool) -> Env:
+    limit = time_limit(task)
+    with _explained(task), quiet_output():
+        if not render:
+            return gymnasium.make(task.env_id, max_episode_steps=limit)
+        try:
+            env = gymnasium.make(task.env_id, max_episode_steps=limit, render_mode="rgb_array")
+            draws, cause = env.render_mode in env.metadata.get("render_modes", ()), None
+        except TypeError as error:  # It knows of no render_mode at all.
+            draws, cause = False, error
+    if not draws:
+        raise _draws_nothing(task) from cause
+    return env
+
+
+def _draws_nothing(task: TaskConfig) -> UserError:
+    return UserError(f"{task.env_id} draws no pictures: it has no render_mode 'rgb_array'.")
+
+
+@contextlib.contextmanager
+def _explained(task: TaskConfig) -> Iterator[None]:
+    try:
+        with simulating(f"{task.env_id} could not begin"):
+            yield
+    except SimulatorError as error:
+        cause = error.__cause__
+        if not isinstance(cause, gymnasium.error.Error | ImportError):
+            raise
+        raise unknown_task(task.env_id, cause) from cause
+
+
+@contextlib.contextmanager
+def quiet_output() -> Iterator[None]:
+    """Keeps what a C library prints, as Bullet does at start, off the screen."""
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
+    saved = [os.dup(number) for number in (1, 2)]
+    silent = os.open(os.devnull, os.O_WRONLY)
+    try:
+        for number in (1, 2):
+            os.dup2(silent, number)
+        yield
+    finally:
+        # What the library has printed waits in C's own buffer where the output is no terminal.
+        ctypes.CDLL(None).fflush(None)
+        for number, original in zip((1, 2), saved, strict=True):
+            os.dup2(original, number)
+            os.close(original)
+        os.close(silent)

@@ -1,0 +1,1 @@
+"""Replay, one gradient step, and its compilation."""

@@ -1,0 +1,1 @@
+"""A run: the loop, tests during training, the folder, checkpoints and resuming."""

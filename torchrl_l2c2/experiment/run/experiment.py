@@ -1,0 +1,346 @@
+"""One run of the experiment: it is assembled, trained, saved, tested."""
+
+from __future__ import annotations
+
+import json
+import time
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from torchrl_l2c2.experiment.agents._torchrl_internals import load_replay_state, replay_state
+from torchrl_l2c2.experiment.agents.build import make_agent
+from torchrl_l2c2.experiment.agents.optimizers import anneal
+from torchrl_l2c2.experiment.collect.player import Episode, Player
+from torchrl_l2c2.experiment.collect.workers import make_collector
+from torchrl_l2c2.experiment.envs.environments import TEST_SEED, make_env
+from torchrl_l2c2.experiment.learn.compilation import compiler_available
+from torchrl_l2c2.experiment.learn.learner import Learner, untrained
+from torchrl_l2c2.experiment.learn.replay import make_replay
+from torchrl_l2c2.experiment.run.best_policy import BestPolicy
+from torchrl_l2c2.experiment.run.checkpoints import save_checkpoint
+from torchrl_l2c2.experiment.run.continuation import (
+    check_length,
+    check_same_settings,
+    checkpoint_named,
+    find_checkpoint,
+    find_elsewhere,
+)
+from torchrl_l2c2.experiment.run.evaluation import Evaluation, LateTests, evaluate_task
+from torchrl_l2c2.experiment.run.files import make_folder
+from torchrl_l2c2.experiment.run.finished import FinishedRun, write_evaluation
+from torchrl_l2c2.experiment.run.folder import begin_folder, bring_files, versions
+from torchrl_l2c2.experiment.run.gain_schedule import GainControl
+from torchrl_l2c2.experiment.run.lock import lock_folder
+from torchrl_l2c2.experiment.run.metrics_log import MetricsLog, check_installed
+from torchrl_l2c2.experiment.run.policies import save_policy
+from torchrl_l2c2.experiment.run.process import ProcessState
+from torchrl_l2c2.experiment.run.progress import Progress, say
+from torchrl_l2c2.experiment.run.schedules import SCHEDULES
+from torchrl_l2c2.experiment.run.signals import Interrupted, stop_on_signals
+from torchrl_l2c2.experiment.settings.config import ExperimentConfig
+from torchrl_l2c2.experiment.settings.tasks import Budget
+
+
+class Experiment:
+    """One run of the paper's experiment.
+
+    The process's random generators and its number of threads are left as they are found: a run has
+    its own while it trains and tests.
+
+    Args:
+        config (ExperimentConfig): every setting. Default: the paper's L2C2 on Swingup.
+        folder (str or Path, optional): where results are written; ``None`` writes nothing. Where
+            it holds a checkpoint of the same run, the run continues from it.
+
+    Keyword Args:
+        resume (str or Path, optional): another run's folder to continue from, in ``folder``.
+        allow_other_versions (bool): whether to continue, with a warning, what other versions of
+            PyTorch, TorchRL or a simulator began; the numbers may then differ from those of a run
+            in one go. Default ``False``.
+
+    Attributes:
+        agent: what learns.
+        player: plays episodes, and counts frames.
+        learner: remembers transitions and updates the agent, and counts updates.
+        metrics: a dictionary of metrics per episode.
+
+    Raises:
+        ValueError: a setting that cannot be, or that differs from the checkpoint's.
+        CheckpointError: there are checkpoints, but none can be read.
+        OSError: a folder that cannot be written to.
+        FolderInUseError: another process writes the folder.
+
+    Examples:
+        >>> from torchrl_l2c2.experiment import Experiment, ExperimentConfig, TaskConfig
+        >>> task = TaskConfig("pendulum", "Pendulum-v1", episodes=2, max_steps=20)
+        >>> experiment = Experiment(ExperimentConfig(task=task, compile=False))
+        >>> metrics = experiment.train()
+        >>> [row["frames"] for row in metrics]
+        [20, 40]
+        >>> len(experiment.test(episodes=3).returns)
+        3
+    """
+
+    def __init__(
+        self,
+        config: ExperimentConfig | None = None,
+        folder: str | Path | None = None,
+        *,
+        resume: str | Path | None = None,
+        allow_other_versions: bool = False,
+    ) -> None:
+        self.config = config = config or ExperimentConfig()
+        self.folder = None if folder is None else Path(folder)
+        check_installed(config.logger.name)
+        self._log, self._unlock = MetricsLog(None), lambda: None  # till the folder is there
+        self._compile = config.compile and compiler_available()
+        self._process = ProcessState(config.seed, config.threads)
+        with self._process:
+            env = make_env(config.task, config.seed)
+            self.agent = make_agent(config, env)
+            self.learner = Learner(
+                self.agent,
+                make_replay(config),
+                reward_factor=config.algorithm.reward_factor,
+                compile=self._compile,
+                skip_nonfinite=config.on_nonfinite == "skip",
+            )
+            collector = make_collector(config, env, self.agent, compile=self._compile)
+            self.player = Player(collector, self.agent, config.task.env_id)
+        self.metrics: list[dict[str, float]] = []
+        self._late_tests = LateTests(config.task, config.seed, self.agent.policy, self._compile)
+        try:
+            self._best_policy = BestPolicy(config, self.agent.policy, self.folder)
+            self._gain = GainControl(config, self.learner)
+            self._begin(resume, allow_other_versions)
+        except BaseException:
+            self.close()
+            raise
+
+    def train(
+        self, episodes: int | None = None, *, progress: bool | str = False
+    ) -> list[dict[str, float]]:
+        """Trains from where it left off, or where a checkpoint did.
+
+        SIGTERM and SIGINT end the training after the episode, or rollout, that is being played,
+        with a checkpoint; a second one ends it at once.
+
+        Args:
+            episodes (int, optional): how many there are to be in all, which ``config.json`` has
+                then. Default: the task's, or its frames.
+            progress (bool or str): whether to show a progress bar; a text goes before it.
+
+        Returns:
+            list: a dictionary of metrics per episode.
+
+        Raises:
+            FloatingPointError: NaN or infinity in what the environment or the policy gave, in a
+                loss or in a parameter; names the key and the step, and the last good checkpoint.
+            SimulatorError: the environment failed; names the frame and the last good checkpoint.
+            OSError: the disk is full, for example; names the file and the last good checkpoint.
+            OtherRunError: fewer episodes than there are, or another Experiment went on here.
+            Interrupted: a signal ended the training.
+
+        Warns:
+            UserWarning: no update was made, or every action was random: there is no trained policy;
+                or a regularizer's terms are too small to matter.
+        """
+        task = self.config.task if episodes is None else self.config.task.for_episodes(episodes)
+        full, budget = self.config.task.budget, task.budget
+        check_length(budget, full, self._spent(budget))
+        full = full.at_least(budget)  # Of which a part is trained now.
+        algorithm, saved = self.config.algorithm, time.monotonic()
+        schedule = SCHEDULES[algorithm.schedule](self.player, self.learner, algorithm)
+        bar = Progress(
+            budget.total,
+            self._spent(budget),
+            self.player.frames,
+            shown=progress,
+            compiles=self.learner.compiles and not self.learner.updates,
+            unit=budget.unit,
+            folder=self.folder,
+        )
+        ended = self._ended(budget)
+        if self.folder is not None:
+            settings = replace(self.config, task=task).to_dict()
+            self._log.check_unchanged()
+            begin_folder(self.folder, settings, begun=True, ended=ended)
+        with self._process, bar, stop_on_signals() as signals, checkpoint_named(self.folder):
+            # What goes on for longer begins at another rate than it had ended with.
+            anneal(self.config.optimizer, self.agent.optimizer, self._spent(full) / full.total)
+            while not ended:
+                episode = next(schedule)
+                if episode is None:
+                    counts = {"episode": len(self.metrics), "frames": self.player.frames}
+                    self._gain.after(counts, full)
+                else:
+                    self._record(episode, full, bar)
+                anneal(self.config.optimizer, self.agent.optimizer, self._spent(full) / full.total)
+                if episode is not None and not episode.ends_round:
+                    continue
+                ended = self._ended(budget)
+                overdue = time.monotonic() - saved > self.config.checkpoint_interval
+                if ended or signals or overdue:
+                    self.save()
+                    saved = time.monotonic()
+                if signals and not ended:
+                    raise Interrupted(signals[0], len(self.metrics), self.folder)
+        if problem := self._untrained():
+            warnings.warn(problem, stacklevel=2)
+        return self.metrics
+
+    def save(self) -> Path | None:
+        """Writes a checkpoint of everything that the rest of the run depends on."""
+        if self.folder is None:
+            return None
+        self.learner.check_parameters()
+        keep = self.config.checkpoint_keep
+        return save_checkpoint(self.folder, len(self.metrics), self.state_dict(), keep)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that the rest of the run depends on, between two episodes or rollouts."""
+        return {
+            "config": json.dumps(self.config.to_dict()),
+            "versions": json.dumps(versions()),
+            **{name: part.state_dict() for name, part in self._parts().items()},
+            "replay": replay_state(self.learner.replay),
+            "collector": self.player.collector.generator_state(),
+            "global_rng": self._process.state_dict(),
+            "counters": [self.player.frames, self.learner.updates, self.learner.skipped_updates],
+            "unreported": self.learner.unreported,
+            "metrics": json.dumps(self.metrics),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`state_dict` gave.
+
+        Raises:
+            OtherRunError: the state is of a run with other settings.
+        """
+        learner = self.learner
+        check_same_settings(json.loads(state["config"]), self.config.to_dict())
+        for name, part in self._parts().items():
+            part.load_state_dict(state[name])
+        load_replay_state(learner.replay, state["replay"])
+        self.player.collector.set_generator_state(state["collector"])
+        self.player.frames, learner.updates, learner.skipped_updates = state["counters"]
+        learner.unreported = list(state["unreported"])
+        self.metrics = json.loads(state["metrics"])
+        # Some of the tensors that a compiled update was made for are others now.
+        learner.renew()
+        self._process.load_state_dict(state["global_rng"])
+
+    def test(
+        self, episodes: int | None = None, *, sampled: bool = False, progress: bool = False
+    ) -> Evaluation:
+        """Plays test episodes with the policy's mean, with environment and seed of their own.
+
+        Args:
+            episodes (int, optional): how many. Default: the settings' ``test_episodes``.
+            sampled (bool): whether the policy acts as in training instead. Default ``False``.
+            progress (bool): whether to show a progress bar.
+
+        Returns:
+            Evaluation: give it to :meth:`finish` to have it written.
+        """
+        return evaluate_task(
+            self.agent.policy,
+            self.config.task,
+            self.config.seed + TEST_SEED,
+            self.config.test_episodes if episodes is None else episodes,
+            threads=self.config.threads,
+            sampled=sampled,
+            compile_policy=self._compile,
+            progress=progress,
+        )
+
+    def finish(self, result: Evaluation, sampled: Evaluation | None = None) -> FinishedRun:
+        """Writes the policy and the test episodes, which mark the run as finished.
+
+        Args:
+            result (Evaluation): of :meth:`test`.
+            sampled (Evaluation, optional): of :meth:`test` with samples.
+
+        Returns:
+            FinishedRun: the folder, read back.
+
+        Raises:
+            ValueError: the experiment was made without a folder.
+        """
+        if self.folder is None:
+            raise ValueError("this experiment has no folder to write to; give it one when made.")
+        save_policy(self.agent.policy, self.folder / "policy.pt")
+        tests = {"mean": result, "sampled": sampled}
+        written = {name: test.to_dict() for name, test in tests.items() if test is not None}
+        training: dict[str, Any] = {"episodes": len(self.metrics), "frames": self.player.frames}
+        training |= {"updates": self.learner.updates, "untrained": self._untrained()}
+        written["mean"]["training"] = training
+        return write_evaluation(self.folder, self.config, written)
+
+    def close(self) -> None:
+        """Ends the processes of ``num_workers``; the experiment cannot train any further."""
+        self.player.collector.shutdown()
+        self._late_tests.close()
+        self._log.close()
+        self._unlock()
+
+    def _begin(self, elsewhere: str | Path | None, allow_other_versions: bool) -> None:
+        options = {"allow_other_versions": allow_other_versions}
+        found = find_elsewhere(elsewhere, self.folder, self.config, **options)
+        if self.folder is not None:
+            # Only now, as what was refused above leaves no folder.
+            self._unlock = lock_folder(make_folder(self.folder), self)
+            found = find_checkpoint(self.folder, self.config, **options) or found
+        self._log = MetricsLog(self.folder, logger=self.config.logger.name)
+        if found is not None:
+            self._go_on(*found)
+        if self.folder is not None:
+            ended = self._ended(self.config.task.budget)
+            begin_folder(self.folder, self.config.to_dict(), begun=found is not None, ended=ended)
+
+    def _go_on(self, path: Path, state: dict[str, Any]) -> None:
+        if self.folder is not None and path.parent != self.folder:
+            bring_files(path.parent, self.folder)
+        self.load_state_dict(state)
+        say(self.folder, f"continuing after episode {len(self.metrics)} from {path}")
+
+    def _parts(self) -> dict[str, Any]:
+        """What has a state of its own, by its name in checkpoints."""
+        named = ("loss", "optimizer", "target_updater", "exploration", "normalization")
+        parts = {name: getattr(self.agent, name) for name in named}
+        parts |= {"best_policy": self._best_policy, "gain": self._gain, "metrics_log": self._log}
+        return {name: part for name, part in parts.items() if part is not None}
+
+    def _untrained(self) -> str | None:
+        random_frames = self.config.algorithm.random_frames
+        return untrained(self.player.frames, self.learner.updates, random_frames)
+
+    def _spent(self, budget: Budget) -> int:
+        return budget.spent(len(self.metrics), self.player.frames)
+
+    def _ended(self, budget: Budget) -> bool:
+        # Rollouts may have used up the frames before an episode ended, which results are of.
+        least = bool(self.metrics) or budget.unit == "episode"
+        return least and self._spent(budget) >= budget.total
+
+    def _record(self, episode: Episode, full: Budget, bar: Progress) -> None:
+        report = self.learner.report(episode.last_frame)  # Before tests, which blame the task.
+        number = len(self.metrics) + 1
+        late = full.is_late(full.spent(number, episode.last_frame), self.config.late_share)
+        row = {
+            "episode": number,
+            "frames": episode.last_frame,
+            "updates": self.learner.updates,
+            "skipped_updates": self.learner.skipped_updates,
+            **episode.measures,
+            **(self._late_tests.play(number) if late else self._late_tests.none()),
+            **report,
+        }
+        row |= self._gain.after(row, full, ends_round=episode.ends_round)
+        row["frames_per_second"] = bar.frames_per_second(self.player.frames)
+        self.metrics.append(row)
+        self._log.write(row)
+        bar.show(self.metrics, self.learner.first_update_seconds)
+        self._best_policy.after(number)

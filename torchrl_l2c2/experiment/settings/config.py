@@ -1,0 +1,256 @@
+"""The settings of a run: what its groups are, how they are read, and what depends on several."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Mapping
+from functools import partial
+from typing import Any, Literal
+
+from pydantic import Field
+
+from torchrl_l2c2.experiment.settings.algorithms import ALGORITHMS, AlgorithmConfig, PPORPEConfig
+from torchrl_l2c2.experiment.settings.fields import (
+    CHANGES_NO_NUMBERS,
+    SettingError,
+    neutral,
+    read,
+    settings,
+)
+from torchrl_l2c2.experiment.settings.optimizers import OPTIMIZERS, OptimizerConfig
+from torchrl_l2c2.experiment.settings.regularizers import (
+    REGULARIZERS,
+    L2C2Config,
+    RegularizerConfig,
+    preset_settings,
+)
+from torchrl_l2c2.experiment.settings.replay import REPLAYS, ReplayConfig
+from torchrl_l2c2.experiment.settings.tasks import TASKS, TaskConfig
+
+
+@settings
+class LoggerConfig:
+    """Where metrics go: metrics.csv, a line per episode; the others get them as well."""
+
+    name: Literal["csv", "tensorboard", "wandb", "mlflow"] = Field(
+        default="csv", json_schema_extra=CHANGES_NO_NUMBERS
+    )
+
+
+LOGGERS = {
+    "csv": LoggerConfig("csv"),
+    "tensorboard": LoggerConfig("tensorboard"),
+    "wandb": LoggerConfig("wandb"),
+    "mlflow": LoggerConfig("mlflow"),
+}
+
+# group -> name -> the settings that `group=name` chooses.
+GROUPS: dict[str, Mapping[str, Any]] = {
+    "task": TASKS,
+    "algorithm": ALGORITHMS,
+    "regularizer": REGULARIZERS,
+    "replay": REPLAYS,
+    "optimizer": OPTIMIZERS,
+    "logger": LOGGERS,
+}
+# What steers where and how often runs happen, and is no setting of a run.
+STEERING = {"outputs", "experiment", "preset", "resume", "allow_other_versions"}
+
+
+@settings
+class ExperimentConfig:
+    """Everything one run depends on; the defaults are those of ``python train.py``.
+
+    Left out, ``replay`` and ``optimizer`` are the algorithm's usual ones, and
+    ``regularizer`` is L2C2 with the preset of the algorithm, or else the paper's settings; an
+    ``L2C2Config()`` that is given begins with the paper's settings.
+
+    Raises:
+        SettingError: a setting that is not known or lies outside its range.
+
+    Examples:
+        >>> config = ExperimentConfig(task=TaskConfig(episodes=5), regularizer=REGULARIZERS["caps"])
+        >>> config.task.episodes, config.regularizer.name, config.replay.batch_size
+        (5, 'caps', 32)
+    """
+
+    task: TaskConfig = dataclasses.field(default_factory=lambda: TASKS["swingup"])
+    algorithm: AlgorithmConfig = dataclasses.field(default_factory=PPORPEConfig)
+    # None stands for what __post_init__ chooses by the algorithm.
+    regularizer: RegularizerConfig = None  # type: ignore[assignment]
+    replay: ReplayConfig = None  # type: ignore[assignment]
+    optimizer: OptimizerConfig = None  # type: ignore[assignment]
+    logger: LoggerConfig = dataclasses.field(default_factory=LoggerConfig)
+    seed: int = Field(
+        # Simulators and tests have seeds that are larger, and NumPy takes those below 2 ** 32.
+        default=0,
+        ge=0,
+        lt=2**31,
+        description="of everything that is random in the run",
+    )
+    device: str = Field(
+        default="cpu",
+        description="of the updates and what they learn from: cpu, cuda or cuda:N; episodes are "
+        "played on the CPU, by a copy of the policy",
+        json_schema_extra=neutral("cpu"),
+    )
+    threads: int = Field(
+        default=1,
+        ge=1,
+        le=1024,
+        description="of PyTorch; networks so small gain nothing from more",
+        json_schema_extra=CHANGES_NO_NUMBERS,
+    )
+    num_workers: int = Field(
+        default=1,
+        ge=1,
+        le=1024,
+        description="processes that play episodes, one each in a round with one policy, the last "
+        "round whole: 4 play 352 episodes where 350 are asked for; more than 1 needs "
+        "algorithm.schedule other than step",
+    )
+    compile: bool = Field(
+        default=True,
+        description="compile updates and policies where a C++ compiler is found; false: eager",
+    )
+    on_nonfinite: Literal["stop", "skip"] = Field(
+        default="stop",
+        description="what a batch whose loss or gradient is NaN or infinite does (skipped ones are "
+        "counted)",
+    )
+    test_episodes: int = Field(
+        default=100,
+        ge=0,
+        description="episodes played with the policy's mean, and as many with samples, after "
+        "training; 0: none, and no evaluation.json, so that reports pass the run over",
+        json_schema_extra=CHANGES_NO_NUMBERS,
+    )
+    evaluate_every: int = Field(
+        default=0,
+        ge=0,
+        description="training episodes between tests of 10 episodes; "
+        "policy_best.pt is from the best test; 0: none",
+        json_schema_extra=CHANGES_NO_NUMBERS,
+    )
+    record: bool = Field(
+        default=False,
+        description="a test episode as video.mp4, after training (extra video)",
+        json_schema_extra=CHANGES_NO_NUMBERS,
+    )
+    late_share: float = Field(
+        default=0.1,
+        ge=0,
+        le=1,
+        description="final fraction of training whose policies play one test episode each; 0: none",
+        json_schema_extra=CHANGES_NO_NUMBERS,
+    )
+    checkpoint_interval: float = Field(
+        default=60.0,
+        ge=0,
+        description="seconds between checkpoints, after episodes or rollouts",
+        json_schema_extra=CHANGES_NO_NUMBERS,
+    )
+    checkpoint_keep: int = Field(
+        default=2,
+        ge=1,
+        description="newest checkpoints that stay in the folder",
+        json_schema_extra=CHANGES_NO_NUMBERS,
+    )
+
+    def __post_init__(self) -> None:
+        # Frozen: this is how a default that depends on another field is set.
+        if self.regularizer is None:
+            begins = preset_settings("l2c2", self.algorithm.name)
+            object.__setattr__(self, "regularizer", L2C2Config(**begins))
+        if self.replay is None:
+            object.__setattr__(self, "replay", REPLAYS[self.algorithm.usual_replay])
+        if self.optimizer is None:
+            object.__setattr__(self, "optimizer", OPTIMIZERS[self.algorithm.usual_optimizer])
+        self._check_names()
+        self._check_device()
+        self._check_replay()
+        self._check_rounds()
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> ExperimentConfig:
+        """Reads nested mappings, such as a resolved Hydra configuration.
+
+        Args:
+            values (Mapping): by group and name; what a group leaves out is the default of its name,
+                which for ``l2c2`` is the paper's; ``outputs``, ``resume``, ``experiment`` and
+                ``allow_other_versions``, which steer where, whether and how often runs happen, are
+                passed over.
+
+        Raises:
+            SettingError: an unknown key, an unknown name, or a value outside its range.
+        """
+        given = {k: v for k, v in values.items() if k not in STEERING}
+        for group in GROUPS.keys() & given.keys():
+            given[group] = _read_group(group, given[group])
+        return read(cls, given, "")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Nested dictionaries of plain values: ``from_dict`` reads them back."""
+        return dataclasses.asdict(self)
+
+    def _check_names(self) -> None:
+        """A group is found again by its name, as a run's folder has it; tasks may have any."""
+        for group in GROUPS.keys() - {"task"}:
+            chosen, choices = getattr(self, group), GROUPS[group]
+            if type(choices.get(chosen.name)) is not type(chosen):
+                own = [name for name, each in choices.items() if type(each) is type(chosen)]
+                raise SettingError(
+                    f"{group}.name",
+                    f"must be one of {own} with {type(chosen).__name__}, got {chosen.name!r}.",
+                )
+
+    def _check_device(self) -> None:
+        # Not a pattern of the field, which pydantic would show as it is written.
+        if not re.fullmatch(r"cpu|cuda(:\d+)?", self.device):
+            raise SettingError(
+                "device", f"must be cpu, cuda or cuda:N, a number from 0 up, got {self.device!r}."
+            )
+
+    def _check_replay(self) -> None:
+        on_policy = self.algorithm.usual_replay == "rollout"
+        if on_policy != (type(self.replay) is type(REPLAYS["rollout"])):
+            raise SettingError(
+                "replay",
+                f"{self.replay.name!r} is nothing that algorithm {self.algorithm.name!r} can learn "
+                "from: ppo needs rollout, the others prioritized or uniform.",
+            )
+
+    def _check_rounds(self) -> None:
+        """Several workers play whole episodes, and all of them as many."""
+        workers = self.num_workers
+        if workers > 1 and self.algorithm.num_envs is not None:
+            raise SettingError(
+                "num_workers",
+                f"must be 1 with algorithm.num_envs, whose simulators one process plays, got "
+                f"{workers}: leave one of the two.",
+            )
+        if workers > 1 and self.algorithm.schedule == "step":
+            raise SettingError(
+                "num_workers",
+                f"must be 1 with algorithm.schedule=step, which updates after every frame, got "
+                f"{workers}: use one worker, or algorithm.schedule=episode algorithm.updates=null "
+                f"algorithm.replay_ratio={self.replay.batch_size}, one update a frame on average.",
+            )
+
+
+def _read_group(group: str, values: Mapping[str, Any]) -> Any:
+    """The settings of a group that a mapping's ``name`` chooses, with its other values."""
+    if not isinstance(values, Mapping):
+        raise SettingError(group, f"must have settings by their names, got {values!r}.")
+    choices, name = GROUPS[group], str(values.get("name"))
+    if name in choices:
+        return read(partial(dataclasses.replace, choices[name]), values, group)
+    if group == "task":  # Any name will do for a task of one's own.
+        if values.get("env_id", "") is None:
+            raise SettingError(
+                "env_id", "must be given with task=gymnasium, such as Pendulum-v1, got null.", group
+            )
+        return read(TaskConfig, values, group)
+    given = values.get("name")
+    raise SettingError("name", f"must be one of {sorted(choices)}, got {given!r}.", group)

@@ -1,0 +1,156 @@
+"""What a group of settings is: a frozen dataclass whose every field has a default, a range, a word.
+
+Settings are read without importing torch, so that help and errors come at once: a setting imports
+what it makes when it makes it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, TypeVar, dataclass_transform, get_type_hints
+
+import pydantic.dataclasses
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+
+from torchrl_l2c2.experiment.errors import UserError
+
+Group = TypeVar("Group")
+
+# Metadata of a setting, for ``Field(json_schema_extra=...)``; :mod:`~.settings.identity` reads it.
+# A run and its continuation may differ in this setting: it changes none of the numbers, or only
+# how long the training is.
+CHANGES_NO_NUMBERS: dict[str, Any] = {"changes_no_numbers": True}
+
+
+def neutral(value: Any) -> dict[str, Any]:
+    """Metadata of a setting: with this value, a run has the numbers of one without the setting."""
+    return {"neutral": value}
+
+
+class SettingError(UserError):
+    """A setting that cannot be.
+
+    Attributes:
+        setting: its name within its group; empty where it is about several.
+        problem: what is allowed, and what was given.
+    """
+
+    def __init__(self, setting: str, problem: str, group: str = "") -> None:
+        self.setting, self.problem = setting, problem
+        super().__init__(f"{'.'.join(filter(None, (group, setting)))} {problem}".strip())
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(Field,))
+def settings(cls: type[Group]) -> type[Group]:
+    """Makes a class of settings: frozen, its values checked against their types and ranges.
+
+    Raises:
+        SettingError: when an object is made with a value that is not allowed, or of another name.
+
+    Examples:
+        >>> from pydantic import Field
+        >>> @settings
+        ... class Pace:
+        ...     tau: float = Field(default=0.1, gt=0, le=1, description="how fast targets follow")
+        >>> Pace(tau=2.0)
+        Traceback (most recent call last):
+        torchrl_l2c2.experiment.settings.fields.SettingError: Pace.tau must be less than or equal to 1, got 2.0.
+    """  # noqa: E501
+    strict = ConfigDict(
+        strict=True, extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True
+    )
+    made = pydantic.dataclasses.dataclass(frozen=True, config=strict)(cls)
+    checked = made.__init__
+
+    def __init__(self: Any, *args: Any, **values: Any) -> None:
+        try:
+            checked(self, *args, **values)
+        except ValidationError as error:
+            raise _first_problem(error, made) from None
+
+    made.__init__ = __init__  # type: ignore[method-assign]
+    return made  # type: ignore[return-value]
+
+
+def read(make: Callable[..., Group], values: Mapping[str, Any], prefix: str) -> Group:
+    """Settings from plain values, as a file or a command line has them.
+
+    Lists stand for tuples, and whole floats for integers, as in ``task.frames=1e6``.
+
+    Args:
+        make (Callable): a class of settings, or a ``functools.partial`` of ``dataclasses.replace``
+            and an object of one.
+        values (Mapping): by name.
+        prefix (str): how errors name the group, such as ``"task"``.
+
+    Raises:
+        SettingError: an unknown name, or a value outside its range.
+    """
+    plain = {name: _plain(value) for name, value in values.items()}
+    try:
+        return make(**plain)
+    except SettingError as error:
+        raise SettingError(error.setting, error.problem, prefix) from None
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, list):
+        return tuple(map(_plain, value))
+    # Where a float is wanted, pydantic makes one of the integer.
+    whole = isinstance(value, float) and value.is_integer() and abs(value) < 2**63
+    return int(value) if whole else value
+
+
+# Of every group that was asked for: the command's help and its nodes ask many times.
+_described: dict[type, dict[str, tuple[str, str]]] = {}
+
+
+def describe(group: type) -> dict[str, tuple[str, str]]:
+    """The range or choices and the meaning of every setting of a group, as they were declared."""
+    if group not in _described:
+        types = get_type_hints(group)
+        _described[group] = {
+            field.name: (_allowed(types[field.name], field.default), meaning)
+            for field in dataclasses.fields(group)
+            if (meaning := getattr(field.default, "description", None))
+        }
+    return _described[group]
+
+
+_LIMITS = {
+    "exclusiveMinimum": "> {}",
+    "minimum": ">= {}",
+    "exclusiveMaximum": "< {}",
+    "maximum": "<= {}",
+}
+
+
+def _allowed(annotation: Any, declared: Any) -> str:
+    schema = TypeAdapter(Annotated[annotation, declared]).json_schema()
+    kinds = schema.get("anyOf", [schema])
+    choices = [str(choice) for kind in kinds for choice in kind.get("enum", ())]
+    limits = [
+        form.format(kind[key]) for kind in kinds for key, form in _LIMITS.items() if key in kind
+    ]
+    return " | ".join([*choices, *([", ".join(limits)] if limits else [])])
+
+
+def _first_problem(error: ValidationError, cls: type) -> SettingError:
+    """Pydantic's first complaint as one line."""
+    first = error.errors(include_url=False, include_context=True)[0]
+    where, given = [str(part) for part in first["loc"]], first["input"]
+    name = next((part for part in where if part in {f.name for f in dataclasses.fields(cls)}), "")
+    if first["type"] == "value_error":
+        cause = first["ctx"]["error"]
+        if isinstance(cause, SettingError):
+            return SettingError(cause.setting, cause.problem, cls.__name__)
+        return SettingError(name, str(cause), cls.__name__)
+    if first["type"] == "unexpected_keyword_argument":
+        known = ", ".join(sorted(f.name for f in dataclasses.fields(cls)))
+        return SettingError(where[0], f"is not a setting; here there are {known}.", cls.__name__)
+    if first["type"] == "missing":  # of a tuple
+        return SettingError(name, f"must have more entries, got {list(given)}.", cls.__name__)
+    allowed = first["msg"].replace("Input should be", "must be", 1)
+    allowed = allowed.replace("a valid tuple", "a list")
+    return SettingError(name, f"{allowed}, got {given!r}.", cls.__name__)

@@ -1,0 +1,365 @@
+"""Settings of the regularizers, and of the gain's schedule."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, ClassVar, Literal
+
+from pydantic import Field
+
+from torchrl_l2c2.experiment.settings.fields import SettingError, neutral, settings
+from torchrl_l2c2.presets import KINDS, METHODS, preset
+
+# Values of ``gain`` with which a setting has an effect.
+READ_BY = {
+    "gain_target": ("target",),
+    "gain_of": ("target",),
+    "gain_rate": ("target",),
+    "gain_limit": ("target",),
+    "gain_length": ("ramp",),
+}
+# The setting of regularizers that compare means.
+COMPARED_MEAN: Any = Field(
+    default="loc",
+    description="loc: compare means before the squashing; action: after it. No difference for "
+    "deterministic policies (td3) [inferred: loc]",
+)
+
+
+class RegularizerConfig:
+    """Settings of a regularizer.
+
+    Attributes:
+        reads_previous: whether batches must have the previous observation.
+    """
+
+    reads_previous: ClassVar[bool] = False
+
+    name: str
+
+    @property
+    def ramped(self) -> bool:
+        """Checks whether the gain is a ramp."""
+        return False
+
+
+@settings
+class GainConfig(RegularizerConfig):
+    """Settings of a regularizer with a gain, and of the gain's schedule."""
+
+    strength: float = Field(
+        default=1.0,
+        ge=0,
+        description="factor on the penalty; larger values smooth more, too large values lower the "
+        "return",
+        json_schema_extra=neutral(1.0),
+    )
+    gain: Literal["constant", "ramp", "target"] = Field(
+        default="constant",
+        description="schedule of the gain: constant, a linear ramp from 0 to 1, or the gain that "
+        "keeps gain_of at or below gain_target; set after every episode",
+        json_schema_extra=neutral("constant"),
+    )
+    gain_target: float | None = Field(
+        default=None, gt=0, description="largest value of gain_of with gain=target"
+    )
+    gain_of: str = Field(
+        default="action_variation",
+        description="metrics.csv column that gain=target keeps at or below gain_target; its "
+        "numbers must be at least 0",
+        json_schema_extra=neutral("action_variation"),
+    )
+    gain_rate: float = Field(
+        default=0.1,
+        gt=0,
+        le=1,
+        description="largest change of the gain's logarithm in a step of gain=target",
+        json_schema_extra=neutral(0.1),
+    )
+    gain_limit: float = Field(
+        default=1000.0,
+        gt=1,
+        description="largest gain of gain=target; the smallest is 1 over it",
+        json_schema_extra=neutral(1000.0),
+    )
+    gain_length: float = Field(
+        default=1.0,
+        gt=0,
+        le=1,
+        description="share of training after which the gain of gain=ramp is 1",
+        json_schema_extra=neutral(1.0),
+    )
+
+    def __post_init__(self) -> None:
+        if self.gain in READ_BY["gain_target"] and self.gain_target is None:
+            raise SettingError("gain_target", f"must be given with gain={self.gain}, got null.")
+        declared: Any = {field.name: field.default for field in dataclasses.fields(GainConfig)}
+        for name, gains in READ_BY.items():
+            given, usual = getattr(self, name), declared[name].default
+            if self.gain not in gains and given != usual:
+                raise SettingError(
+                    name,
+                    f"works only with gain={' or gain='.join(gains)}, got {given} with "
+                    f"gain={self.gain}: change gain, or leave {name} at "
+                    f"{'null' if usual is None else usual}.",
+                )
+
+    @property
+    def ramped(self) -> bool:
+        """Checks whether the gain is a ramp."""
+        return self.gain == "ramp"
+
+
+@settings
+class L2C2Config(GainConfig):
+    """Settings of L2C2Loss, the paper's method."""
+
+    name: str = "l2c2"
+    sigma: float = Field(
+        default=1.0,
+        gt=0,
+        description="size of the neighborhood relative to the step from s to s' [paper]",
+    )
+    lambda_min: float = Field(
+        default=0.01, gt=0, description="gain at the edge of the neighborhood [paper]"
+    )
+    lambda_max: float = Field(
+        default=1.0, gt=0, description="gain at the center of the neighborhood [paper]"
+    )
+    shared: bool = Field(
+        default=False,
+        description="line neighborhood (one random number for all dimensions of the state) instead "
+        "of a box neighborhood (one for each) [paper: box]",
+    )
+    max_step: float | None = Field(
+        default=None,
+        gt=0,
+        description="longest step from s to s' that counts, in the observation's units (with "
+        "algorithm.normalize_observations, in standard deviations); excludes resets and teleports; "
+        "null: no limit [paper]",
+    )
+    beta: float = Field(
+        default=0.1,
+        ge=0,
+        description="gain of the value terms relative to the policy term [paper]",
+    )
+    num_samples: int = Field(default=1, ge=1, description="neighbors per transition [inferred: 1]")
+    over_neighbors: Literal["mean", "max"] = Field(
+        default="mean",
+        description="mean over a transition's neighbors [paper] or the largest penalty, which "
+        "needs num_samples above 1",
+        json_schema_extra=neutral("mean"),
+    )
+    fraction: float = Field(
+        default=1.0,
+        gt=0,
+        le=1,
+        description="share of the batch that has neighbors; smaller values save time in large "
+        "batches and make the terms noisier [paper: all]",
+        json_schema_extra=neutral(1.0),
+    )
+    policy_distance: Literal["hellinger", "mean", "mse", "kl"] = Field(
+        default="hellinger",
+        description="distance of policies: hellinger [paper]; mean: half the squared distance of "
+        "the means before the squashing; mse: their mean squared error over the action's "
+        "dimensions; kl: the KL divergence. Each needs other gains. For deterministic policies "
+        "(td3), hellinger and mean are half the squared distance of the actions",
+        json_schema_extra=neutral("hellinger"),
+    )
+
+    tchebycheff_mu: float | None = Field(
+        default=None,
+        gt=0,
+        description="temperature of the smooth maximum of the policy's loss and its penalty, which "
+        "the policy minimizes; larger values are smoother; null: their sum [paper]",
+    )
+    tchebycheff_ideal: float | None = Field(
+        default=None,
+        description="smallest expected policy loss, with tchebycheff_mu; for example minus the "
+        "largest value; null: 0",
+    )
+
+    def __post_init__(self) -> None:
+        GainConfig.__post_init__(self)
+        if self.lambda_max <= (least := max(1.0, self.sigma) * self.lambda_min):
+            raise SettingError(
+                "lambda_max",
+                f"must be above lambda_min and above sigma * lambda_min, here above {least:g}, got "
+                f"{self.lambda_max:g}: raise it, or lower lambda_min or sigma.",
+            )
+        if self.over_neighbors == "max" and self.num_samples == 1:
+            raise SettingError("num_samples", "must be above 1 with over_neighbors=max, got 1.")
+        if self.tchebycheff_ideal is not None and self.tchebycheff_mu is None:
+            raise SettingError(
+                "tchebycheff_ideal",
+                f"works only with tchebycheff_mu, got {self.tchebycheff_ideal}: set both.",
+            )
+
+
+@settings
+class CAPSConfig(GainConfig):
+    """Settings of CAPSLoss."""
+
+    name: str = "caps"
+    sigma: float = Field(
+        default=0.2, gt=0, description="standard deviation of the noise on the state [paper]"
+    )
+    lambda_temporal: float = Field(
+        default=0.01, ge=0, description="gain of the distance between s and s' [paper]"
+    )
+    lambda_spatial: float = Field(
+        default=0.05, ge=0, description="gain of the distance between s and its noisy copy [paper]"
+    )
+    mean: Literal["loc", "action"] = COMPARED_MEAN
+
+
+@settings
+class CATSConfig(GainConfig):
+    """Settings of CATSLoss, with a linear ramp over the training."""
+
+    name: str = "cats"
+    gain: Literal["constant", "ramp", "target"] = Field(
+        default="ramp", description="schedule of the gain, as for other methods [paper: ramp]"
+    )
+    lambda_temporal: float = Field(
+        default=0.1, ge=0, description="gain of the distance between s and s' [inferred]"
+    )
+    mean: Literal["loc", "action"] = COMPARED_MEAN
+
+
+@settings
+class GradCAPSConfig(GainConfig):
+    """Settings of GradCAPSLoss. Batches have the previous observation."""
+
+    reads_previous: ClassVar[bool] = True
+
+    name: str = "grad_caps"
+    lambda_temporal: float = Field(
+        default=0.01, ge=0, description="gain of the action's second difference [inferred]"
+    )
+    epsilon: float = Field(
+        default=0.1,
+        gt=0,
+        description="constant in the denominator; smaller values penalize small zigzags more",
+    )
+    mean: Literal["loc", "action"] = COMPARED_MEAN
+
+
+@settings
+class ASAPConfig(GainConfig):
+    """Settings of ASAPLoss. Batches have the previous observation."""
+
+    reads_previous: ClassVar[bool] = True
+
+    name: str = "asap"
+    lambda_spatial: float = Field(
+        default=0.3,
+        ge=0,
+        description="gain of the distance to the predicted action [the authors' value for MuJoCo; "
+        "0.03 for LunarLander and Pendulum]",
+    )
+    lambda_temporal: float = Field(
+        default=2.0, ge=0, description="gain of the predictor's loss [the authors' value]"
+    )
+    lambda_grad: float = Field(
+        default=0.05,
+        ge=0,
+        description="gain of the action's second difference [the authors' value for MuJoCo; 0.005 "
+        "for LunarLander and Pendulum]",
+    )
+    epsilon: float = Field(
+        default=0.1,
+        gt=0,
+        description="constant in the denominator; smaller values penalize small zigzags more",
+    )
+    mean: Literal["loc", "action"] = COMPARED_MEAN
+
+
+@settings
+class SR2LConfig(GainConfig):
+    """Settings of SR2LLoss. An update takes several times as long as with other regularizers."""
+
+    name: str = "sr2l"
+    epsilon: float = Field(
+        default=0.05, gt=0, description="half the width of the box, in the observation's units"
+    )
+    coeff: float = Field(default=0.1, ge=0, description="gain of the largest distance in the box")
+    steps: int = Field(default=10, ge=1, description="ascent steps to the largest distance")
+    policy_distance: Literal["jeffreys", "hellinger", "mean", "mse", "kl"] = Field(
+        default="jeffreys",
+        description="distance of policies; deterministic policies are compared by their actions, "
+        "and kl does not work with them",
+    )
+
+
+@settings
+class LCPConfig(GainConfig):
+    """Settings of LCPLoss."""
+
+    name: str = "lcp"
+    coeff: float = Field(default=0.002, ge=0, description="gain of the squared gradient")
+    of: Literal["log_prob", "mean"] = Field(
+        default="log_prob",
+        description="function to differentiate: the log-likelihood [the authors' choice] or the "
+        "mean action, whose gradient does not fall when the policy gets wider",
+    )
+
+
+@settings
+class NoRegularizerConfig(RegularizerConfig):
+    """The loss without a regularizer: the baseline."""
+
+    name: str = "none"
+
+
+# Choices that start from the algorithm's preset, with their overrides. l2c2_paper has the paper's
+# settings with every algorithm.
+BEGIN_WITH_PRESET: dict[str, tuple[str, dict[str, Any]]] = {
+    "l2c2": ("l2c2", {}),
+    "l2c2_constant": ("l2c2", {"gain": "constant"}),
+    "l2c2_ramp": ("l2c2", {"gain": "ramp"}),
+    **{method: (method, {}) for method in METHODS if method != "l2c2"},
+}
+
+
+def preset_settings(regularizer: str, algorithm: str) -> dict[str, Any]:
+    """The initial settings of a regularizer for an algorithm.
+
+    Args:
+        regularizer (str): a name in :data:`REGULARIZERS`.
+        algorithm (str): name of the algorithm.
+
+    Returns:
+        dict: settings by name; empty if there is no preset.
+
+    Examples:
+        >>> preset_settings("l2c2_constant", "ppo")["gain"], preset_settings("l2c2_paper", "ppo")
+        ('constant', {})
+    """
+    if regularizer not in BEGIN_WITH_PRESET or algorithm not in KINDS:
+        return {}
+    method, own = BEGIN_WITH_PRESET[regularizer]
+    chosen = preset(method, algorithm)
+    gain: dict[str, Any] = {"gain": "constant" if chosen.ramp is None else "ramp"}
+    if chosen.ramp not in (None, 1.0):
+        gain["gain_length"] = chosen.ramp
+    return {**chosen.settings, **gain, **own}
+
+
+REGULARIZERS: dict[str, RegularizerConfig] = {
+    "none": NoRegularizerConfig(),
+    "caps": CAPSConfig(),
+    "cats": CATSConfig(),
+    "grad_caps": GradCAPSConfig(),
+    "asap": ASAPConfig(),
+    "sr2l": SR2LConfig(),
+    "lcp": LCPConfig(),
+    "l2c2": L2C2Config(),
+    "l2c2_paper": L2C2Config(name="l2c2_paper"),
+    # The paper's ablation: only the policy is regularized.
+    "l2c2_policy": L2C2Config(name="l2c2_policy", beta=0.0),
+    # The distance of the means suits policies of any scale; a ramp costs less return early.
+    "l2c2_mean": L2C2Config(name="l2c2_mean", policy_distance="mean"),
+    "l2c2_ramp": L2C2Config(name="l2c2_ramp", policy_distance="mean", gain="ramp"),
+    "l2c2_constant": L2C2Config(name="l2c2_constant"),
+}

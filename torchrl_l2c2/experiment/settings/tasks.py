@@ -1,0 +1,144 @@
+"""Settings of the tasks: environment, noise and length of training."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+from pydantic import Field, model_validator
+from pydantic_core import ArgsKwargs
+
+from torchrl_l2c2.experiment.settings.fields import CHANGES_NO_NUMBERS, SettingError, settings
+
+SWINGUP = "pybullet_envs_gymnasium:InvertedPendulumSwingupBulletEnv-v0"
+TASKS: dict[str, TaskConfig] = {}  # by their names; filled below
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How long a training is.
+
+    Attributes:
+        total: so many episodes, or so many frames and what is left of their last episode.
+        unit: which of the two.
+    """
+
+    total: int
+    unit: Literal["episode", "frame"] = "episode"
+
+    def at_least(self, other: Budget) -> Budget:
+        """The longer of the two; this one where they are not of the same unit."""
+        return other if other.unit == self.unit and other.total > self.total else self
+
+    def spent(self, episodes: int, frames: int) -> int:
+        """What a training of so many episodes and frames has used of it."""
+        return episodes if self.unit == "episode" else frames
+
+    def is_late(self, spent: int, share: float) -> bool:
+        """Whether a training is in the last share of it, which has one unit at least."""
+        return share > 0.0 and self.total - spent < max(1, round(self.total * share))
+
+
+@settings
+class TaskConfig:
+    """A Gymnasium task with noisy observations; by default the paper's Swingup."""
+
+    name: str = Field(default="swingup", json_schema_extra=CHANGES_NO_NUMBERS)
+    env_id: str = Field(
+        default=SWINGUP,
+        description="Gymnasium id; `module:id` imports the module that registers it",
+    )
+    noise_scale: float | None = Field(
+        default=None,
+        ge=0,
+        le=1e9,
+        description="standard deviation of the white noise on every observation; null: the paper's "
+        ".01 for Swingup, none for other ids [paper]",
+    )
+    episodes: int = Field(
+        default=350,
+        ge=1,
+        description="to train for, unless frames are given [inferred: the paper states none]",
+        json_schema_extra=CHANGES_NO_NUMBERS,
+    )
+    max_steps: int | None = Field(
+        default=None,
+        ge=1,
+        description="longest episode; null: as the task is registered with Gymnasium",
+    )
+    solved_at: float | None = Field(
+        default=None,
+        description="return at which the task counts as solved, a line in the picture",
+        json_schema_extra=CHANGES_NO_NUMBERS,
+    )
+    frames: int | None = Field(
+        default=None,
+        ge=1,
+        description="to train for instead of episodes, such as 1e6: training ends with the first "
+        "episode that reaches them, with algorithm.num_envs with the first rollout",
+        json_schema_extra=CHANGES_NO_NUMBERS,
+    )
+    flatten: bool = Field(
+        default=False,
+        description="make one vector of matrices, nested entries and labels (as one-hot vectors) "
+        "that are observed; several vectors become one, in the order of their names, without it",
+    )
+    images: bool = Field(
+        default=False,
+        description="the observation is an image, which small convolutional networks see, with its "
+        "values from 0 to 1; the replay buffer keeps two of them for every transition, as floats",
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _check_env_id_given(cls, given: ArgsKwargs) -> ArgsKwargs:
+        """Refuses a name without a simulator, which would be Swingup's."""
+        values = given.kwargs or {}
+        name = given.args[0] if given.args else values.get("name", "swingup")
+        if len(given.args) < 2 and "env_id" not in values and name != "swingup":
+            instead = f"TASKS[{name!r}]" if name in TASKS else f"TaskConfig({name!r}, ENV_ID)"
+            raise SettingError("env_id", f"must be given with name={name!r}: write {instead}.")
+        return given
+
+    def __post_init__(self) -> None:
+        if self.name in TASKS and self.env_id != (own := TASKS[self.name].env_id):
+            raise SettingError(
+                "env_id",
+                f"must be {own} with name={self.name!r}, got {self.env_id}: give another name (in "
+                f"a shell, task=gymnasium task.env_id={self.env_id}).",
+            )
+        if self.images and self.flatten:
+            raise SettingError("images", "and flatten exclude each other: leave one at false.")
+        if self.noise_scale is None:
+            # Frozen: this is how a default that depends on another field is set.
+            object.__setattr__(self, "noise_scale", 0.01 if self.env_id == SWINGUP else 0.0)
+
+    @property
+    def budget(self) -> Budget:
+        """How long to train."""
+        return Budget(self.episodes) if self.frames is None else Budget(self.frames, "frame")
+
+    def for_episodes(self, episodes: int) -> TaskConfig:
+        """The task with a training of so many episodes."""
+        return replace(self, episodes=episodes, frames=None)
+
+
+def _bullet(name: str, **settings: Any) -> TaskConfig:
+    return TaskConfig(name.lower(), f"pybullet_envs_gymnasium:{name}BulletEnv-v0", **settings)
+
+
+# Noise, steps and the returns that count as solved are the paper's; episodes are inferred.
+PAPER_TASKS: dict[str, TaskConfig] = {
+    "swingup": TaskConfig(max_steps=1000, solved_at=800.0),
+    "reacher": _bullet("Reacher", noise_scale=0.01, episodes=4500, max_steps=150, solved_at=18.0),
+    "hopper": _bullet("Hopper", noise_scale=0.001, episodes=750, max_steps=1000, solved_at=2500.0),
+    "ant": _bullet("Ant", noise_scale=0.001, episodes=750, max_steps=1000, solved_at=2500.0),
+}
+# Those of the methods after it, without noise; conf/preset/rl_zoo/ says how long they train.
+FIELD_TASKS: dict[str, TaskConfig] = {
+    "pendulum": TaskConfig("pendulum", "Pendulum-v1"),
+    "lunarlander": TaskConfig("lunarlander", "LunarLanderContinuous-v3"),
+    "hopper_v5": TaskConfig("hopper_v5", "Hopper-v5"),
+    "walker2d_v5": TaskConfig("walker2d_v5", "Walker2d-v5"),
+}
+TASKS.update(PAPER_TASKS | FIELD_TASKS)
