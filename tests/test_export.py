@@ -27,7 +27,7 @@ from torchrl_l2c2.experiment import (
 )
 from torchrl_l2c2.experiment.analysis.export import export_policy
 from torchrl_l2c2.experiment.cli.export import main
-from torchrl_l2c2.experiment.envs.environments import control_rate
+from torchrl_l2c2.experiment.envs.pictures import control_rate
 from torchrl_l2c2.experiment.run.policies import load_policy
 
 onnxruntime = pytest.importorskip("onnxruntime")

@@ -26,6 +26,7 @@ from torchrl_l2c2.experiment import (
 from torchrl_l2c2.experiment.agents.build import make_agent
 from torchrl_l2c2.experiment.cli.train import run
 from torchrl_l2c2.experiment.envs.environments import time_limit
+from torchrl_l2c2.experiment.envs.pictures import Drawing
 from torchrl_l2c2.experiment.errors import SimulatorError
 
 INF = float("inf")
@@ -300,7 +301,7 @@ def test_a_task_that_cannot_draw_says_so(monkeypatch, modes):
     for name, value in {"space": VECTOR, "modes": modes}.items():
         monkeypatch.setitem(gymnasium.registry["Drawn-v0"].kwargs, name, value)
     with pytest.raises(ValueError, match="Drawn-v0 draws no pictures: it has no render_mode"):
-        make_env(task("Drawn-v0"), 0, render=True)
+        make_env(task("Drawn-v0"), 0, render=Drawing())
     make_env(task("Drawn-v0"), 0).close()
 
 

@@ -12,6 +12,7 @@ from processes import run_train
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig, PPORPEConfig, TaskConfig
 from torchrl_l2c2.experiment.analysis.video import play_pictures, record_video
 from torchrl_l2c2.experiment.cli.video import main
+from torchrl_l2c2.experiment.envs.pictures import Drawing
 from torchrl_l2c2.experiment.run.policies import load_policy
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
@@ -63,11 +64,20 @@ def test_a_video_has_every_state_at_the_simulators_speed(pendulum, tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_a_drawing_leaves_states_out(pendulum):
+    """Five pictures a second are every fourth step; half a second is ten steps."""
+    ((_, whole, *_),) = play_pictures(pendulum, 1)
+    ((_, some, rate, every),) = play_pictures(pendulum, 1, drawing=Drawing(rate=5.0, seconds=0.5))
+    assert (len(some), rate, every) == (3, 20.0, 4)
+    for number, picture in enumerate(some):
+        assert np.array_equal(picture, whole[4 * number])
+
+
 def test_the_pictures_are_those_of_the_test_episode(pendulum):
     """They change as it moves; drawing changes none of its numbers, nor the environment's."""
     before = dict(os.environ)
-    ((episode, pictures, rate),) = play_pictures(pendulum, 1)
-    assert len(pictures) == len(episode) + 1 and rate == 20.0
+    ((episode, pictures, rate, every),) = play_pictures(pendulum, 1)
+    assert len(pictures) == len(episode) + 1 and (rate, every) == (20.0, 1)
     assert all((a != b).any() for a, b in pairwise(pictures))
     first = load_policy(pendulum)[1].reset()["observation"]
     assert np.array_equal(first.numpy(), episode["observation"][0].numpy())

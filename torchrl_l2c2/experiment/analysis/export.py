@@ -29,7 +29,8 @@ from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 from torchrl_l2c2.experiment.agents._torchrl_internals import simulator_of
 from torchrl_l2c2.experiment.agents.networks import action_bounds
 from torchrl_l2c2.experiment.collect.episodes import play_episodes
-from torchrl_l2c2.experiment.envs.environments import control_rate, untransformed
+from torchrl_l2c2.experiment.envs.environments import untransformed
+from torchrl_l2c2.experiment.envs.pictures import control_rate
 from torchrl_l2c2.experiment.envs.spaces import CountedFromZero
 from torchrl_l2c2.experiment.errors import MissingPackageError, UserError
 from torchrl_l2c2.experiment.run.files import (

@@ -10,7 +10,7 @@ import os
 from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,8 @@ from tensordict import TensorDictBase
 
 from torchrl_l2c2.experiment.agents._torchrl_internals import simulator_of
 from torchrl_l2c2.experiment.collect.episodes import play_episodes
-from torchrl_l2c2.experiment.envs.environments import control_rate, make_env, untransformed
+from torchrl_l2c2.experiment.envs.environments import make_env, untransformed
+from torchrl_l2c2.experiment.envs.pictures import Drawing, control_rate
 from torchrl_l2c2.experiment.errors import MissingPackageError, UserError
 from torchrl_l2c2.experiment.run.files import make_folder_of
 from torchrl_l2c2.experiment.run.policies import load_policy, seed_of_test
@@ -60,7 +61,7 @@ def check_pictures(task: TaskConfig) -> None:
         SimulatorError: it fails at drawing, for lack of a graphics library for example.
     """
     with _without_a_screen(), ProcessState(0):
-        make_env(task, 0, render=True).close()
+        make_env(task, 0, render=Drawing()).close()
 
 
 def record_video(
@@ -101,9 +102,25 @@ def record_video(
         raise UserError(f"episodes must be at least 1, got {episodes}.")
     path = Path(path or Path(run) / "video.mp4")
     played = play_pictures(run, episodes, seed=seed, noise_scale=noise_scale, best=best)
-    rate = played[0][2]
-    write_video(path, [picture for _, seen, _ in played for picture in seen], rate or 30.0)
+    seen = [picture for each in played for picture in each.pictures]
+    write_video(path, seen, played[0].rate or 30.0)
     return path
+
+
+class PlayedPictures(NamedTuple):
+    """An episode and its pictures.
+
+    Attributes:
+        episode: transitions ``[T]``.
+        pictures: pictures ``[H, W, 3]``, from the reset on.
+        rate: actions per second of simulated time; ``None`` if the simulator does not tell it.
+        every: steps from one picture to the next.
+    """
+
+    episode: TensorDictBase
+    pictures: list[Picture]
+    rate: float | None
+    every: int
 
 
 def play_pictures(
@@ -113,24 +130,22 @@ def play_pictures(
     seed: int | None = None,
     noise_scale: float | None = None,
     best: bool = False,
-) -> list[tuple[TensorDictBase, list[Picture], float | None]]:
-    """Test episodes with the pictures of every state, and the pictures per second.
+    drawing: Drawing = Drawing(),  # noqa: B008
+) -> list[PlayedPictures]:
+    """Plays test episodes with pictures.
 
-    The arguments are those of :func:`record_video`.
-
-    Returns:
-        list: of each, the episode ``[T]``; its ``T + 1`` pictures, from the reset on; their rate,
-        or ``None`` where the simulator does not say.
+    The arguments are those of :func:`record_video`, and ``drawing``, which says which states are
+    drawn. Default: all.
     """
     with _without_a_screen():
         # Within, as some tasks draw from the global generators where they are made.
         with ProcessState(seed_of_test(run, seed)):
             policy, env, max_steps = load_policy(
-                run, seed=seed, noise_scale=noise_scale, best=best, render=True
+                run, seed=seed, noise_scale=noise_scale, best=best, render=drawing
             )
-            simulator: Any = simulator_of(untransformed(env))
+            recorder: Any = simulator_of(untransformed(env))
             played = [
-                (episode, list(simulator.render()), control_rate(env))
+                PlayedPictures(episode, recorder.pictures(), control_rate(env), recorder.every)
                 for episode in play_episodes(policy, env, episodes, max_steps=max_steps)
             ]
         env.close()

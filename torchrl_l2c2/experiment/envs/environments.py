@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import torch
-from gymnasium.wrappers import RenderCollection
 from torchrl.envs import EnvBase, GymWrapper, TransformedEnv
 
+from torchrl_l2c2.experiment.envs.pictures import Drawing, PictureRecorder
 from torchrl_l2c2.experiment.envs.spaces import (
     Env,
     observing_image,
@@ -55,7 +55,7 @@ def simulating(what: str) -> Iterator[None]:
         raise SimulatorError(f"{what}: {type(error).__name__}: {told}") from error
 
 
-def make_env(task: TaskConfig, seed: int, *, render: bool = False) -> EnvBase:
+def make_env(task: TaskConfig, seed: int, *, render: Drawing | None = None) -> EnvBase:
     """Makes a task's environment, noisy and seeded.
 
     Args:
@@ -63,8 +63,8 @@ def make_env(task: TaskConfig, seed: int, *, render: bool = False) -> EnvBase:
         seed (int): of the simulator and, separately, of the noise.
 
     Keyword Args:
-        render (bool): whether every state is drawn; the Gymnasium environment's ``render()`` gives
-            the pictures since its last call. Default ``False``.
+        render (Drawing, optional): which states are drawn, by a :class:`~.pictures.PictureRecorder`
+            around the Gymnasium environment. Default: none.
 
     Returns:
         EnvBase: a ``GymWrapper`` that observes one vector, or image, of float32, transformed by
@@ -81,14 +81,16 @@ def make_env(task: TaskConfig, seed: int, *, render: bool = False) -> EnvBase:
         simulator = observing_image(simulator)
     else:
         simulator = observing_vector(simulator, flatten=task.flatten)
-    if render:
-        simulator = RenderCollection(simulator)
+    if render is not None:
+        simulator = PictureRecorder(simulator, render)
     try:
         with _explained(task), quiet_output():
             env = GymWrapper(simulator)
             env.reset()
     except SimulatorError as error:
-        if render and isinstance(error.__cause__, NotImplementedError):  # Gymnasium's own render()
+        if render is not None and isinstance(
+            error.__cause__, NotImplementedError
+        ):  # Gymnasium's own render()
             raise _draws_nothing(task) from error.__cause__
         raise
     env.set_seed(seed)
@@ -124,37 +126,18 @@ def untransformed(env: EnvBase) -> Any:
     return getattr(env, "base_env", env)
 
 
-def control_rate(env: EnvBase) -> float | None:
-    """Actions per second of simulated time; ``None`` where the simulator does not say.
-
-    Args:
-        env (EnvBase): of :func:`make_env`, reset at least once.
-
-    Examples:
-        >>> from torchrl.envs import GymEnv
-        >>> control_rate(GymEnv("Pendulum-v1"))
-        20.0
-    """
-    simulator = untransformed(env).unwrapped
-    # MuJoCo's and the classic tasks; Bullet's; the cart pole.
-    for owner, name in (
-        (simulator, "dt"),
-        (getattr(simulator, "scene", None), "dt"),
-        (simulator, "tau"),
-    ):
-        if seconds := getattr(owner, name, None):
-            return round(1.0 / float(seconds), 6)
-    frames: float | None = simulator.metadata.get("render_fps")
-    return frames
-
-
-def _make(task: TaskConfig, render: bool) -> Env:
+def _make(task: TaskConfig, render: Drawing | None) -> Env:
     limit = time_limit(task)
     with _explained(task), quiet_output():
-        if not render:
+        if render is None:
             return gymnasium.make(task.env_id, max_episode_steps=limit)
         try:
-            env = gymnasium.make(task.env_id, max_episode_steps=limit, render_mode="rgb_array")
+            env = gymnasium.make(
+                task.env_id,
+                max_episode_steps=limit,
+                render_mode="rgb_array",
+                **render.options(task.env_id),
+            )
             draws, cause = env.render_mode in env.metadata.get("render_modes", ()), None
         except TypeError as error:  # It knows of no render_mode at all.
             draws, cause = False, error

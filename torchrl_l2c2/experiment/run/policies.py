@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_l2c2.experiment.agents.build import make_agent
 from torchrl_l2c2.experiment.envs.environments import TEST_SEED, make_env, time_limit
+from torchrl_l2c2.experiment.envs.pictures import Drawing
 from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.run.checkpoints import CheckpointError, load_newest
 from torchrl_l2c2.experiment.run.files import REMEDY, read_config, write_atomically
@@ -28,7 +29,7 @@ def load_policy(
     seed: int | None = None,
     noise_scale: float | None = None,
     best: bool = False,
-    render: bool = False,
+    render: Drawing | None = None,
 ) -> tuple[TensorDictModule, EnvBase, int]:
     """A run's acting policy and a fresh environment of its task, from its folder alone.
 
@@ -45,8 +46,8 @@ def load_policy(
             Default: the task's.
         best (bool): whether to take the best policy of the tests during training, where
             ``evaluate_every`` had some, instead of the last. Default ``False``.
-        render (bool): whether the simulator draws pictures, as for
-            :func:`~.environments.make_env`. Default ``False``.
+        render (Drawing, optional): which states the simulator draws, as for
+            :func:`~.environments.make_env`. Default: none.
 
     Returns:
         The policy, the environment and the longest episode.

@@ -23,7 +23,7 @@ CURSOR = (194, 24, 43)
 
 
 def film(diagnoses: Sequence[Diagnosis]) -> bytes:
-    """An MP4 file of the policies' first episodes, at the speed of simulated time.
+    """An MP4 file of the pictures of the policies' first episodes, at the speed of simulated time.
 
     An episode that ends earlier than others stays at its last picture.
 
@@ -34,15 +34,15 @@ def film(diagnoses: Sequence[Diagnosis]) -> bytes:
         ImportError: the ``video`` extra is missing.
         OSError: it could not be written.
     """
-    rate = diagnoses[0].rate or USUAL_RATE
+    rate = (diagnoses[0].rate or USUAL_RATE) / diagnoses[0].picture_every
     apart = max(1, round(rate / FASTEST))
     strips = [_strip(one) for one in diagnoses]
     length = max(len(one.pictures) for one in diagnoses)
     heights = [_shrunk(one.pictures[0]).shape[0] for one in diagnoses]
     seen = []
-    for step in [*range(0, length - 1, apart), length - 1]:
+    for number in [*range(0, length - 1, apart), length - 1]:
         columns = [
-            _column(one, strip, step, max(heights))
+            _column(one, strip, number, max(heights))
             for one, strip in zip(diagnoses, strips, strict=True)
         ]
         seen.append(np.concatenate(columns, 1))
@@ -52,12 +52,12 @@ def film(diagnoses: Sequence[Diagnosis]) -> bytes:
         return path.read_bytes()
 
 
-def _column(one: Diagnosis, strip: tuple[Picture, Any], step: int, height: int) -> Picture:
-    step = min(step, len(one.pictures) - 1)
+def _column(one: Diagnosis, strip: tuple[Picture, Any], number: int, height: int) -> Picture:
+    number = min(number, len(one.pictures) - 1)
     drawn_strip, places = strip
     below = drawn_strip.copy()
-    below[:, places[min(step, len(places) - 1)]] = CURSOR
-    above = _shrunk(one.pictures[step])
+    below[:, places[min(number * one.picture_every, len(places) - 1)]] = CURSOR
+    above = _shrunk(one.pictures[number])
     rest = np.full((height - len(above), WIDTH, 3), 255, np.uint8)
     column: Picture = np.concatenate([above, rest, below])
     return column

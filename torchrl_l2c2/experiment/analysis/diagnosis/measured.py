@@ -16,8 +16,9 @@ from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase, ExplorationType, GymWrapper, set_exploration_type
 
 from torchrl_l2c2._checks import check_positive_int, check_real
-from torchrl_l2c2.experiment.envs.environments import control_rate, untransformed
+from torchrl_l2c2.experiment.envs.environments import untransformed
 from torchrl_l2c2.experiment.envs.frames import check_finite
+from torchrl_l2c2.experiment.envs.pictures import control_rate
 from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.run.evaluation import LEAST_STEPS, measure
 from torchrl_l2c2.metrics import action_variation, local_lipschitz, noise_sensitivity
@@ -75,7 +76,8 @@ class Diagnosis:
         rate: actions per second; ``None`` where it is not known.
         shares: of the loss's terms.
         entries: what the coordinates of an observation are called.
-        pictures: of every state of the first episode, ``[H, W, 3]``; may be empty.
+        pictures: pictures ``[H, W, 3]`` of the first episode, from the reset on; may be empty.
+        picture_every: steps from one picture to the next.
         task: a run's, by its id; empty where it is not known.
     """
 
@@ -99,6 +101,7 @@ class Diagnosis:
     shares: Mapping[str, TermShare] = field(default_factory=dict)
     entries: Sequence[str] = ()
     pictures: Sequence[Any] = ()
+    picture_every: int = 1
     task: str = ""
 
     @property

@@ -207,7 +207,7 @@ def _terms(diagnoses: Sequence[Diagnosis]) -> list[str]:
 
 
 def _videos(diagnoses: Sequence[Diagnosis]) -> list[str]:
-    title = "<h2>Test episodes</h2>"
+    title = "<h2>Test episodes</h2><p>The beginning of the first one, with its actions.</p>"
     if find_spec("imageio_ffmpeg") is None:
         return [f"{title}<p>No video: imageio-ffmpeg is missing, the extra video brings it.</p>"]
     parts = []

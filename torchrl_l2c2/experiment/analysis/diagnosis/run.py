@@ -31,6 +31,7 @@ from torchrl_l2c2.experiment.analysis.video import play_pictures
 from torchrl_l2c2.experiment.collect.episodes import play_episodes
 from torchrl_l2c2.experiment.envs.environments import TEST_SEED, untransformed
 from torchrl_l2c2.experiment.envs.frames import PREVIOUS
+from torchrl_l2c2.experiment.envs.pictures import Drawing
 from torchrl_l2c2.experiment.errors import SimulatorError
 from torchrl_l2c2.experiment.run.checkpoints import load_newest
 from torchrl_l2c2.experiment.run.files import read_config, read_rows
@@ -41,6 +42,9 @@ from torchrl_l2c2.experiment.settings.config import ExperimentConfig
 from torchrl_l2c2.experiment.settings.regularizers import GainConfig
 from torchrl_l2c2.gains import gradient_shares
 from torchrl_l2c2.objectives._networks import VALUE_NETWORKS, EvaluatedNetworks, is_ensemble
+
+# The film of the page. Without a graphics card, drawing takes most of the time.
+DRAWING = Drawing(rate=30.0, seconds=10.0, quick=True)
 
 
 def diagnose_run(
@@ -95,9 +99,11 @@ def diagnose_run(
     seen = untransformed(env).unwrapped.observation_space
     entries = entry_names(seen, found.observations.shape[1])
     env.close()
-    pictures = _pictures(folder, seed, noise_scale, best) if with_pictures else []
+    pictures, every = _pictures(folder, seed, noise_scale, best) if with_pictures else ([], 1)
     task = config.task.env_id
-    return replace(found, task=task, shares=shares, entries=entries, pictures=pictures)
+    return replace(
+        found, task=task, shares=shares, entries=entries, pictures=pictures, picture_every=every
+    )
 
 
 def value_function(loss: LossModule, normalization: Normalization | None = None) -> Value | None:
@@ -194,12 +200,15 @@ def _batch(agent: Agent, config: ExperimentConfig, env: EnvBase, max_steps: int)
         return agent.as_learned(episode, config.algorithm.reward_factor)
 
 
-def _pictures(folder: Path, seed: int, noise_scale: float | None, best: bool) -> list[Any]:
+def _pictures(
+    folder: Path, seed: int, noise_scale: float | None, best: bool
+) -> tuple[list[Any], int]:
+    """The pictures of the first test episode, and the steps from one to the next."""
     try:
-        ((_, pictures, _),) = play_pictures(
-            folder, 1, seed=seed, noise_scale=noise_scale, best=best
+        (played,) = play_pictures(
+            folder, 1, seed=seed, noise_scale=noise_scale, best=best, drawing=DRAWING
         )
     # The task draws none, or not without what is not there.
     except (ValueError, DependencyNotInstalled, SimulatorError):
-        return []
-    return pictures
+        return [], 1
+    return played.pictures, played.every

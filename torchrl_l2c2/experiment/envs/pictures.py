@@ -1,0 +1,100 @@
+"""Pictures of an environment while it is played."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import gymnasium
+
+from torchrl_l2c2.experiment.envs.spaces import Env
+
+QUICK_SIZE = 320  # pixels of a side
+
+
+class Drawing(NamedTuple):
+    """Which states of an episode are drawn, and how.
+
+    Attributes:
+        rate: most pictures per second of simulated time.
+        seconds: simulated time that is drawn, from the start of the episode.
+        quick: whether MuJoCo draws small pictures, without shadows and smooth edges: about ten
+            times faster without a graphics card.
+    """
+
+    rate: float = math.inf
+    seconds: float = math.inf
+    quick: bool = False
+
+    def options(self, env_id: str) -> dict[str, Any]:
+        """Keyword arguments of ``gymnasium.make``."""
+        module, _, name = env_id.rpartition(":")
+        entry = "" if module else str(gymnasium.spec(name).entry_point)
+        small = self.quick and entry.startswith("gymnasium.envs.mujoco")
+        return {"width": QUICK_SIZE, "height": QUICK_SIZE} if small else {}
+
+
+class PictureRecorder(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Keeps pictures of the states from a reset on.
+
+    Args:
+        env (gymnasium.Env): draws with ``render_mode="rgb_array"``.
+        drawing (Drawing): which states are drawn.
+
+    Attributes:
+        every: steps from one picture to the next.
+    """
+
+    def __init__(self, env: Env, drawing: Drawing) -> None:
+        super().__init__(env)
+        self._drawing = drawing
+        self.every = 1
+        self._steps = 0
+        self._pictures: list[Any] = []
+        quality = getattr(getattr(env.unwrapped, "model", None), "vis", None)
+        if drawing.quick and quality is not None:
+            quality.quality.shadowsize = quality.quality.offsamples = 0
+
+    def reset(self, **options: Any) -> Any:
+        begun = self.env.reset(**options)
+        rate = control_rate(self.env)
+        if rate is not None:
+            self.every = max(1, round(rate / self._drawing.rate))
+        self._steps, self._pictures = 0, [self.env.render()]
+        return begun
+
+    def step(self, action: Any) -> Any:
+        result = self.env.step(action)
+        self._steps += 1
+        drawn = self._steps / (control_rate(self.env) or 1.0) <= self._drawing.seconds
+        if drawn and self._steps % self.every == 0:
+            self._pictures.append(self.env.render())
+        return result
+
+    def pictures(self) -> list[Any]:
+        """The pictures ``[H, W, 3]`` of bytes of the current episode."""
+        return list(self._pictures)
+
+
+def control_rate(env: Any) -> float | None:
+    """Actions per second of simulated time; ``None`` if the simulator does not tell it.
+
+    Args:
+        env: a Gymnasium environment, or a TorchRL one around it, reset at least once.
+
+    Examples:
+        >>> from torchrl.envs import GymEnv
+        >>> control_rate(GymEnv("Pendulum-v1"))
+        20.0
+    """
+    simulator = getattr(env, "base_env", env).unwrapped
+    # MuJoCo's and the classic tasks; Bullet's; the cart pole.
+    for owner, name in (
+        (simulator, "dt"),
+        (getattr(simulator, "scene", None), "dt"),
+        (simulator, "tau"),
+    ):
+        if seconds := getattr(owner, name, None):
+            return round(1.0 / float(seconds), 6)
+    frames: float | None = simulator.metadata.get("render_fps")
+    return frames
