@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
+import numpy as np
 import torch
 from torchrl.envs import EnvBase, GymWrapper, TransformedEnv
 
@@ -81,6 +82,8 @@ def make_env(task: TaskConfig, seed: int, *, render: Drawing | None = None) -> E
         simulator = observing_image(simulator)
     else:
         simulator = observing_vector(simulator, flatten=task.flatten)
+    if task.action_rate:
+        simulator = ActionRatePenalty(simulator, task.action_rate)
     if render is not None:
         simulator = PictureRecorder(simulator, render)
     try:
@@ -98,6 +101,55 @@ def make_env(task: TaskConfig, seed: int, *, render: Drawing | None = None) -> E
         return env
     generator = torch.Generator().manual_seed(seed + NOISE_SEED)
     return TransformedEnv(env, ObservationNoise(task.noise_scale, generator=generator))
+
+
+class ActionRatePenalty(gymnasium.Wrapper[Any, Any, Any, Any]):
+    r"""Subtracts a penalty on the change of the action from the reward.
+
+    .. math::
+        r_t - \frac{w}{A} \sum_i \Big( \frac{a_{t,i} - a_{t-1,i}}{h_i} \Big)^2
+
+    with half the range :math:`h_i` of each action; the first reward of an episode is unchanged.
+
+    Args:
+        env (gymnasium.Env): an environment with bounded actions.
+        weight (float): :math:`w`. Larger values give smoother actions and lower returns.
+
+    Raises:
+        UserError: the actions have no bounds.
+
+    Examples:
+        >>> env = ActionRatePenalty(gymnasium.make("Pendulum-v1"), weight=1.0)
+        >>> _ = env.reset(seed=0)
+        >>> rewards = [env.step(np.array([u], np.float32))[1] for u in (2.0, 2.0, -2.0)]
+        >>> _ = env.env.reset(seed=0)
+        >>> own = [env.env.step(np.array([u], np.float32))[1] for u in (2.0, 2.0, -2.0)]
+        >>> [round(float(a - b), 6) for a, b in zip(own, rewards)]
+        [0.0, 0.0, 4.0]
+    """
+
+    def __init__(self, env: Env, weight: float) -> None:
+        super().__init__(env)
+        space = env.action_space
+        if not isinstance(space, gymnasium.spaces.Box) or not space.is_bounded():
+            raise UserError(
+                f"Expected bounded actions with task.action_rate={weight:g}, got {space}. Set "
+                "task.action_rate=0."
+            )
+        self._weight, self._half_range = weight, (space.high - space.low) / 2
+        self._previous: Any = None
+
+    def reset(self, **options: Any) -> Any:
+        self._previous = None
+        return self.env.reset(**options)
+
+    def step(self, action: Any) -> Any:
+        observation, reward, *rest = self.env.step(action)
+        if self._previous is not None:
+            change = (action - self._previous) / self._half_range
+            reward = float(reward) - self._weight * float(np.mean(np.square(change)))
+        self._previous = np.array(action)
+        return observation, reward, *rest
 
 
 def time_limit(task: TaskConfig) -> int:

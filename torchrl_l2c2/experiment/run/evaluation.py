@@ -176,7 +176,7 @@ def evaluate_task(
     The process's random generators and number of threads are left as they are found.
     """
     with ProcessState(seed, threads):  # Seeding an environment seeds the process, too.
-        env = make_env(task, seed)
+        env = make_env(task.for_test(), seed)
         result = evaluate_policy(policy, env, episodes, max_steps=time_limit(task), **options)
         env.close()
     return result
@@ -272,7 +272,7 @@ class LateTests:
 
     def _make_collector(self) -> EpisodeCollector:
         return EpisodeCollector(
-            make_env(self._task, self._seed),
+            make_env(self._task.for_test(), self._seed),
             self._policy,
             frames_per_batch=time_limit(self._task),
             compile_policy=self._compile,

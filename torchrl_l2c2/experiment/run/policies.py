@@ -79,7 +79,7 @@ def load_policy(
     config = replace(config, device="cpu")
     _check_origin(config.task.env_id, folder)
     noise = config.task.noise_scale if noise_scale is None else noise_scale
-    task = replace(config.task, noise_scale=noise)
+    task = replace(config.task.for_test(), noise_scale=noise)
     with torch.random.fork_rng(devices=[]):  # Weights are drawn, before they are read.
         env = make_env(task, seed, render=render)
         agent = make_agent(config, env)

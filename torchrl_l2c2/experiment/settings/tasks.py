@@ -8,7 +8,12 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 from pydantic_core import ArgsKwargs
 
-from torchrl_l2c2.experiment.settings.fields import CHANGES_NO_NUMBERS, SettingError, settings
+from torchrl_l2c2.experiment.settings.fields import (
+    CHANGES_NO_NUMBERS,
+    SettingError,
+    neutral,
+    settings,
+)
 
 SWINGUP = "pybullet_envs_gymnasium:InvertedPendulumSwingupBulletEnv-v0"
 TASKS: dict[str, TaskConfig] = {}  # by their names; filled below
@@ -89,6 +94,14 @@ class TaskConfig:
         "values from 0 to 1; the replay buffer keeps two of them for every transition, as floats",
     )
 
+    action_rate: float = Field(
+        default=0.0,
+        ge=0,
+        description="weight of an action-rate penalty: training rewards minus this times the mean "
+        "squared change of the action, in halves of its range; tests have the task's own rewards",
+        json_schema_extra=neutral(0.0),
+    )
+
     @model_validator(mode="before")
     @classmethod
     def _check_env_id_given(cls, given: ArgsKwargs) -> ArgsKwargs:
@@ -117,6 +130,10 @@ class TaskConfig:
     def budget(self) -> Budget:
         """How long to train."""
         return Budget(self.episodes) if self.frames is None else Budget(self.frames, "frame")
+
+    def for_test(self) -> TaskConfig:
+        """The task with its own rewards."""
+        return replace(self, action_rate=0.0)
 
     def for_episodes(self, episodes: int) -> TaskConfig:
         """The task with a training of so many episodes."""
