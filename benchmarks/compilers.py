@@ -1,8 +1,8 @@
 """Compares this package's compiler of an update with ``torch.compile``.
 
-``python -m benchmarks.compilers`` prints, for PPO-RPE and SAC with L2C2, the seconds until the
-first update with an empty and with a filled compiler cache, and the time of an update, measured in
-turns in one process. ``torch.compile`` runs with ``torch.compiler.skip_all_guards_unsafe``, the
+``python -m benchmarks.compilers`` prints, for PPO-RPE and SAC with L2C2, the seconds of the first
+update with an empty and with a filled compiler cache, and the time of a later update; processes of
+the two compilers alternate. ``torch.compile`` runs with ``torch.compiler.skip_all_guards_unsafe``, the
 public filter that removes all checks of a call.
 """
 
@@ -59,57 +59,60 @@ def make_update(algorithm: str, compiler: str) -> Callable[[], object]:
     return lambda: compiled(True, *draw)
 
 
-def seconds_to_first_update(algorithm: str, compiler: str, cache: str) -> float:
-    """Seconds of the first update in a process of its own, without imports."""
+def measure(algorithm: str, compiler: str) -> None:
+    """Prints the seconds of the first update, and the median microseconds of later ones."""
+    update = make_update(algorithm, compiler)
+    started = time.perf_counter()
+    update()
+    first = time.perf_counter() - started
+    times = []
+    for _ in range(UPDATES):
+        started = time.perf_counter()
+        update()
+        times.append(time.perf_counter() - started)
+    print(json.dumps({"first_s": first, "update_us": 1e6 * statistics.median(times)}))
+
+
+def in_a_process(algorithm: str, compiler: str, cache: str) -> dict[str, float]:
+    """The numbers of :func:`measure`, from a process of its own."""
     done = subprocess.run(
-        [sys.executable, "-m", "benchmarks.compilers", "--first", algorithm, compiler],
+        [sys.executable, "-m", "benchmarks.compilers", "--one", algorithm, compiler],
         env={**os.environ, "TORCHINDUCTOR_CACHE_DIR": cache},
         capture_output=True,
         text=True,
         check=True,
     )
-    return float(done.stdout.splitlines()[-1])
+    found: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
+    return found
 
 
 def compare(algorithm: str, rounds: int) -> dict[str, dict[str, float]]:
-    """Times of both compilers for an algorithm's update."""
-    found: dict[str, dict[str, float]] = {}
-    updates = {}
-    for compiler in COMPILERS:
-        with tempfile.TemporaryDirectory() as cache:
-            cold, warm = (seconds_to_first_update(algorithm, compiler, cache) for _ in range(2))
-        found[compiler] = {"first_cold_s": cold, "first_warm_s": warm}
-        torch.manual_seed(0)
-        updates[compiler] = make_update(algorithm, compiler)
-        updates[compiler]()
-    times: dict[str, list[float]] = {compiler: [] for compiler in COMPILERS}
+    """Medians of both compilers for an algorithm's update; the processes alternate."""
+    found: dict[str, list[tuple[float, float, float]]] = {name: [] for name in COMPILERS}
     for _ in range(rounds):
-        for compiler, update in updates.items():
-            started = time.perf_counter()
-            for _ in range(UPDATES):
-                update()
-            times[compiler].append((time.perf_counter() - started) / UPDATES * 1e6)
-    for compiler, each in times.items():
-        found[compiler]["update_us"] = statistics.median(each)
-    return found
+        for compiler in COMPILERS:
+            with tempfile.TemporaryDirectory() as cache:
+                cold, warm = (in_a_process(algorithm, compiler, cache) for _ in range(2))
+            found[compiler].append((cold["first_s"], warm["first_s"], warm["update_us"]))
+    names = ("first_cold_s", "first_warm_s", "update_us")
+    return {
+        compiler: dict(zip(names, map(statistics.median, zip(*each, strict=True)), strict=True))
+        for compiler, each in found.items()
+    }
 
 
 def main() -> None:
     """Prints the comparison as JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rounds", type=int, default=10)
+    parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--algorithms", nargs="+", default=["ppo_rpe", "sac"])
-    parser.add_argument("--first", nargs=2, metavar=("ALGORITHM", "COMPILER"))
+    parser.add_argument("--one", nargs=2, metavar=("ALGORITHM", "COMPILER"))
     chosen = parser.parse_args()
     torch.set_num_threads(1)
-    if chosen.first:
-        update = make_update(*chosen.first)
-        started = time.perf_counter()
-        update()
-        print(time.perf_counter() - started)
+    if chosen.one:
+        measure(*chosen.one)
         return
-    found = {name: compare(name, chosen.rounds) for name in chosen.algorithms}
-    print(json.dumps(found, indent=2))
+    print(json.dumps({name: compare(name, chosen.rounds) for name in chosen.algorithms}, indent=2))
 
 
 if __name__ == "__main__":

@@ -121,7 +121,7 @@ def test_settings_and_components_have_the_same_defaults(settings, component):
 def test_every_comparison_is_made_of_valid_runs(name, regularizer):
     """With the task and sizes that its file says."""
     # Its sweep chooses the tasks and the algorithms.
-    chosen = ["task=pendulum", "algorithm=ppo"] if name.startswith("field_") else []
+    chosen = ["task=pendulum", "algorithm=ppo"] if name.startswith(("field_", "filters")) else []
     config = ExperimentConfig.from_dict(
         composed(f"experiment={name}", f"regularizer={regularizer}", *chosen)
     )
@@ -133,6 +133,7 @@ def test_every_comparison_is_made_of_valid_runs(name, regularizer):
         "field_table": ("Pendulum-v1", "ppo", 64),
         "cartpole": ("CartPole-v1", "dqn", 64),
         "new_tasks": ("Reacher-v5", "ppo", 64),
+        "filters": ("Pendulum-v1", "ppo", 64),
     }[name]
     if algorithm == "ppo_rpe":
         assert config.algorithm.tau == (0.5 if name == "table3_tau" else 0.1)
@@ -417,7 +418,10 @@ def test_settings_survive_a_round_trip():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"task": {"episode": 3}}, "task.episode is not a setting; here there are env_id, episode"),
+        (
+            {"task": {"episode": 3}},
+            "task.episode is not a setting; here there are action_rate, env_id",
+        ),
         ({"task": {"episodes": 0}}, "task.episodes must be greater than or equal to 1, got 0"),
         ({"task": {"noise_scale": -1.0}}, "task.noise_scale must be greater than or equal to 0"),
         ({"regularizer": {"name": "lipsnet"}}, "regularizer.name must be one of .*'l2c2'"),
