@@ -2,8 +2,8 @@
 
 ``python -m benchmarks.compilers`` prints, for PPO-RPE and SAC with L2C2, the seconds of the first
 update with an empty and with a filled compiler cache, and the time of a later update; processes of
-the two compilers alternate. ``torch.compile`` runs with ``torch.compiler.skip_all_guards_unsafe``, the
-public filter that removes all checks of a call.
+the two compilers alternate. ``torch.compile`` runs with the public filter
+``torch.compiler.skip_all_guards_unsafe``, which removes all checks of a call.
 """
 
 from __future__ import annotations
