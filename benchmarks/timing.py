@@ -25,6 +25,7 @@ PACKAGES = (
     "stable-baselines3",
     "sbx-rl",
     "jax",
+    "brax",
 )
 
 
@@ -83,6 +84,14 @@ def alternate(
     Returns:
         dict: the median over the rounds of seconds per unit.
     """
+    seconds = take_turns(actions, repeats=repeats, calls=calls, warm_up=warm_up)
+    return {name: statistics.median(values) for name, values in seconds.items()}
+
+
+def take_turns(
+    actions: Mapping[str, Callable[[], object]], *, repeats: int, calls: int = 1, warm_up: int = 1
+) -> dict[str, list[float]]:
+    """Times actions as :func:`alternate` does; returns the seconds per unit of every round."""
     for action in actions.values():
         for _ in range(warm_up):
             action()
@@ -95,7 +104,7 @@ def alternate(
                 done = action()
                 units += done if isinstance(done, int) else 1
             seconds[name].append((time.perf_counter() - start) / units)
-    return {name: statistics.median(values) for name, values in seconds.items()}
+    return seconds
 
 
 def machine() -> dict[str, Any]:

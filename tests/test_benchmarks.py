@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from benchmarks import cost
 from benchmarks.setups import matrix_products
 from benchmarks.timing import Row, alternate, to_markdown
 from benchmarks.zoo import arguments
@@ -128,3 +129,38 @@ def test_a_preset_goes_to_stable_baselines_as_the_zoo_has_it():
     baselines = arguments("hopper_v5", "baselines")
     assert (baselines["ppo"]["n_steps"], baselines["ppo"]["vf_coef"]) == (2048, 0.5)
     assert baselines["linear"] and not hopper["linear"]
+
+
+def test_the_cost_command_writes_every_regularizer(tmp_path, capsys):
+    """With the baseline first, each fraction, and less memory with the smaller fraction."""
+    path = tmp_path / "cost.json"
+    cost.main(["--quick", "--fractions", "1", "0.25", "--json", str(path)])
+    told, written = capsys.readouterr().out, json.loads(path.read_text())
+    rows = written["rows"]
+    names = [cost.BASELINE, *cost.VARIANTS, *cost.VARIANTS]
+    assert [row["method"] for row in rows] == names
+    assert {row["method"]: (row["time"], row["memory"]) for row in rows[:1]} == {"baseline": (1, 1)}
+    for whole, quarter in zip(rows[1 : len(cost.VARIANTS) + 1], rows[-8:], strict=True):
+        assert (whole["fraction"], quarter["fraction"]) == (1.0, 0.25)
+        assert whole["memory"] > quarter["memory"] > 1
+        assert f"64 states, {whole['method']}, fraction 1:" in told
+    assert written["quick"] and written["device"] == "cpu" and "name" not in written["machine"]
+    assert written["machine"]["versions"]["torch"] and written["machine"]["commit"]
+    assert written["command"].startswith("python -m benchmarks.cost --quick")
+
+
+def test_the_cost_command_refuses_a_device_without_a_measure_of_memory():
+    """Its memory would not be comparable."""
+    with pytest.raises(SystemExit, match=r"Expected --device cpu or cuda, got 'mps'\."):
+        cost.main(["--device", "mps"])
+
+
+def test_saved_tensors_count_while_they_are_saved():
+    """A storage once, whoever shares it; what is freed and ignored not at all."""
+    x = torch.randn(256, requires_grad=True)
+    shared = torch.randn(2, 256)
+    with cost.SavedTensors([x]) as saved:
+        for _ in range(3):
+            (x * shared[0] * x * shared[1]).sum().backward()
+    # `shared`, and the first product, as a factor of the next one.
+    assert saved.peak == 4 * (512 + 256)
