@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import importlib
 import inspect
 import math
 import re
@@ -745,3 +746,14 @@ def test_a_checkpoint_loads_into_rsl_rls_own_ppo(
         plain.load(str(tmp_path / "l2c2" / "model_1.pt"), strict=True)
         found = plain.get_inference_policy()(observed)
     assert torch.equal(found, expected) and not torch.equal(before, expected)
+
+
+def test_an_rsl_rl_that_is_too_old_is_refused_with_the_version_needed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Version 5.0.1, which an Isaac Lab pins, has no such extension."""
+    monkeypatch.delattr("rsl_rl.extensions.Symmetry")
+    monkeypatch.setattr("importlib.metadata.version", lambda name: "5.0.1")
+    said = r"Expected rsl-rl-lib 5\.4\.1 or newer.*, got 5\.0\.1\. Run: pip install [^\n]*$"
+    with pytest.raises(ImportError, match=said):
+        importlib.reload(rsl)
