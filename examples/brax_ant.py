@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 
 import torch
+from tensordict import TensorDict
 from torchrl.envs import BraxEnv, Compose, RewardScaling, StepCounter, TransformedEnv, VecNormV2
 from torchrl.objectives import ClipPPOLoss, KLAdaptiveLR
 from torchrl.objectives.value import GAE
@@ -57,7 +58,7 @@ def main() -> None:
             for _ in range(options.steps):
                 step, state = env.step_and_maybe_reset(actor(state))
                 steps.append(step.exclude("state", ("next", "state")))  # JAX's own, which is large
-            rollout = torch.stack(steps, 1)
+            rollout = TensorDict.stack(steps, 1)
             advantage(rollout)
         rows = rollout.reshape(-1)
         for _ in range(EPOCHS):
