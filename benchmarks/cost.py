@@ -1,9 +1,10 @@
 """Time and memory of each regularizer with PPO: ``python -m benchmarks.cost --json FILE``.
 
 A step is TorchRL's ``ClipPPOLoss`` and its gradients on one minibatch, without the optimizer, with
-networks of the size that robots are trained with. In each round every variant has its turn, and its
-time is divided by the time of the loss without a regularizer in the same round, so other load on
-the machine affects both. The table has the medians of these ratios.
+networks of the size that robots are trained with. Each variant takes turns with the loss without a
+regularizer, and the times of a round are divided by one another, so other load on the machine
+affects both. The table has the medians of these ratios; the first row divides the baseline by
+itself. Times on the CPU are processor times of one thread.
 
 Memory on CUDA is the peak that torch.cuda.max_memory_allocated reports for one step, without what
 is allocated before it. On the CPU it is the largest total size of the tensors that are saved for
@@ -18,6 +19,7 @@ import json
 import os
 import statistics
 import sys
+import time
 import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -237,7 +239,7 @@ def costs(states: int, device: str, rounds: int, calls: int, fractions: list[flo
     Args:
         states: number of states in the minibatch.
         device: a device of torch.
-        rounds: rounds in which every variant has its turn.
+        rounds: rounds of each variant and the baseline.
         calls: steps in a turn.
         fractions: shares of the states that the regularizers use.
     """
@@ -266,13 +268,14 @@ def costs(states: int, device: str, rounds: int, calls: int, fractions: list[flo
 
         return steps_of_a_turn
 
-    turns = {str(key): turn(step) for key, step in steps.items()}
-    seconds = take_turns(turns, repeats=rounds, warm_up=0)
-    plain = seconds[str((BASELINE, 1.0))]
+    # On the CPU other processes do not count, as they would by the clock on the wall.
+    clock = time.perf_counter if device.startswith("cuda") else time.process_time
+    plain, plain_memory = turn(steps[BASELINE, 1.0]), memory[BASELINE, 1.0]
     rows = []
-    for key in steps:
-        own = seconds[str(key)]
-        ratios = [a / b for a, b in zip(own, plain, strict=True)]
+    for key, step in steps.items():
+        pair = {"plain": plain, "own": turn(step)}
+        seconds = take_turns(pair, repeats=rounds, warm_up=0, clock=clock)
+        ratios = [own / base for own, base in zip(seconds["own"], seconds["plain"], strict=True)]
         low, middle, high = quartiles(ratios)
         rows.append(
             Cost(
@@ -281,8 +284,8 @@ def costs(states: int, device: str, rounds: int, calls: int, fractions: list[flo
                 time=middle,
                 time_low=low,
                 time_high=high,
-                milliseconds=1e3 * statistics.median(own),
-                memory=memory[key] / memory[BASELINE, 1.0],
+                milliseconds=1e3 * statistics.median(seconds["own"]),
+                memory=memory[key] / plain_memory,
                 memory_mib=memory[key] / 2**20,
             )
         )

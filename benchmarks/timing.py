@@ -89,7 +89,12 @@ def alternate(
 
 
 def take_turns(
-    actions: Mapping[str, Callable[[], object]], *, repeats: int, calls: int = 1, warm_up: int = 1
+    actions: Mapping[str, Callable[[], object]],
+    *,
+    repeats: int,
+    calls: int = 1,
+    warm_up: int = 1,
+    clock: Callable[[], float] = time.perf_counter,
 ) -> dict[str, list[float]]:
     """Times actions as :func:`alternate` does; returns the seconds per unit of every round."""
     for action in actions.values():
@@ -99,11 +104,11 @@ def take_turns(
     for _ in range(repeats):
         for name, action in actions.items():
             units = 0
-            start = time.perf_counter()
+            start = clock()
             for _ in range(calls):
                 done = action()
                 units += done if isinstance(done, int) else 1
-            seconds[name].append((time.perf_counter() - start) / units)
+            seconds[name].append((clock() - start) / units)
     return seconds
 
 

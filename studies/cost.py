@@ -19,6 +19,9 @@ PAGE = ROOT / "docs" / "isaac_lab.md"
 MEASURED = ROOT / "results" / "cost.json"
 
 
+_TIMES = {"cpu": "processor time of one thread", "cuda": "time by the clock"}
+
+
 def cost_table(measured: Mapping[str, Any]) -> str:
     """The table as Markdown, with its command, commit, machine and versions.
 
@@ -52,10 +55,10 @@ def cost_table(measured: Mapping[str, Any]) -> str:
             "",
             *(f"| {' | '.join(row)} |" for row in table),
             "",
-            "Each number is a multiple of the baseline's: the median over "
-            f"{measured['rounds']} rounds in which all variants take turns, with quartiles in "
-            "parentheses. The baseline's own numbers are in ms and MiB. Memory: "
-            f"{measured['memory']}. {networks['observations']} observations, "
+            "Each number is a multiple of the baseline's; the baseline's own numbers are in ms and "
+            f"MiB. Time: {_TIMES[measured['device']]} for the loss and its gradients, the median of "
+            f"{measured['rounds']} rounds in turns with the baseline, with quartiles in "
+            f"parentheses. Memory: {measured['memory']}. {networks['observations']} observations, "
             f"{networks['actions']} actions, layers {layers} for actor and critic.",
         ]
     )
@@ -65,16 +68,17 @@ def _cells(rows: list[Any]) -> list[str]:
     """Times and memories; the baseline's are absolute."""
     if rows[0]["method"] == "baseline":
         return [
-            *(
-                f"{row['milliseconds']:,.{0 if row['milliseconds'] > 20 else 2}f} ms"
-                for row in rows
-            ),
+            *(_milliseconds(row) for row in rows),
             *(f"{row['memory_mib']:,.0f} MiB" for row in rows),
         ]
     return [
         *(f"{row['time']:.2f} ({row['time_low']:.2f}, {row['time_high']:.2f})" for row in rows),
         *(f"{row['memory']:.2f}" for row in rows),
     ]
+
+
+def _milliseconds(row: Mapping[str, Any]) -> str:
+    return f"{row['milliseconds']:,.{0 if row['milliseconds'] > 20 else 2}f} ms"
 
 
 def main() -> None:

@@ -139,7 +139,7 @@ def test_the_cost_command_writes_every_regularizer(tmp_path, capsys):
     rows = written["rows"]
     names = [cost.BASELINE, *cost.VARIANTS, *cost.VARIANTS]
     assert [row["method"] for row in rows] == names
-    assert {row["method"]: (row["time"], row["memory"]) for row in rows[:1]} == {"baseline": (1, 1)}
+    assert rows[0]["memory"] == 1 and all(row["time"] > 0 for row in rows)
     for whole, quarter in zip(rows[1 : len(cost.VARIANTS) + 1], rows[-8:], strict=True):
         assert (whole["fraction"], quarter["fraction"]) == (1.0, 0.25)
         assert whole["memory"] > quarter["memory"] > 1
