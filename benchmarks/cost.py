@@ -331,6 +331,8 @@ def main(arguments: list[str] | None = None) -> None:
     """Measures, prints and writes the table."""
     options = _parse(arguments)
     given = sys.argv[1:] if arguments is None else arguments
+    # Folders of this machine are nobody else's.
+    given = [Path(each).name if Path(each).is_absolute() else each for each in given]
     kind = options.device.split(":")[0]
     if kind not in MEASURES:
         raise SystemExit(f"Expected --device cpu or cuda, got {options.device!r}.")

@@ -192,7 +192,8 @@ def _commit() -> str:
             describe, cwd=Path(__file__).parent, capture_output=True, text=True, check=True
         )
     except (OSError, subprocess.CalledProcessError):
-        return "unknown"
+        # A copy without the repository can be told its commit.
+        return os.environ.get("COMMIT", "unknown")
     return told.stdout.strip()
 
 

@@ -56,7 +56,7 @@ def cost_table(measured: Mapping[str, Any]) -> str:
             *(f"| {' | '.join(row)} |" for row in table),
             "",
             "Each number is a multiple of the baseline's; the baseline's own numbers are in ms and "
-            f"MiB. Time: {_TIMES[measured['device']]} for the loss and its gradients, the median of "
+            f"MiB. Time: {_TIMES[measured['device']]} for the loss and its gradients, median of "
             f"{measured['rounds']} rounds in turns with the baseline, with quartiles in "
             f"parentheses. Memory: {measured['memory']}. {networks['observations']} observations, "
             f"{networks['actions']} actions, layers {layers} for actor and critic.",
