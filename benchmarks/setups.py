@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from importlib.util import find_spec
 from typing import Any
 
 import torch
@@ -21,6 +22,7 @@ from torchrl_l2c2.experiment import (
     PPORPEConfig,
     PrioritizedReplayConfig,
     TaskConfig,
+    UniformReplayConfig,
 )
 from torchrl_l2c2.experiment.agents.optimizers import make_optimizer
 from torchrl_l2c2.experiment.learn.update import ReplayUpdate, make_update
@@ -57,6 +59,11 @@ def paper_config(effort: Effort) -> ExperimentConfig:
     )
 
 
+def pendulum_task(effort: Effort) -> TaskConfig:
+    """Gymnasium's Pendulum, for machines without PyBullet."""
+    return TaskConfig("pendulum", "Pendulum-v1", max_steps=effort.steps, episodes=1)
+
+
 def play_episode(experiment: Experiment) -> Callable[[], int]:
     """Training of one more episode, as a function; returns its frames."""
 
@@ -71,13 +78,16 @@ def play_episode(experiment: Experiment) -> Callable[[], int]:
 def updates(
     effort: Effort, size: int, regularizer: str, compile: bool, device: str = "cpu"
 ) -> Callable[[], object]:
-    """Updates of a new agent with one batch."""
+    """Updates of a new agent with one batch; on CUDA of one drawn uniformly, on any torch."""
+    draws = PrioritizedReplayConfig if device == "cpu" else UniformReplayConfig
     config = dataclasses.replace(
         paper_config(effort),
         regularizer=REGULARIZERS[regularizer],
-        replay=PrioritizedReplayConfig(capacity=max(10_000, size), batch_size=size),
+        replay=draws(capacity=max(10_000, size), batch_size=size),
         compile=False,
     )
+    if device != "cpu" and find_spec("pybullet") is None:
+        config = dataclasses.replace(config, task=pendulum_task(effort))
     experiment = Experiment(config)
     learner, agent = experiment.learner, experiment.agent
     learner.remember(experiment.player.collector.rollout())

@@ -82,14 +82,14 @@ def main(arguments: list[str] | None = None) -> None:
         for row in getattr(import_module(f"benchmarks.{module}"), function)(effort):
             tqdm.write(to_text(row))
             rows.append(row)
-    result = {
-        "machine": where,
-        "quick": options.quick,
-        "minutes": (time.monotonic() - started) / 60,
-        "rows": [row.to_dict() for row in rows],
-    }
-    if options.json:
-        options.json.write_text(json.dumps(result, indent=2) + "\n")
+            result = {
+                "machine": where,
+                "quick": options.quick,
+                "minutes": (time.monotonic() - started) / 60,
+                "rows": [row.to_dict() for row in rows],
+            }
+            if options.json:  # After each row: what is interrupted keeps the others.
+                options.json.write_text(json.dumps(result, indent=2) + "\n")
     if options.markdown:
         given = sys.argv[1:] if arguments is None else arguments
         command = " ".join(("python -m benchmarks.speed", *given))

@@ -25,6 +25,7 @@ PACKAGES = (
     "stable-baselines3",
     "sbx-rl",
     "jax",
+    "brax",
 )
 
 
@@ -83,6 +84,19 @@ def alternate(
     Returns:
         dict: the median over the rounds of seconds per unit.
     """
+    seconds = take_turns(actions, repeats=repeats, calls=calls, warm_up=warm_up)
+    return {name: statistics.median(values) for name, values in seconds.items()}
+
+
+def take_turns(
+    actions: Mapping[str, Callable[[], object]],
+    *,
+    repeats: int,
+    calls: int = 1,
+    warm_up: int = 1,
+    clock: Callable[[], float] = time.perf_counter,
+) -> dict[str, list[float]]:
+    """Times actions as :func:`alternate` does; returns the seconds per unit of every round."""
     for action in actions.values():
         for _ in range(warm_up):
             action()
@@ -90,12 +104,12 @@ def alternate(
     for _ in range(repeats):
         for name, action in actions.items():
             units = 0
-            start = time.perf_counter()
+            start = clock()
             for _ in range(calls):
                 done = action()
                 units += done if isinstance(done, int) else 1
-            seconds[name].append((time.perf_counter() - start) / units)
-    return {name: statistics.median(values) for name, values in seconds.items()}
+            seconds[name].append((clock() - start) / units)
+    return seconds
 
 
 def machine() -> dict[str, Any]:
@@ -178,7 +192,8 @@ def _commit() -> str:
             describe, cwd=Path(__file__).parent, capture_output=True, text=True, check=True
         )
     except (OSError, subprocess.CalledProcessError):
-        return "unknown"
+        # A copy without the repository can be told its commit.
+        return os.environ.get("COMMIT", "unknown")
     return told.stdout.strip()
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from functools import partial
+from importlib.util import find_spec
 
 import torch
 
@@ -88,8 +89,9 @@ def _smoothing_row(
 
 def cuda_rows(effort: Effort) -> Iterable[Row]:
     """The update on a CUDA device: eager, and compiled into CUDA graphs."""
+    where = "" if find_spec("pybullet") else " of Pendulum"
     for size in (32, 1024, 16384):
-        name = f"eager update / compiled update with CUDA graphs, batch {size}"
+        name = f"eager update / compiled update with CUDA graphs, batch {size}{where}"
         if not torch.cuda.is_available():
             yield Row("cuda", name, note="not measured: no CUDA device")
             continue

@@ -10,9 +10,13 @@ from pathlib import Path
 import pytest
 import torch
 
+from benchmarks import cost
+from benchmarks import gpu as benchmarks_gpu
 from benchmarks.setups import matrix_products
 from benchmarks.timing import Row, alternate, to_markdown
 from benchmarks.zoo import arguments
+from studies import gpu
+from studies.gpu import NOT_MEASURED
 
 REPOSITORY = Path(__file__).parent.parent
 WHERE = {
@@ -128,3 +132,110 @@ def test_a_preset_goes_to_stable_baselines_as_the_zoo_has_it():
     baselines = arguments("hopper_v5", "baselines")
     assert (baselines["ppo"]["n_steps"], baselines["ppo"]["vf_coef"]) == (2048, 0.5)
     assert baselines["linear"] and not hopper["linear"]
+
+
+def test_the_cost_command_writes_every_regularizer(tmp_path, capsys):
+    """With the baseline first, each fraction, and less memory with the smaller fraction."""
+    path = tmp_path / "cost.json"
+    cost.main(["--quick", "--fractions", "1", "0.25", "--json", str(path)])
+    told, written = capsys.readouterr().out, json.loads(path.read_text())
+    rows = written["rows"]
+    names = [cost.BASELINE, *cost.VARIANTS, *cost.VARIANTS]
+    assert [row["method"] for row in rows] == names
+    assert rows[0]["memory"] == 1 and all(row["time"] > 0 for row in rows)
+    for whole, quarter in zip(rows[1 : len(cost.VARIANTS) + 1], rows[-8:], strict=True):
+        assert (whole["fraction"], quarter["fraction"]) == (1.0, 0.25)
+        assert whole["memory"] > quarter["memory"] > 1
+        assert f"64 states, {whole['method']}, fraction 1:" in told
+    assert written["quick"] and written["device"] == "cpu" and "name" not in written["machine"]
+    assert written["machine"]["versions"]["torch"] and written["machine"]["commit"]
+    assert written["command"].startswith("python -m benchmarks.cost --quick")
+
+
+def test_the_cost_command_refuses_a_device_without_a_measure_of_memory():
+    """Its memory would not be comparable."""
+    with pytest.raises(SystemExit, match=r"Expected --device cpu or cuda, got 'mps'\."):
+        cost.main(["--device", "mps"])
+
+
+def test_saved_tensors_count_while_they_are_saved():
+    """A storage once, whoever shares it; what is freed and ignored not at all."""
+    x = torch.randn(256, requires_grad=True)
+    shared = torch.randn(2, 256)
+    with cost.SavedTensors([x]) as saved:
+        for _ in range(3):
+            (x * shared[0] * x * shared[1]).sum().backward()
+    # `shared`, and the first product, as a factor of the next one.
+    assert saved.peak == 4 * (512 + 256)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_the_cost_command_measures_on_cuda(tmp_path):
+    """Less memory with the smaller fraction, by the allocator's peak."""
+    path = tmp_path / "cost.json"
+    cost.main(["--device", "cuda", "--states", "4096", "--rounds", "1", "--json", str(path)])
+    rows = json.loads(path.read_text())["rows"]
+    for whole, quarter in zip(rows[1 : len(cost.VARIANTS) + 1], rows[-8:], strict=True):
+        assert whole["memory"] > quarter["memory"] > 1, whole["method"]
+
+
+@pytest.mark.slow
+def test_the_script_for_a_gpu_runs_its_parts_without_one(tmp_path):
+    """Tests are skipped; what is not there is said; the page has a section for each part."""
+    script = REPOSITORY / "benchmarks" / "gpu.sh"
+    done = subprocess.run(
+        [script, "--cpu", "--quick"],
+        env={
+            **os.environ,
+            "CUDA_VISIBLE_DEVICES": "",
+            "OUT": str(tmp_path),
+            "PYTHON": sys.executable,
+        },
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert [line.split(":")[0] for line in done.stdout.splitlines()] == [
+        "cost",
+        "tests",
+        "speed",
+        "brax",
+    ]
+    tests = json.loads((tmp_path / "tests.json").read_text())["tests"]
+    assert len(tests) > 5 and {test["outcome"] for test in tests} == {"skipped"}
+    gpu.main([str(tmp_path), "--output", str(tmp_path / "gpu.md")])
+    page = (tmp_path / "gpu.md").read_text()
+    assert NOT_MEASURED not in page and "no CUDA device" in page
+    assert "quick run, which say nothing" in page and "| L2C2 | 0.25 |" in page
+
+
+def test_a_training_is_stopped_at_its_limit_and_keeps_its_iterations(tmp_path, monkeypatch):
+    """The baseline ends, L2C2 hangs after its first iteration."""
+    example = tmp_path / "example.py"
+    example.write_text(
+        "import sys, time\n"
+        "print('1: reward 0.500, action variation 0.250')\n"
+        "if '--baseline' not in sys.argv:\n    time.sleep(60)\n"
+    )
+    monkeypatch.setattr(benchmarks_gpu, "EXAMPLE", example)
+    monkeypatch.setattr(benchmarks_gpu, "why_not", lambda given: "")
+    path = tmp_path / "brax.json"
+    benchmarks_gpu.main(["brax", "--json", str(path), "--seconds", "2", "--envs", "4"])
+    measured = json.loads(path.read_text())
+    assert [run["ended"] for run in measured["runs"]] == [True, False]
+    assert measured["command"] == "python examples/brax_ant.py --envs 4"
+    rows = gpu.brax_table(measured).splitlines()[-2:]
+    assert [row.split(" | ")[1] for row in rows] == ["1", "1, stopped"]
+    assert all(row.endswith("| 0.500 | 0.250 |") for row in rows)
+
+
+def test_the_page_of_a_gpu_names_what_was_not_measured(tmp_path):
+    """Of a folder with one part the others have no table; an empty folder is refused."""
+    with pytest.raises(FileNotFoundError, match=r"Expected results of .*gpu\.sh in .*, got none"):
+        gpu.gpu_page(tmp_path)
+    tests = [{"test": "test_it", "outcome": "passed", "seconds": 1.25}]
+    where = WHERE | {"cuda": "A card"}
+    (tmp_path / "tests.json").write_text(json.dumps({"machine": where, "tests": tests}))
+    page = gpu.gpu_page(tmp_path)
+    assert page.count(NOT_MEASURED) == 3 and "| `test_it` | passed | 1.2 |" in page
+    assert "commit abc1234, A card, Python 3" in page

@@ -13,8 +13,15 @@ import torch
 
 ROOT = Path(__file__).parents[1]
 # One plays what a run has exported, test_export.py; others are for rsl_rl, test_rsl_rl.py, for
-# mjlab, test_hosts.py, and for several processes, test_several_devices.py.
-ELSEWHERE = ("mjlab_cartpole", "onnx_policy", "rsl_rl_l2c2", "rsl_rl_points", "several_devices")
+# mjlab, test_hosts.py, for several processes, test_several_devices.py, and for Brax, below.
+ELSEWHERE = (
+    "brax_ant",
+    "mjlab_cartpole",
+    "onnx_policy",
+    "rsl_rl_l2c2",
+    "rsl_rl_points",
+    "several_devices",
+)
 EXAMPLES = sorted(p for p in (ROOT / "examples").glob("*.py") if p.stem not in ELSEWHERE)
 
 # Of those that make an update for every frame fewer than by themselves; one of them random ones.
@@ -67,4 +74,22 @@ def test_a_search_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_it_is_short(example: Path) -> None:
     """Under 80 lines, to be read in one go."""
+    assert len(example.read_text().splitlines()) < 80
+
+
+@pytest.mark.parametrize("method", [[], ["--baseline"]], ids=["l2c2", "baseline"])
+def test_brax_trains(
+    method: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On a small environment, with a finite reward and action variation in each iteration."""
+    pytest.importorskip("brax")
+    example = ROOT / "examples" / "brax_ant.py"
+    small = ["--env", "fast", "--envs", "4", "--steps", "6", "--iterations", "2"]
+    monkeypatch.setattr(sys, "argv", [str(example), *small, *method])
+    with torch.random.fork_rng():
+        runpy.run_path(str(example), run_name="__main__")
+    line = r"^(\d+): reward (\S+), action variation (\S+)$"
+    told = re.findall(line, capsys.readouterr().out, re.M)
+    assert [iteration for iteration, _, _ in told] == ["1", "2"]
+    assert all(math.isfinite(float(reward)) and float(change) > 0 for _, reward, change in told)
     assert len(example.read_text().splitlines()) < 80

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import importlib
+import inspect
 import math
 import re
 import runpy
@@ -678,3 +680,80 @@ def test_the_example_trains_and_compares(
         assert difference[column] == pytest.approx(regularized[column] - plain[column], abs=2e-3)
     for script in (EXAMPLE, EXAMPLE.with_stem("rsl_rl_points")):
         assert len(script.read_text().splitlines()) < 80
+
+
+def trained_runner(folder: Path, algorithm: dict[str, Any], **runner: Any) -> Any:
+    """A runner after two iterations, which have moved the normalization of the observations."""
+    from rsl_rl.runners import OnPolicyRunner
+    from rsl_rl_points import NoisyPoints
+
+    torch.manual_seed(0)
+    config = {**runner_config(**algorithm), **runner}
+    for network in ("actor", "critic"):
+        config[network]["obs_normalization"] = True
+    trained = OnPolicyRunner(NoisyPoints(8), config, log_dir=str(folder))
+    trained.learn(2)
+    return trained
+
+
+EXPORTED: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    "float32": ({}, {}),
+    "mixed precision": ({"use_mixed_precision": True}, {}),
+    "compiled": ({}, {"torch_compile_mode": "default"}),
+}
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["float32", "mixed precision", pytest.param("compiled", marks=pytest.mark.slow)],
+)
+def test_the_runners_exports_give_the_actions_of_its_policy(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As TorchScript and as ONNX, with the normalization of the observations."""
+    runtime = pytest.importorskip("onnxruntime")
+    monkeypatch.syspath_prepend(EXAMPLE.parent)
+    algorithm, options = EXPORTED[name]
+    if not algorithm.keys() <= inspect.signature(PPO).parameters.keys():
+        pytest.skip("this version of rsl_rl has no mixed precision")
+    runner = trained_runner(
+        tmp_path, {"regularizer_cfg": {"strength": 3.0}, **algorithm}, **options
+    )
+    runner.export_policy_to_jit(str(tmp_path))
+    runner.export_policy_to_onnx(str(tmp_path))
+
+    observed = TensorDict({"policy": 3 * torch.randn(5, 2) + 1}, [5])
+    with torch.inference_mode():
+        expected = runner.get_inference_policy()(observed)
+        jit = torch.jit.load(tmp_path / "policy.pt")(observed["policy"])
+    torch.testing.assert_close(jit, expected)
+    session = runtime.InferenceSession(str(tmp_path / "policy.onnx"))
+    for row, action in zip(observed["policy"], expected, strict=True):
+        (found,) = session.run(["actions"], {"obs": row[None].numpy()})
+        torch.testing.assert_close(torch.as_tensor(found[0]), action, rtol=1e-4, atol=1e-5)
+
+
+def test_a_checkpoint_loads_into_rsl_rls_own_ppo(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Strictly, with the same actions: playing a policy does not need this package."""
+    monkeypatch.syspath_prepend(EXAMPLE.parent)
+    runner = trained_runner(tmp_path / "l2c2", {})
+    plain = trained_runner(tmp_path / "plain", {"class_name": "PPO"})
+    observed = TensorDict({"policy": torch.randn(5, 2)}, [5])
+    with torch.inference_mode():
+        expected, before = (each.get_inference_policy()(observed) for each in (runner, plain))
+        plain.load(str(tmp_path / "l2c2" / "model_1.pt"), strict=True)
+        found = plain.get_inference_policy()(observed)
+    assert torch.equal(found, expected) and not torch.equal(before, expected)
+
+
+def test_an_rsl_rl_that_is_too_old_is_refused_with_the_version_needed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Version 5.0.1, which an Isaac Lab pins, has no such extension."""
+    monkeypatch.delattr("rsl_rl.extensions.Symmetry")
+    monkeypatch.setattr("importlib.metadata.version", lambda name: "5.0.1")
+    said = r"Expected rsl-rl-lib 5\.4\.1 or newer.*, got 5\.0\.1\. Run: pip install [^\n]*$"
+    with pytest.raises(ImportError, match=said):
+        importlib.reload(rsl)
