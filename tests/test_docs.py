@@ -111,7 +111,7 @@ def test_every_public_name_has_a_section_that_uses_it(components: dict[str, Any]
 
 
 WRITTEN = sorted(
-    path for folder in (ROOT, FOLDER, ROOT / "results") for path in folder.glob("*.md")
+    path for folder in (ROOT, FOLDER, ROOT / "results", ROOT / "studies") for path in folder.glob("*.md")
 )
 
 
