@@ -107,7 +107,9 @@ def parts() -> dict[str, tuple[str, str]]:
     return {
         Path(included).stem: (page.stem, (ROOT / included).read_text().splitlines()[0])
         for page in (ROOT / "docs").glob("*.md")
-        for included in re.findall(r"{include} \.\./((?:results|studies)/\S+\.md)", page.read_text())
+        for included in re.findall(
+            r"{include} \.\./((?:results|studies)/\S+\.md)", page.read_text()
+        )
     }
 
 
