@@ -66,7 +66,7 @@ def _node(chosen: Any) -> dict[str, Any]:
 
 
 def read(values: dict[str, Any]) -> tuple[ExperimentConfig, Path]:
-    """A run's settings, and its folder: what Hydra was told, or one below ``outputs``.
+    """Returns a run's settings and its folder, which Hydra names or which is below ``outputs``.
 
     Args:
         values (dict): the configuration.
@@ -110,7 +110,7 @@ def check_preset(values: dict[str, Any], name: str | None) -> None:
 
 
 def check_budget(config: ExperimentConfig, given: Sequence[str]) -> None:
-    """Refuses episodes beside frames, as a preset has them, by which the length goes then.
+    """Refuses a number of episodes if a preset sets a number of frames.
 
     Args:
         config (ExperimentConfig): the settings.
@@ -124,16 +124,16 @@ def check_budget(config: ExperimentConfig, given: Sequence[str]) -> None:
         raise SettingError(
             "task.episodes",
             f"is not read where there is task.frames, here {config.task.frames}: give "
-            "task.frames=... instead, or task.frames=null beside it.",
+            "task.frames=... instead, or add task.frames=null.",
         )
 
 
 def check_folders(chosen: Any, outputs: str) -> None:
-    """Refuses Hydra's names for where runs go, which a sweep does not read.
+    """Refuses Hydra's names of run folders, which a sweep does not read.
 
     Args:
-        chosen (HydraConf): what Hydra was told.
-        outputs (str): where the sweep's runs go.
+        chosen (HydraConf): Hydra's configuration.
+        outputs (str): folder of the sweep's runs.
 
     Raises:
         SettingError: with what to give instead.
@@ -267,7 +267,7 @@ def preset_used(config: ExperimentConfig) -> str | None:
     if algorithm not in KINDS:
         return (
             f"regularizer={regularizer.name}: there is no preset for {algorithm}; the settings are "
-            "the paper's, or given"
+            "given, or as in the paper"
         )
     begins = preset_settings(regularizer.name, algorithm)
     chosen = ", ".join(f"{name}={getattr(regularizer, name)}" for name in begins)

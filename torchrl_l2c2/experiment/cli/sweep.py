@@ -1,7 +1,7 @@
-"""What the jobs of a sweep and the process that began it tell each other, on whatever machines.
+"""Messages between the jobs of a sweep and the process that began it, on one or many machines.
 
-A folder beside the runs' holds it: whether the sweep is to stop, and which jobs run, have finished
-and failed. A file for each, as several machines cannot add to one.
+A folder next to the runs holds one file per message, because several machines cannot append to one
+file: a request to stop, and the jobs that run, have finished or have failed.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ GUARD = Path(__file__).with_name("guard.py")
 
 
 class Sweep:
-    """A sweep, as the process that began it and its jobs see it.
+    """A sweep, for the process that began it and for its jobs.
 
     Attributes:
-        begun_by: the process that began it, with its machine.
-        overrides: of its command.
-        begun_here: the one that this process began; ``None`` where it began none.
+        begun_by: machine and process that began it.
+        overrides: overrides of its command.
+        begun_here: the sweep that this process began, or ``None``.
         job_is_here: whether a job runs in this process.
     """
 
@@ -67,7 +67,7 @@ class Sweep:
         """The sweep that this job belongs to.
 
         Raises:
-            UserError: the launcher told the job nothing of it, or its folder is nowhere here.
+            UserError: The launcher did not pass the sweep on, or its folder is missing here.
         """
         if VARIABLE not in os.environ:
             raise UserError(f"the launcher passes no {VARIABLE} on to the jobs' environment.")
@@ -81,13 +81,13 @@ class Sweep:
 
     @property
     def is_remote(self) -> bool:
-        """Whether another program started this process, as a cluster does, and may do so again."""
+        """Checks whether another program, such as a cluster, started this process."""
         host, process = self.begun_by
         return host != socket.gethostname() or process not in (os.getpid(), os.getppid())
 
     @property
     def stopped_by(self) -> int | None:
-        """The signal that stopped it; ``None`` where it goes on."""
+        """The signal that stopped the sweep; ``None`` while it continues."""
         try:
             return int((self._folder / "stopped").read_text())
         except OSError:
@@ -95,7 +95,7 @@ class Sweep:
             return None if self._folder.is_dir() else signal.SIGTERM
 
     def stop(self, signal_number: int) -> None:
-        """No job is to begin any more; those that train are to save and end."""
+        """Stops the sweep: no job begins, and training jobs save and end."""
         if self.stopped_by is None:
             self._put("stopped", str(signal_number))
 
@@ -117,7 +117,7 @@ class Sweep:
         os.environ[VARIABLE] = json.dumps(told)
 
     def end(self) -> None:
-        """Nothing is told any more, and what still runs somewhere is to save and end."""
+        """Ends the messages; jobs that still run somewhere save and end."""
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def add_failure(self, number: int, job: str, reason: str) -> None:
@@ -255,7 +255,7 @@ class Sweep:
 
 
 class ShareSweep(Callback):
-    """Puts what a sweep's jobs tell beside its runs, where every machine that runs one sees it."""
+    """Keeps the messages of a sweep next to its runs, where every machine can read them."""
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         """Called by Hydra, once the folder is known and before its launcher starts.

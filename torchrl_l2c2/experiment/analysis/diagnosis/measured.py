@@ -52,14 +52,14 @@ class Diagnosis:
     """What was measured of a policy, for words and pictures.
 
     Attributes:
-        name: of the policy.
+        name: name of the policy.
         measures: means over the episodes: return, length, the paper's action variation, and the
             field's measures as :func:`~torchrl_l2c2.experiment.evaluate_policy` names them.
         actions: mean actions of the first episode, ``[T, A]``.
-        low: lower bounds of the actions, ``[A]``; of those that were seen, where there are none.
-        high: upper bounds, likewise.
+        low: lower bounds of the actions, ``[A]``; without bounds, the smallest actions.
+        high: upper bounds of the actions, ``[A]``; without bounds, the largest actions.
         bounded: whether the bounds are the task's.
-        observations: of the first episode, ``[T, F]``.
+        observations: observations of the first episode, ``[T, F]``.
         policy_lipschitz: local Lipschitz constants of the mean action there, ``[T]``; NaN where
             the observation does not move.
         value_lipschitz: those of the value function; ``None`` without one.
@@ -157,9 +157,9 @@ def diagnose(
         env (EnvBase): a single environment, seeded by who made it.
 
     Keyword Args:
-        name (str): what it is called beside others. Default ``"policy"``.
-        episodes (int): how many, at least 1. The measures are means over them, all else is of the
-            first. Default 3.
+        name (str): name of the policy, for comparisons. Default ``"policy"``.
+        episodes (int): number of episodes, at least 1. The measures are means over episodes; all
+            other results are from the first episode. Default 3.
         max_steps (int): longest episode. Default 1000.
         neighborhood (Neighborhood, optional): where local Lipschitz constants are taken. Default:
             ``Neighborhood()``.
@@ -314,7 +314,7 @@ def _means(played: Sequence[TensorDictBase], env: EnvBase) -> dict[str, float]:
 
 
 def _bounds(spec: TensorSpec, actions: Tensor) -> tuple[Tensor, Tensor, bool]:
-    """Of the task, else of what was seen."""
+    """Bounds of the task, or else of the played actions."""
     if isinstance(spec, Bounded) and spec.dtype.is_floating_point:
         low, high = (bound.flatten().float().cpu() for bound in (spec.space.low, spec.space.high))
         if low.isfinite().all() and high.isfinite().all():
