@@ -32,7 +32,7 @@ version = release = __version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
 myst_enable_extensions = ["dollarmath"]
-myst_heading_anchors = 3
+myst_heading_anchors = 4
 autodoc_member_order = "bysource"
 napoleon_use_ivar = True
 python_use_unqualified_type_names = True
@@ -87,7 +87,7 @@ def show_constructor(
 
 
 class LinksToParts(SphinxPostTransform):
-    """A link to a file of ``results/`` leads to the part of a page here that this file is."""
+    """Leads a link to a record to the page of the site that includes this record."""
 
     default_priority = 8  # Before MyST looks for the file among the pages.
 
@@ -103,11 +103,13 @@ class LinksToParts(SphinxPostTransform):
 
 @cache
 def parts() -> dict[str, tuple[str, str]]:
-    """By the name of a file of ``results/``, the page that it is a part of, and its heading."""
+    """The including page and the first heading of every record in ``results/`` and ``studies/``."""
     return {
         Path(included).stem: (page.stem, (ROOT / included).read_text().splitlines()[0])
         for page in (ROOT / "docs").glob("*.md")
-        for included in re.findall(r"{include} \.\./(results/\S+\.md)", page.read_text())
+        for included in re.findall(
+            r"{include} \.\./((?:results|studies)/\S+\.md)", page.read_text()
+        )
     }
 
 

@@ -123,7 +123,7 @@ def pages() -> dict[str, Page]:
         "results/td3.md": Page({"test": td3_test(), "choice": td3_choice()}),
         "results/field_gains.md": Page(dict(zip(("rivals", "one", "caps"), chosen, strict=True))),
         "results/targets.md": Page(dict(zip(("all", "swingup", "hopper"), targets, strict=True))),
-        "docs/protocol.md": Page({"reacher": reacher_by_seed(runs)}),
+        "studies/protocol.md": Page({"reacher": reacher_by_seed(runs)}),
     }
 
 

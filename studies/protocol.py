@@ -1,4 +1,4 @@
-"""Scores of readings of the paper: their distance from its table, by docs/protocol.md.
+"""Scores of readings of the paper: their distance from its table, by studies/protocol.md.
 
 ``python -m studies.protocol FOLDER... --length 200 300`` prints the scores of the runs below
 folders, as if their training had ended after 200 and after 300 episodes.

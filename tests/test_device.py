@@ -66,7 +66,7 @@ def test_a_copy_of_the_policy_acts_as_the_policy_does(monkeypatch, name):
 
 def test_a_device_that_is_not_there_is_refused():
     """With how many there are, before anything is made; and so is what is no device."""
-    with pytest.raises(SettingError, match=r"device must be one that PyTorch finds.*'cuda:99'"):
+    with pytest.raises(SettingError, match=r"device must be a device of this machine.*'cuda:99'"):
         Experiment(config("sac", device="cuda:99"))
     with pytest.raises(SettingError, match=r"device .*got 'gpu'"):
         config("sac", device="gpu")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -10,15 +12,19 @@ from unittest.mock import patch
 import pytest
 import torch
 from scipy.integrate import quad
+from tensordict import TensorDict
 from torchrl.objectives import SACLoss
 
 import torchrl_l2c2
 from torchrl_l2c2 import affinities
+from torchrl_l2c2.experiment.analysis.diagnosis import words
+from torchrl_l2c2.experiment.learn.learner import MEASURED_AFTER, TOLD_BELOW
 from torchrl_l2c2.presets import KINDS, PRESETS, presets_table
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs"
 COMPONENTS = FOLDER / "components.md"
+DISTANCES = FOLDER / "distances.md"
 # An HTML comment right before a block keeps it from being run.
 BLOCK = re.compile(r"(?P<skip><!-- no-test -->\s*)?^```python\n(?P<code>.*?)^```", re.M | re.S)
 PAGES = [
@@ -46,6 +52,12 @@ def components() -> dict[str, Any]:
     """What the page of the components has defined when all of it has run."""
     torch.manual_seed(0)
     return run_blocks(COMPONENTS)
+
+
+@pytest.fixture(scope="module")
+def mean_gain() -> Any:
+    """The function of the page of distances and gains."""
+    return run_blocks(DISTANCES)["mean_gain"]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
@@ -76,13 +88,52 @@ def test_the_readmes_code_does_what_it_says() -> None:
 
 def test_the_guide_shows_the_table_of_presets() -> None:
     """As the package has it; pages that are named as evidence exist."""
-    page = (FOLDER / "choosing.md").read_text()
+    page = (FOLDER / "smooth_policy.md").read_text()
     shown = re.search(r"<!-- presets -->\n(.*)<!-- presets end -->", page, re.S)
     assert shown is not None and shown[1] == presets_table()
     for kinds in PRESETS.values():
         assert kinds.keys() == KINDS.keys()
         for preset in kinds.values():
             assert preset.evidence is None or (ROOT / preset.evidence).exists()
+
+
+def test_the_quickstart_is_the_notebook() -> None:
+    """The page's training runs; its numbers and picture are saved outputs of the notebook."""
+    page = FOLDER / "quickstart.md"
+    policy = run_blocks(page)["train"](strength=1.0, iterations=1)
+    assert policy(TensorDict({"observation": torch.zeros(2)}))["action"].shape == (1,)
+    notebook = json.loads((ROOT / "notebooks" / "quickstart.ipynb").read_text())
+    saved = [output for cell in notebook["cells"] for output in cell.get("outputs", [])]
+    printed = "".join("".join(output.get("text", "")) for output in saved)
+    (numbers,) = re.findall(r"^```text\n(.*?)^```", page.read_text(), re.M | re.S)
+    assert all(line in printed for line in numbers.splitlines())
+    pictures = [
+        output["data"]["image/png"] for output in saved if "image/png" in output.get("data", {})
+    ]
+    assert base64.b64decode(pictures[-1]) == (FOLDER / "quickstart.png").read_bytes()
+
+
+def test_the_pages_have_the_thresholds_of_diagnose() -> None:
+    """Each is in the row of its finding; the page about gradients has the threshold of a run."""
+    page = (FOLDER / "shaking.md").read_text()
+    rows = dict(re.findall(r"^\| ([^|]+) \| ([^|]+) \|", page, re.M))
+    for finding, thresholds in {
+        "flips from step to step": [words.FLIPS],
+        "moves like noise": [words.ROUGH, words.SMOOTH],
+        "bang-bang": [words.BANG_BANG, words.EITHER_BOUND],
+        "pinned": [words.BANG_BANG],
+        "sensitive to noise": [words.NOISY],
+        "steep spots": [words.STEEP],
+        "wide samples": [words.WIDE],
+        "small terms": [words.FAINT],
+        "stands still": [words.STILL],
+        "smooth": [words.SMOOTH],
+    }.items():
+        assert {f"{each:g}" for each in thresholds} <= set(re.findall(r"-?[\d.]*\d", rows[finding]))
+    assert f"at least {words.CONCENTRATED:g} of a change" in page
+    check = (FOLDER / "check.md").read_text()
+    assert f"| below {words.FAINT:g} |" in check and f"| below {TOLD_BELOW:.4f} |" in check
+    assert f"after {MEASURED_AFTER} updates" in check
 
 
 def test_a_marked_block_is_left_out_and_the_others_share_a_namespace(tmp_path: Path) -> None:
@@ -111,7 +162,9 @@ def test_every_public_name_has_a_section_that_uses_it(components: dict[str, Any]
 
 
 WRITTEN = sorted(
-    path for folder in (ROOT, FOLDER, ROOT / "results") for path in folder.glob("*.md")
+    path
+    for folder in (ROOT, FOLDER, ROOT / "results", ROOT / "studies")
+    for path in folder.glob("*.md")
 )
 
 
@@ -131,9 +184,9 @@ def prose(page: Path) -> str:
     return re.sub(r"^```.*?^```", "", page.read_text(), flags=re.M | re.S)
 
 
-def test_the_mean_gains_are_right(components: dict[str, Any]) -> None:
+def test_the_mean_gains_are_right(mean_gain: Any) -> None:
     """The page's table and its formula, against quadrature over the largest of n draws."""
-    text = COMPONENTS.read_text()
+    text = DISTANCES.read_text()
     rows = {
         name: [float(cell) for cell in cells.split("|")[:-1]]
         for name, cells in re.findall(r"^\| (mean [^|]*?) \|(.*)$", text, re.M)
@@ -146,13 +199,13 @@ def test_the_mean_gains_are_right(components: dict[str, Any]) -> None:
             return quad(lambda x: n * x ** (n - 1) * function(x), 0.0, near.radius)[0]
 
         gain = mean(lambda x: near.scale / (x + near.epsilon))
-        assert components["mean_gain"](near, n) == pytest.approx(gain, rel=1e-8)
+        assert mean_gain(near, n) == pytest.approx(gain, rel=1e-8)
         assert rows["mean gain"][column] == pytest.approx(gain, abs=0.5001e-4)
         distance = rows["mean distance, less epsilon"][column]
         assert distance == pytest.approx(mean(lambda x: x), abs=0.5001e-3)
 
 
-def test_the_gain_of_the_page_is_that_of_the_loss(components: dict[str, Any]) -> None:
+def test_the_loss_has_the_gain_of_the_page(components: dict[str, Any], mean_gain: Any) -> None:
     """The diagnostics of a long batch are the means that the page predicts."""
     torch.manual_seed(0)
     near, loss = components["near"], components["loss"]
@@ -160,5 +213,5 @@ def test_the_gain_of_the_page_is_that_of_the_loss(components: dict[str, Any]) ->
     with torch.no_grad():
         terms = loss(rollout)
     # In three dimensions the gain's standard deviation is 0.008, the distance's 0.19.
-    assert terms["l2c2_gain"].item() == pytest.approx(components["mean_gain"](near, 3), abs=3e-4)
+    assert terms["l2c2_gain"].item() == pytest.approx(mean_gain(near, 3), abs=3e-4)
     assert terms["l2c2_distance"].item() == pytest.approx(0.75 + near.epsilon, abs=6e-3)

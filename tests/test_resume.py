@@ -399,7 +399,7 @@ def test_what_another_experiment_went_on_with_is_not_written_over(tmp_path):
     first.train()
     first.finish(first.test())
     before = contents(tmp_path)
-    with pytest.raises(OtherRunError, match=r"metrics\.csv has .* another Experiment went on"):
+    with pytest.raises(OtherRunError, match=r"metrics\.csv has .* another Experiment has written"):
         second.train()
     assert contents(tmp_path) == before
 

@@ -205,7 +205,7 @@ def test_actions_that_can_take_one_value_alone_are_refused_where_they_are_drawn(
     if name == "td3":
         experiment(name, task())
         return
-    with pytest.raises(ValueError, match=r"entries \[1\] of this task's can take one value alone"):
+    with pytest.raises(ValueError, match=r"entries \[1\] of this task's can take only one value"):
         experiment(name, task())
 
 

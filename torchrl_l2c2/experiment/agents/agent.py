@@ -1,4 +1,4 @@
-"""What an algorithm's settings make: everything that learns in a run."""
+"""The agent: everything that learns in a run, built from an algorithm's settings."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Agent:
         policy_terms: the algorithm's own terms that train the policy; a regularizer's loss knows
             its own.
         policy_delay: updates of the values per update of the policy.
-        normalization: of what is learned from; ``policy`` has it inside. ``None`` without any.
+        normalization: normalization of the training data, also inside ``policy``; or ``None``.
     """
 
     loss: LossModule
@@ -63,7 +63,7 @@ class Agent:
 
     @property
     def device(self) -> torch.device:
-        """Where the loss's parameters are, and batches have to be."""
+        """Device of the loss's parameters, and of its batches."""
         return next(self.loss.parameters()).device
 
     def as_learned(self, transitions: TensorDictBase, reward_factor: float) -> TensorDictBase:

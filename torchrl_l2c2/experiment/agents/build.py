@@ -91,6 +91,6 @@ def check_device_found(device: str) -> None:
     if device != "cpu" and (torch.device(device).index or 0) >= found:
         raise SettingError(
             "device",
-            f"must be one that PyTorch finds; it finds {found} CUDA devices, got {device!r}: use "
-            "device=cpu.",
+            f"must be a device of this machine; PyTorch finds {found} CUDA devices, got "
+            f"{device!r}: use device=cpu.",
         )

@@ -20,7 +20,7 @@ from torchrl_l2c2.experiment.settings.regularizers import RegularizerConfig
 def make_dqn(
     config: DQNConfig, env: EnvBase, regularizer: RegularizerConfig, optimizer: OptimizerConfig
 ) -> Agent:
-    """Builds DQN; the arguments are those of :func:`~.build.make_algorithm`."""
+    """Builds DQN, with the arguments of :func:`~.build.make_algorithm`."""
     check_actions(env, config.name, continuous=False)
     spec = env.action_spec
     network = perceptron(env, spec.shape[-1], config.hidden, nn.ReLU)

@@ -1,4 +1,4 @@
-"""Networks that several algorithms build, and what they ask of an environment."""
+"""Networks that several algorithms build, and their demands on an environment."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def check_actions(
     """Refuses actions that an algorithm cannot take.
 
     Keyword Args:
-        continuous (bool): whether they are to be.
+        continuous (bool): whether the algorithm needs continuous actions, or else discrete ones.
         squashed (bool): whether they are squashed into their bounds. Default ``False``.
         drawn (bool): whether they are drawn from a distribution between these. Default ``True``.
 
@@ -47,7 +47,7 @@ def check_actions(
             f"algorithm={algorithm} needs {'continuous' if continuous else 'discrete'} actions, "
             f"this task's are {type(env.action_spec).__name__} of shape "
             f"{tuple(env.action_spec.shape)}: use algorithm="
-            f"{'dqn' if continuous else 'ppo_rpe'}, or another one that takes them."
+            f"{'dqn' if continuous else 'ppo_rpe'}, or another algorithm."
         )
     if squashed and not _bounded(env.action_spec):
         raise UserError(
@@ -59,7 +59,7 @@ def check_actions(
     if bounds and (still := (bounds[0] >= bounds[1]).nonzero().flatten().tolist()):
         raise UserError(
             f"algorithm={algorithm} squashes actions into their bounds, and entries {still} of "
-            "this task's can take one value alone: register the task with a "
+            "this task's can take only one value: register the task with a "
             "gymnasium.ActionWrapper that leaves them out."
         )
 
@@ -86,12 +86,12 @@ def clip_bounds(env: EnvBase) -> tuple[Tensor, Tensor]:
     return torch.full_like(low, -torch.inf), torch.full_like(high, torch.inf)
 
 
-# Of the convolutional layers; each halves the image.
+# Channels of the convolutional layers; each layer halves the image.
 CHANNELS = (16, 32, 32)
 
 
 def image_encoder(env: EnvBase) -> nn.Module | None:
-    """Convolutional layers for a task that observes images; ``None`` for one that does not."""
+    """Convolutional layers for a task that observes images; ``None`` for other tasks."""
     shape = env.observation_spec["observation"].shape
     if len(shape) == 1:
         return None
@@ -127,16 +127,16 @@ def perceptron(
     hidden: tuple[int, ...],
     activation: type[nn.Module],
     *,
-    beside: int = 0,
+    extra_features: int = 0,
 ) -> nn.Module:
-    """Fully connected layers on an observation, behind convolutional ones where it is an image.
+    """Fully connected layers on an observation; images first pass convolutional layers.
 
     Keyword Args:
-        beside (int): numbers that are read beside the observation. Default 0.
+        extra_features (int): size of a second input, such as the action. Default 0.
     """
     encoder = image_encoder(env)
     layers = MLP(
-        in_features=observation_size(env) + beside,
+        in_features=observation_size(env) + extra_features,
         out_features=out_features,
         num_cells=list(hidden),
         activation_class=activation,
@@ -218,5 +218,5 @@ def orthogonal(network: nn.Module, *, last: float) -> None:
 
 def action_value(env: EnvBase, hidden: tuple[int, ...]) -> ValueOperator:
     """The value of an action at an observation."""
-    network = perceptron(env, 1, hidden, nn.ReLU, beside=env.action_spec.shape[-1])
+    network = perceptron(env, 1, hidden, nn.ReLU, extra_features=env.action_spec.shape[-1])
     return ValueOperator(network, in_keys=["observation", "action"])

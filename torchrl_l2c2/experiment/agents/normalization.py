@@ -1,4 +1,4 @@
-"""Observations and rewards by their running statistics, and the policy that acts behind them."""
+"""Normalization of observations and rewards, and the policy with its normalization."""
 
 from __future__ import annotations
 
@@ -13,33 +13,33 @@ from torchrl.envs.utils import exploration_type
 
 from torchrl_l2c2.experiment.envs.frames import PREVIOUS
 
-LARGEST = 10.0  # what is normalized is clipped to it, either way
+LARGEST = 10.0  # normalized values are clipped to [-LARGEST, LARGEST]
 EPSILON = 1e-8  # added to variances
 
 
 class Normalization(nn.Module):
-    r"""Running statistics of observations and rewards, and what is normalized by them.
+    r"""Normalization of observations and rewards by running statistics.
 
     .. math::
         s \to \frac{s - \mathrm{mean}(s)}{\sqrt{\mathrm{var}(s) + 10^{-8}}}, \qquad
         r \to \frac{r}{\sqrt{\mathrm{var}(R) + 10^{-8}}}, \qquad R_t = \gamma R_{t-1} + r_t,
 
     both clipped to 10, as ``VecNormalize`` of Stable-Baselines3 does. Rewards keep their sign and
-    their zero: where an episode ends by itself, taking a mean from them, as TorchRL's
-    ``VecNormV2`` would, changes what is best.
+    their zero: subtracting a mean, as TorchRL's ``VecNormV2`` does, would change the optimal policy
+    where an episode can end early.
 
-    The statistics that observations are normalized by stay as they are until :meth:`follow`:
-    a whole rollout is played and learned from with the same ones, so that ``s`` and ``s'`` are
-    normalized alike and likelihoods are those of the policy that acted. A ``state_dict`` holds all.
+    The statistics of observations stay fixed until :meth:`follow`. A whole rollout is played and
+    learned from with the same statistics: ``s`` and ``s'`` are normalized alike, and likelihoods
+    belong to the policy that acted. The ``state_dict`` holds all statistics.
 
     Args:
-        size (int): numbers in an observation.
+        size (int): length of an observation.
 
     Keyword Args:
-        observations (bool): whether they are normalized.
-        rewards (bool): whether they are.
+        observations (bool): whether observations are normalized.
+        rewards (bool): whether rewards are normalized.
         gamma (float): the discount, from 0 to 1. Larger values sum more rewards to :math:`R`.
-        streams (int): simulators that are played at once, at least 1; each has an :math:`R`.
+        streams (int): number of simulators, at least 1; each has an :math:`R`.
 
     Examples:
         >>> import torch
@@ -70,7 +70,7 @@ class Normalization(nn.Module):
         self.seen, self.gained = Moments(size), Moments(1)
 
     def normalize(self, observation: Tensor) -> Tensor:
-        """Observations ``[*B, F]`` by the statistics that are in use."""
+        """Normalizes observations ``[*B, F]`` by the current statistics."""
         if not self._observations:
             return observation
         scaled: Tensor = (observation - self.mean) / self.scale
@@ -78,7 +78,7 @@ class Normalization(nn.Module):
 
     @torch.no_grad()
     def forward(self, rollout: Sequence[TensorDictBase]) -> list[TensorDictBase]:
-        """A rollout's frames normalized, after its rewards are counted in.
+        """Counts a rollout, and returns its frames normalized.
 
         Args:
             rollout (sequence of TensorDictBase): frames ``[T]`` of each stream, with
@@ -97,7 +97,7 @@ class Normalization(nn.Module):
 
     @torch.no_grad()
     def normalized(self, frames: TensorDictBase) -> TensorDictBase:
-        """A copy of frames with both observations and the reward normalized; nothing is counted."""
+        """Copies frames with both observations and the reward normalized; nothing is counted."""
         copied = frames.copy()
         for key in ("observation", ("next", "observation"), PREVIOUS):
             if key not in frames.keys(True):
@@ -109,7 +109,7 @@ class Normalization(nn.Module):
         return copied
 
     def follow(self) -> None:
-        """From here on observations are normalized by all that were counted."""
+        """Makes the statistics of all counted observations the current ones."""
         if self._observations:
             self.mean.copy_(self.seen.mean)
             self.scale.copy_(self.seen.scale)
@@ -127,10 +127,10 @@ class Normalization(nn.Module):
 
 
 class Moments(nn.Module):
-    """Mean and variance of everything that was counted; 0 and 1 at first.
+    """Running mean and variance, 0 and 1 at first.
 
     Args:
-        size (int): of what is counted.
+        size (int): length of a counted vector.
 
     Examples:
         >>> import torch
@@ -149,7 +149,7 @@ class Moments(nn.Module):
         super().__init__()
         self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
         self.register_buffer("var", torch.ones(size, dtype=torch.float64))
-        # Of the first guess: it is forgotten with the first values.
+        # Weight of the first guess, which the first values replace.
         self.register_buffer("count", torch.tensor(1e-4, dtype=torch.float64))
 
     @property
@@ -171,14 +171,14 @@ class Moments(nn.Module):
 
 
 class ActingPolicy(TensorDictModuleBase):
-    """A policy of normalized observations, for those that a task shows and the actions it takes.
+    """A policy with the normalization of its observations and the bounds of its actions.
 
     Args:
         policy (TensorDictModule): reads a normalized ``"observation"``.
-        normalization (Normalization, optional): of its observations. Default: they are as shown.
+        normalization (Normalization, optional): Normalization of the observations. Default: none.
         low (Tensor, optional): lower bounds of the mean action. Default: none.
-        high (Tensor, optional): upper bounds. Samples go beyond, as their likelihood is that of
-            the unclipped action: who plays them clips them.
+        high (Tensor, optional): upper bounds of the mean action. Samples are not clipped, because
+            their likelihood is of the unclipped action; :meth:`taken` clips them.
     """
 
     low: Tensor | None

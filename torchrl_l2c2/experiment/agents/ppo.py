@@ -30,7 +30,7 @@ from torchrl_l2c2.experiment.settings.regularizers import RegularizerConfig
 def make_ppo(
     config: PPOConfig, env: EnvBase, regularizer: RegularizerConfig, optimizer: OptimizerConfig
 ) -> Agent:
-    """Builds PPO; the arguments are those of :func:`~.build.make_algorithm`."""
+    """Builds PPO, with the arguments of :func:`~.build.make_algorithm`."""
     check_actions(env, config.name, continuous=True, squashed=not config.clip_actions)
     activation = {"tanh": nn.Tanh, "relu": nn.ReLU}[config.activation]
     actor = normal_actor(

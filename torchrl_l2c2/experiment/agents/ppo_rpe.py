@@ -25,7 +25,7 @@ from torchrl_l2c2.updaters import TSoftUpdate
 def make_ppo_rpe(
     config: PPORPEConfig, env: EnvBase, regularizer: RegularizerConfig, optimizer: OptimizerConfig
 ) -> Agent:
-    """Builds PPO-RPE; the arguments are those of :func:`~.build.make_algorithm`."""
+    """Builds PPO-RPE, with the arguments of :func:`~.build.make_algorithm`."""
     check_actions(env, config.name, continuous=True, squashed=config.squash != "none")
     size = observation_size(env)
     actor = make_actor(

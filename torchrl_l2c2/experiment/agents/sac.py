@@ -23,7 +23,7 @@ from torchrl_l2c2.experiment.settings.regularizers import RegularizerConfig
 def make_sac(
     config: SACConfig, env: EnvBase, regularizer: RegularizerConfig, optimizer: OptimizerConfig
 ) -> Agent:
-    """Builds SAC; the arguments are those of :func:`~.build.make_algorithm`."""
+    """Builds SAC, with the arguments of :func:`~.build.make_algorithm`."""
     check_actions(env, config.name, continuous=True, squashed=True)
     actor = normal_actor(env, config.hidden, nn.ReLU, exponential=config.scale_mapping == "exp")
     loss = SACLoss(

@@ -29,7 +29,7 @@ from torchrl_l2c2.experiment.settings.regularizers import RegularizerConfig
 def make_td3(
     config: TD3Config, env: EnvBase, regularizer: RegularizerConfig, optimizer: OptimizerConfig
 ) -> Agent:
-    """Builds TD3; the arguments are those of :func:`~.build.make_algorithm`."""
+    """Builds TD3, with the arguments of :func:`~.build.make_algorithm`."""
     check_actions(env, config.name, continuous=True, squashed=True, drawn=False)
     spec = env.action_spec
     network = perceptron(env, spec.shape[-1], config.hidden, nn.ReLU)

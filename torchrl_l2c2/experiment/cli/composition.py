@@ -26,10 +26,10 @@ from torchrl_l2c2.experiment.settings.regularizers import BEGIN_WITH_PRESET, pre
 from torchrl_l2c2.presets import KINDS, preset
 
 PACKAGE = Path(__file__).parents[2]
-# Beside the package in a clone, within it when installed.
+# Next to the package in a clone, inside it when installed.
 CONF = next(folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if folder.is_dir())
 
-# What a method is chosen by.
+# Names that users may type for a setting.
 ALSO_CALLED = {"method": ["regularizer"], "methods": ["regularizer"]}
 
 
@@ -66,13 +66,13 @@ def _node(chosen: Any) -> dict[str, Any]:
 
 
 def read(values: dict[str, Any]) -> tuple[ExperimentConfig, Path]:
-    """A run's settings, and its folder: what Hydra was told, or one below ``outputs``.
+    """Returns a run's settings and its folder, which Hydra names or which is below ``outputs``.
 
     Args:
         values (dict): the configuration.
 
     Raises:
-        SettingError: a setting that cannot be.
+        SettingError: a setting that is unknown or outside its range.
     """
     chosen = HydraConfig.get()
     check_preset(values, chosen.runtime.choices.get("preset"))
@@ -90,12 +90,12 @@ def read(values: dict[str, Any]) -> tuple[ExperimentConfig, Path]:
 
 
 def check_preset(values: dict[str, Any], name: str | None) -> None:
-    """Refuses a task and an algorithm that a preset has no settings of.
+    """Refuses a task and an algorithm without settings in the preset.
 
     Raises:
-        SettingError: with those that it has.
+        SettingError: with the tasks and algorithms of the preset.
     """
-    if values.get("preset") != "???":  # What they replace.
+    if values.get("preset") != "???":  # A preset replaces this mark.
         return
     folder, prefix = CONF / "preset", f"{name}_"
     general = (path.stem.removeprefix(prefix) for path in folder.glob(f"general/{prefix}*.yaml"))
@@ -104,13 +104,13 @@ def check_preset(values: dict[str, Any], name: str | None) -> None:
     task, algorithm = values["task"]["name"], values["algorithm"]["name"]
     raise SettingError(
         "preset",
-        f"must have settings of task={task} with algorithm={algorithm}, and {name} has those of "
-        f"{', '.join(known)}: choose one of these, or preset=none.",
+        f"must have settings of task={task} with algorithm={algorithm}; {name} has settings "
+        f"of {', '.join(known)}: choose one of these, or preset=none.",
     )
 
 
 def check_budget(config: ExperimentConfig, given: Sequence[str]) -> None:
-    """Refuses episodes beside frames, as a preset has them, by which the length goes then.
+    """Refuses a number of episodes if a preset sets a number of frames.
 
     Args:
         config (ExperimentConfig): the settings.
@@ -124,16 +124,16 @@ def check_budget(config: ExperimentConfig, given: Sequence[str]) -> None:
         raise SettingError(
             "task.episodes",
             f"is not read where there is task.frames, here {config.task.frames}: give "
-            "task.frames=... instead, or task.frames=null beside it.",
+            "task.frames=... instead, or add task.frames=null.",
         )
 
 
 def check_folders(chosen: Any, outputs: str) -> None:
-    """Refuses Hydra's names for where runs go, which a sweep does not read.
+    """Refuses Hydra's names of run folders, which a sweep does not read.
 
     Args:
-        chosen (HydraConf): what Hydra was told.
-        outputs (str): where the sweep's runs go.
+        chosen (HydraConf): Hydra's configuration.
+        outputs (str): folder of the sweep's runs.
 
     Raises:
         SettingError: with what to give instead.
@@ -151,10 +151,9 @@ def check_folders(chosen: Any, outputs: str) -> None:
 
 @contextmanager
 def composing() -> Iterator[None]:
-    """Ends with a line where Hydra cannot compose what it was given.
+    """Shows an error of Hydra's composition in one line, and exits.
 
-    Hydra would print several, or a traceback, and exit; as it does where ``HYDRA_FULL_ERROR`` is
-    set by the user.
+    If the user has set ``HYDRA_FULL_ERROR``, Hydra prints its traceback instead.
 
     Raises:
         SystemExit: with that line.
@@ -167,7 +166,7 @@ def composing() -> Iterator[None]:
         if shown:
             raise
         sys.exit(f"error: {refusal(error)}")
-    except OSError as error:  # Of a folder that Hydra makes, before anything runs in it.
+    except OSError as error:  # Hydra cannot make the run's folder.
         if shown or error.filename is None:
             raise
         sys.exit(f"error: {error.filename!r} cannot be made ({error.strerror}); choose another.")
@@ -177,7 +176,7 @@ def composing() -> Iterator[None]:
 
 
 def refusal(error: Exception) -> str:
-    """What Hydra, or OmegaConf, refuses, in a line; of a name that there is not what was meant."""
+    """Text of an error of Hydra or OmegaConf in one line, with the name that was probably meant."""
     if found := re.match("Could not override '([^']+)'", str(error)):
         return unknown_setting(found[1])
     if "group override must be" in str(error) or "${regularizer}_${algorithm}" in str(error):
@@ -200,7 +199,7 @@ def _choice_meant(group: str, name: str) -> str:
 
 
 def unknown_setting(name: str) -> str:
-    """Whose setting a name is, or the one that is most like it.
+    """Text about an unknown name: the group that has it, or the most similar setting.
 
     Examples:
         >>> unknown_setting("task.epsodes")
@@ -230,7 +229,7 @@ def unknown_setting(name: str) -> str:
 
 
 def _two_commands(group: str, having: Sequence[str]) -> str:
-    """What to do in a sweep over choices of which only some have a setting."""
+    """Advice for a sweep over choices if only some of them have the setting."""
     prefix = f"{group}="
     swept = next((each for each in sys.argv if each.startswith(prefix) and "," in each), "")
     choices = swept.removeprefix(prefix).split(",") if swept else []
@@ -245,7 +244,7 @@ def _two_commands(group: str, having: Sequence[str]) -> str:
 
 
 def folder_named(setting: str, given: Any) -> str | None:
-    """A folder, which may be named by a number; of ``resume`` there need be none.
+    """Checks the name of a folder, which may be a number; ``resume`` may be ``None``.
 
     Raises:
         SettingError: another value.
@@ -259,7 +258,7 @@ def folder_named(setting: str, given: Any) -> str | None:
 
 
 def preset_used(config: ExperimentConfig) -> str | None:
-    """The preset that the regularizer's settings begin with, or that there is none; in a line."""
+    """Names the regularizer's preset in a line, or says that there is none."""
     regularizer, algorithm = config.regularizer, config.algorithm.name
     if regularizer.name not in BEGIN_WITH_PRESET:
         return None
@@ -267,7 +266,7 @@ def preset_used(config: ExperimentConfig) -> str | None:
     if algorithm not in KINDS:
         return (
             f"regularizer={regularizer.name}: there is no preset for {algorithm}; the settings are "
-            "the paper's, or given"
+            "given, or as in the paper"
         )
     begins = preset_settings(regularizer.name, algorithm)
     chosen = ", ".join(f"{name}={getattr(regularizer, name)}" for name in begins)
@@ -277,7 +276,7 @@ def preset_used(config: ExperimentConfig) -> str | None:
 
 
 def tell_sweep() -> None:
-    """Says where the configuration is that of a comparison, and this is but one run of it."""
+    """Reports that the configuration describes a comparison if only one run is made."""
     chosen = HydraConfig.get()
     if chosen.sweeper.params:
         sweeps = " ".join(f"{name}={value}" for name, value in chosen.sweeper.params.items())

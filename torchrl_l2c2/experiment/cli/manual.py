@@ -76,7 +76,7 @@ def _line(name: str, default: Any, meaning: str, only: str = "") -> str:
 def page() -> str:
     """Every setting as a page of the docs."""
     lines = ["# Settings", "", "Made by `python -m torchrl_l2c2 settings`.", ""]
-    lines += ["## The command", "", "| setting | default | what it is |", "| --- | --- | --- |"]
+    lines += ["## The command", "", "| setting | default | meaning |", "| --- | --- | --- |"]
     lines += [f"| `{n}` | `{v[0]}` | {v[1]} |" for n, v in OF_THE_COMMAND.items()]
     lines += ["", "## The run as a whole", "", *_table(ExperimentConfig(), ""), ""]
     for group, choices in GROUPS.items():
@@ -115,7 +115,7 @@ def _together(values: Mapping[str, Any]) -> str:
 
 
 def _table(group: Any, prefix: str) -> Iterator[str]:
-    yield "| setting | default | allowed | what it is |"
+    yield "| setting | default | allowed | meaning |"
     yield "| --- | --- | --- | --- |"
     for name, (allowed, meaning) in describe(type(group)).items():
         default = f"`{_written(getattr(group, name))}`"

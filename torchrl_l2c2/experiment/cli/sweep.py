@@ -1,7 +1,7 @@
-"""What the jobs of a sweep and the process that began it tell each other, on whatever machines.
+"""Messages between the jobs of a sweep and the process that began it, on one or many machines.
 
-A folder beside the runs' holds it: whether the sweep is to stop, and which jobs run, have finished
-and failed. A file for each, as several machines cannot add to one.
+A folder next to the runs holds one file per message, because several machines cannot append to one
+file: a request to stop, and the jobs that run, have finished or have failed.
 """
 
 from __future__ import annotations
@@ -38,20 +38,20 @@ from torchrl_l2c2.experiment.run.files import make_folder
 from torchrl_l2c2.experiment.run.signals import FINISHING, SAME_SIGNAL_SECONDS, terminate
 from torchrl_l2c2.experiment.settings.fields import SettingError
 
-VARIABLE = "TORCHRL_L2C2_SWEEP"  # of the environment, which a launcher's processes inherit
+VARIABLE = "TORCHRL_L2C2_SWEEP"  # environment variable, inherited by a launcher's processes
 POLL_SECONDS = 0.2
-REMOTE_POLL_SECONDS = 2.0  # of a file system that hundreds of machines may share
+REMOTE_POLL_SECONDS = 2.0  # hundreds of machines may share the file system
 LOST = "lost with its process or machine, or still running"
 GUARD = Path(__file__).with_name("guard.py")
 
 
 class Sweep:
-    """A sweep, as the process that began it and its jobs see it.
+    """A sweep, for the process that began it and for its jobs.
 
     Attributes:
-        begun_by: the process that began it, with its machine.
-        overrides: of its command.
-        begun_here: the one that this process began; ``None`` where it began none.
+        begun_by: machine and process that began it.
+        overrides: overrides of its command.
+        begun_here: the sweep that this process began, or ``None``.
         job_is_here: whether a job runs in this process.
     """
 
@@ -67,7 +67,7 @@ class Sweep:
         """The sweep that this job belongs to.
 
         Raises:
-            UserError: the launcher told the job nothing of it, or its folder is nowhere here.
+            UserError: The launcher did not pass the sweep on, or its folder is missing here.
         """
         if VARIABLE not in os.environ:
             raise UserError(f"the launcher passes no {VARIABLE} on to the jobs' environment.")
@@ -81,13 +81,13 @@ class Sweep:
 
     @property
     def is_remote(self) -> bool:
-        """Whether another program started this process, as a cluster does, and may do so again."""
+        """Checks whether another program, such as a cluster, started this process."""
         host, process = self.begun_by
         return host != socket.gethostname() or process not in (os.getpid(), os.getppid())
 
     @property
     def stopped_by(self) -> int | None:
-        """The signal that stopped it; ``None`` where it goes on."""
+        """The signal that stopped the sweep; ``None`` while it continues."""
         try:
             return int((self._folder / "stopped").read_text())
         except OSError:
@@ -95,15 +95,15 @@ class Sweep:
             return None if self._folder.is_dir() else signal.SIGTERM
 
     def stop(self, signal_number: int) -> None:
-        """No job is to begin any more; those that train are to save and end."""
+        """Stops the sweep: no job begins, and training jobs save and end."""
         if self.stopped_by is None:
             self._put("stopped", str(signal_number))
 
     def share(self, outputs: Path) -> None:
-        """Has what jobs tell below a folder that all their machines see; before any begins.
+        """Moves the messages to a folder that all machines see, before any job begins.
 
         Raises:
-            OSError: it cannot be written to.
+            OSError: The folder cannot be written to.
         """
         stopped, self._folder = self.stopped_by, make_folder(outputs) / f".{self._folder.name}"
         self._folder.mkdir()
@@ -112,16 +112,16 @@ class Sweep:
             self.stop(stopped)
 
     def publish(self) -> None:
-        """Tells processes that are born from now on of it."""
+        """Passes the sweep on to processes that start from now on."""
         told = [str(self._folder), self.begun_by, [*self.overrides], os.getcwd()]
         os.environ[VARIABLE] = json.dumps(told)
 
     def end(self) -> None:
-        """Nothing is told any more, and what still runs somewhere is to save and end."""
+        """Ends the messages; jobs that still run somewhere save and end."""
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def add_failure(self, number: int, job: str, reason: str) -> None:
-        """Keeps why a job failed until the sweep's end."""
+        """Stores the reason of a job's failure until the end of the sweep."""
         self._put(f"failed_{number:06d}", json.dumps([job, reason]))
         self._ended(number)
 
@@ -138,11 +138,11 @@ class Sweep:
         """Keeps a run's folder for one job of the sweep.
 
         Raises:
-            SettingError: another job has it, whose results it would take the place of.
+            SettingError: another job has it, whose results would be replaced.
         """
         claim = self._folder / f"claim_{hashlib.sha256(str(folder).encode()).hexdigest()[:16]}"
         try:
-            # Of two that begin at once, one makes it.
+            # If two jobs begin at once, one of them makes the file.
             with open(claim, "x") as file:
                 file.write(str(number))
         except FileExistsError:
@@ -158,7 +158,7 @@ class Sweep:
             return
 
     def add_finished(self, number: int, folder: Path, seconds: float) -> None:
-        """Keeps where a finished run lies, and how long it took, until the sweep's end."""
+        """Stores the folder and the duration of a finished run until the end of the sweep."""
         self._put(f"finished_{number:06d}", json.dumps([str(folder), seconds]))
 
     @property
@@ -167,10 +167,10 @@ class Sweep:
         return [Path(folder) for _, (folder, _) in self._all("finished")]
 
     def standing(self, number: int, params: Mapping[str, str]) -> str:
-        """Where a sweep stands when a job begins, such as ``"run 3 of 72, about 4.1 h left"``.
+        """State of a sweep when a job begins, such as ``"run 3 of 72, about 4.1 h left"``.
 
         Args:
-            number (int): of the job, from 1.
+            number (int): The job's number, from 1.
             params (Mapping): sweeps of the configuration, by setting.
         """
         try:
@@ -184,7 +184,7 @@ class Sweep:
         place = f"run {number} of {len(tasks)}"
         if not seconds:
             return place
-        # A task takes many times as long as another; one that is still to come, their mean.
+        # Durations differ between tasks; a task without a finished run counts as their mean.
         of_task = {task: statistics.fmean(each) for task, each in seconds.items()}
         usual = statistics.fmean(of_task.values())
         left = sum(of_task.get(task, usual) for task in tasks[number - 1 :])
@@ -192,14 +192,14 @@ class Sweep:
 
     @contextlib.contextmanager
     def job(self, number: int, job: str) -> Iterator[bool]:
-        """A job of the sweep runs within it: a stop ends it in order, wherever it is.
+        """Context in which a job of the sweep runs; a stop ends the job in order.
 
         Args:
-            number (int): of the job; the same one where it is begun again.
-            job (str): what it is called.
+            number (int): The job's number, the same if the job is begun again.
+            job (str): The job's name.
 
         Yields:
-            bool: whether it was begun before, and lost.
+            bool: Whether the job was begun before, and lost.
         """
         begun_before = (self._folder / f"running_{number:06d}").exists()
         self._put(f"running_{number:06d}", json.dumps(job))
@@ -216,14 +216,14 @@ class Sweep:
         (self._folder / f"running_{number:06d}").unlink(missing_ok=True)
 
     def _put(self, name: str, content: str) -> None:
-        """Writes a file that is there whole or not at all, unless the sweep has ended."""
+        """Writes a file in one step, unless the sweep has ended."""
         partial = self._folder / f".{name}.{socket.gethostname()}.{os.getpid()}"
         with contextlib.suppress(FileNotFoundError):
             partial.write_text(content)
             partial.replace(self._folder / name)
 
     def _all(self, kind: str) -> list[tuple[int, Any]]:
-        """What the jobs told, by their numbers."""
+        """Messages of a kind, with the numbers of their jobs."""
         told = []
         for path in sorted(self._folder.glob(f"{kind}_*")):
             with contextlib.suppress(FileNotFoundError):  # A job that has just ended.
@@ -231,9 +231,9 @@ class Sweep:
         return told
 
     def _follow(self) -> None:
-        """A stop reaches this process as SIGTERM, and it dies with the one that began the sweep.
+        """Ends this process with the sweep: a stop arrives as SIGTERM.
 
-        Unless it is remote: whether it lives on is then for the program that started it.
+        A local process also ends with the process that began the sweep.
         """
         signal.signal(signal.SIGTERM, terminate)
         if Sweep._following:
@@ -255,7 +255,7 @@ class Sweep:
 
 
 class ShareSweep(Callback):
-    """Puts what a sweep's jobs tell beside its runs, where every machine that runs one sees it."""
+    """Keeps the messages of a sweep next to its runs, where every machine can read them."""
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         """Called by Hydra, once the folder is known and before its launcher starts.
@@ -269,12 +269,12 @@ class ShareSweep(Callback):
 
 
 def enter_folder() -> None:
-    """Goes where the sweep was begun, for launchers whose processes begin elsewhere."""
+    """Changes to the working directory of the sweep, for launchers that start elsewhere."""
     os.chdir(json.loads(os.environ[VARIABLE])[-1])
 
 
 def start_guard(mark: str) -> None:
-    """Starts what ends the processes with this mark in their environment when this one is gone."""
+    """Starts a guard, which ends processes with this mark in their environment after this one."""
     if not Path("/proc/self/environ").exists():
         return
     command = [sys.executable, "-I", "-S", str(GUARD), mark]
@@ -285,10 +285,10 @@ def start_guard(mark: str) -> None:
 
 
 def list_jobs(overrides: Sequence[str], params: Mapping[str, str]) -> list[dict[str, str]]:
-    """What a sweep chooses for each of its jobs: a product, where the command's go before.
+    """Lists the choices of a sweep for each of its jobs; the command's overrides come first.
 
     Raises:
-        HydraException: a sweep that says by itself not of what: a glob, an interval.
+        HydraException: A sweep without a list of values: a glob or an interval.
 
     Examples:
         >>> jobs = list_jobs(["-m", "seed=0,1", "task=ant"], {"seed": "range(0,18)", "beta": "1,2"})
@@ -318,9 +318,9 @@ def begin_sweep(overrides: Sequence[str] = ()) -> Iterator[Sweep]:
     """Begins a sweep in this process: the first Ctrl-C or SIGTERM stops it in order.
 
     Args:
-        overrides (sequence of str): of its command.
+        overrides (sequence of str): Overrides of the command.
     """
-    # Till it is known where the runs' folders are.
+    # Until the runs' folder is known.
     with tempfile.TemporaryDirectory(prefix="torchrl_l2c2_") as folder:
         begun_by = (socket.gethostname(), os.getpid())
         sweep, first = Sweep(Path(folder), begun_by, overrides), 0.0

@@ -153,7 +153,7 @@ def _asks_for_a_sweep(argument: str) -> bool:
 
 
 def tell_end(sweep: Sweep) -> None:
-    """The last lines of a sweep: a table of its runs, what failed, and how to go on."""
+    """Prints the end of a sweep: a table of its runs, its failures, and how to continue."""
     if sweep.finished:
         from torchrl_l2c2.experiment.analysis.reports import sweep_summary
 
@@ -186,7 +186,7 @@ def _main(values: DictConfig) -> None:
 
 
 def _run_job(values: dict[str, Any], sweep: Sweep) -> None:
-    """A run that lets the sweep's other jobs go on when it fails."""
+    """Runs a job; if it fails, the sweep continues with the others."""
     if sweep.stopped_by is not None:
         return
     number, job = HydraConfig.get().job.num, " ".join(HydraConfig.get().overrides.task)
@@ -241,9 +241,9 @@ def run(
 
     Args:
         config (ExperimentConfig): its settings.
-        folder (Path): of the run.
-        values (dict): the configuration, which says what the run goes on from.
-        standing (str): of the sweep that it belongs to; shown before its name and its progress.
+        folder (Path): The run's folder.
+        values (dict): The configuration, which names the run to continue from.
+        standing (str): State of the sweep, shown before the run's name and progress.
         patience (float): seconds to wait for a process that has its folder.
     """
     # Imported here: settings are checked, and the run is named, before torch is imported.

@@ -39,8 +39,8 @@ class Ended(NamedTuple):
 class RolloutCollector:
     """Plays several Gymnasium simulators in this process with one policy, a frame of each in turn.
 
-    The policy is called once for all of them. A rollout is cut where it is full: what goes on is an
-    episode that the next one continues, and the last ``("next", "observation")`` of a simulator is
+    The policy is called once for all of them. A rollout is cut where it is full: the next
+    one continues the episode, and the last ``("next", "observation")`` of a simulator is
     what to bootstrap from. After an end it is the last observation of the episode, too, and not the
     first one of the next.
 

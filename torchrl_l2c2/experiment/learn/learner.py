@@ -171,9 +171,9 @@ class Learner:
             )
 
     def shares(self, batch: TensorDictBase) -> dict[str, float]:
-        """Of the regularizer's terms, :func:`~.gradient_shares` that are finite.
+        """The finite :func:`~.gradient_shares` of the regularizer's terms.
 
-        What the loss's own terms do not train, as a predictor beside the policy, has none.
+        Terms of networks that the loss itself does not train, such as a predictor, have none.
         """
         shares = gradient_shares(self.agent.loss, batch)
         return {key: share for key, share in shares.items() if math.isfinite(share)}

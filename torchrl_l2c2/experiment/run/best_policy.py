@@ -21,9 +21,8 @@ EPISODES = 10
 class BestPolicy:
     """Ten test episodes with the policy's mean, every so many of training; the best one is kept.
 
-    Every test plays the same episodes, in an environment of its own: training goes on as it would
-    without. They are others than those of the test at the end, so that the best policy's figures
-    there are not those that it was chosen for.
+    Every test plays the same episodes, in an environment of its own, and does not change the
+    training. The test at the end plays other episodes: the best policy was not chosen on them.
 
     Args:
         config (ExperimentConfig): of the run; its ``evaluate_every`` says how often, 0 never.

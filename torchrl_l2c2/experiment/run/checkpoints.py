@@ -118,7 +118,7 @@ def _payload(path: Path) -> bytes:
     if found != FORMAT_VERSION:
         raise CheckpointError(
             f"{path}: has format version {found}, this version of torchrl_l2c2 reads "
-            f"{FORMAT_VERSION}; use the version that wrote it (versions.json beside it)."
+            f"{FORMAT_VERSION}; use the version that wrote it (see versions.json in the folder)."
         )
     payload = content[HEADER.size :]
     if hashlib.sha256(payload).digest() != digest:

@@ -1,4 +1,4 @@
-"""Whether a run goes on from a checkpoint, and from which."""
+"""Choice of the checkpoint that a run continues from."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ def check_same_versions(saved: Mapping[str, str], now: Mapping[str, str]) -> Non
     if differing:
         raise OtherRunError(
             f"the checkpoint was made with {'; '.join(differing)}: the numbers may "
-            "differ from those of a run in one go. allow_other_versions=True continues all the "
-            "same. Nothing was changed."
+            "differ from those of a run in one go. allow_other_versions=True continues "
+            "anyway. Nothing was changed."
         )
 
 
@@ -107,8 +107,8 @@ def find_checkpoint(
         if any((Path(folder) / name).exists() for name in ("evaluation.json", "policy.pt")):
             raise CheckpointError(
                 f"{str(folder)!r} holds a run that has ended, and no checkpoint_*.pt any more to "
-                "go on from: restore one, or begin in another folder (in a shell, outputs=FOLDER). "
-                "Nothing was changed."
+                "continue from: restore one, or begin in another folder (in a shell, "
+                "outputs=FOLDER). Nothing was changed."
             )
         return None
     path, state, damaged = found
@@ -119,7 +119,7 @@ def find_checkpoint(
 
 
 def check_elsewhere(folder: str | Path | None) -> None:
-    """Refuses to go on from where no checkpoint is.
+    """Refuses a folder without a checkpoint.
 
     Raises:
         CheckpointError: names the folder.
@@ -156,7 +156,7 @@ def find_elsewhere(
 def check_continuable(
     state: Mapping[str, Any], config: ExperimentConfig, *, allow_other_versions: bool
 ) -> None:
-    """Refuses a checkpoint that a run with these settings, here and now, cannot go on from.
+    """Refuses a checkpoint that a run with these settings and versions cannot continue from.
 
     Raises:
         OtherRunError: other settings, a shorter training than it is, or other versions.
@@ -189,7 +189,7 @@ def check_continuable(
 
 @contextlib.contextmanager
 def checkpoint_named(folder: Path | None) -> Iterator[None]:
-    """Errors that end a training say from where it can go on."""
+    """Adds the last checkpoint to the text of errors that end a training."""
     try:
         yield
     except FloatingPointError as error:

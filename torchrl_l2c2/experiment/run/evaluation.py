@@ -105,8 +105,8 @@ def evaluate_policy(
         env (EnvBase): one Gymnasium environment, as :class:`EpisodeCollector` takes it.
         episodes (int): how many, at least 1. More give a surer mean.
         max_steps (int): longest episode. Default 1000.
-        sampled (bool): whether the policy acts as in training; the action variation is that of its
-            mean all the same, at the states that it then visits. Default ``False``.
+        sampled (bool): whether the policy samples actions, as in training. The action variation is
+            still measured on the mean actions, at the visited states. Default ``False``.
         compile_policy (bool): whether to compile the policy. Default ``False``.
         progress (bool): whether to show a progress bar.
 
@@ -248,7 +248,7 @@ class LateTests:
 
         Raises:
             FloatingPointError: as in :func:`evaluate_policy`.
-            SimulatorError: likewise.
+            SimulatorError: as in :func:`evaluate_policy`.
         """
         with ProcessState(self._seed, torch.get_num_threads()):
             # Late, as most calls of a short training need none.

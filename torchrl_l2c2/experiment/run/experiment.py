@@ -140,7 +140,7 @@ class Experiment:
                 loss or in a parameter; names the key and the step, and the last good checkpoint.
             SimulatorError: the environment failed; names the frame and the last good checkpoint.
             OSError: the disk is full, for example; names the file and the last good checkpoint.
-            OtherRunError: fewer episodes than there are, or another Experiment went on here.
+            OtherRunError: fewer episodes than there are, or another Experiment wrote here.
             Interrupted: a signal ended the training.
 
         Warns:

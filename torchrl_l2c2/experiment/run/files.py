@@ -104,7 +104,7 @@ def to_json(value: Any) -> str:
 
 
 def _strict(value: Any) -> Any:
-    """JSON knows neither NaN nor infinity; Python writes them all the same."""
+    """Replaces NaN and infinity, which JSON does not know, by ``None``."""
     if isinstance(value, Mapping):
         return {key: _strict(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
@@ -114,10 +114,10 @@ def _strict(value: Any) -> Any:
 
 @contextlib.contextmanager
 def read_back(run: str | Path) -> Iterator[None]:
-    """What is not as it was written is an error of the folder, whatever it is found by.
+    """Turns errors in reading a run's files into an error that names the folder.
 
     Raises:
-        ValueError: names the folder, in the place of errors of what was read in it.
+        ValueError: names the folder, instead of the original error.
     """
     try:
         yield

@@ -25,7 +25,7 @@ metrics.csv           a line per training episode
 train.log             what the run said
 checkpoint_*.pt       what it continues from: the same command again, or resume=FOLDER
 policy.pt             the acting policy at the end of training, a state_dict
-policy_best.pt        the best one of evaluations.json, likewise (evaluate_every)
+policy_best.pt        the best policy of evaluations.json (evaluate_every)
 evaluations.json      tests during training (evaluate_every)
 evaluation.json       test episodes at the end
 learning_curves.png   a picture of metrics.csv
@@ -64,7 +64,7 @@ def begin_folder(folder: Path, settings: dict[str, Any], *, begun: bool, ended: 
         settings (dict): of the run, as in ``config.json``.
 
     Keyword Args:
-        begun (bool): whether it goes on from a checkpoint.
+        begun (bool): whether it continues from a checkpoint.
         ended (bool): whether its training is over.
     """
     if not ended or not is_tested(folder, settings):
@@ -79,7 +79,7 @@ def begin_folder(folder: Path, settings: dict[str, Any], *, begun: bool, ended: 
 
 
 def bring_files(old: Path, new: Path) -> None:
-    """Copies what a run in another folder goes on writing there."""
+    """Copies the files that a run in another folder continues to write."""
     for path in filter(Path.exists, (old / name for name in OF_THE_WAY)):
         write_atomically(new / path.name, path.read_bytes())
 

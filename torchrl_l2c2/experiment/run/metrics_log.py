@@ -68,7 +68,7 @@ class MetricsLog:
                 self._logger.log_scalar(name, value, step=int(row["frames"]))
 
     def check_unchanged(self) -> None:
-        """Refuses to go on where another object of this process went on meanwhile.
+        """Refuses to continue if another object has written to the file.
 
         Raises:
             OtherRunError: the file is not as long as it was left.
@@ -77,8 +77,8 @@ class MetricsLog:
         if size != self._size:
             raise OtherRunError(
                 f"{self.path} has {size} bytes, and had {self._size} when this run last wrote to "
-                "it: another Experiment went on in its folder. Make a new one, which continues "
-                "from there."
+                "it: another Experiment has written to its folder. Make a new one, which "
+                "continues from there."
             )
 
     def state_dict(self) -> dict[str, Any]:
@@ -132,8 +132,8 @@ def check_installed(name: str) -> None:
 def make_logger(name: str, folder: Path) -> Logger | None:
     """TorchRL's logger of a name; ``None`` for ``csv``, which every run writes by itself.
 
-    Weights & Biases and MLflow are told where to by their own environment variables, such as
-    ``WANDB_MODE=offline`` and ``MLFLOW_TRACKING_URI``; MLflow without one writes into the folder.
+    Weights & Biases and MLflow read their own environment variables, such as ``WANDB_MODE=offline``
+    and ``MLFLOW_TRACKING_URI``. Without one, MLflow writes into the folder.
 
     Args:
         name (str): ``"csv"``, ``"tensorboard"``, ``"wandb"`` or ``"mlflow"``.

@@ -55,8 +55,8 @@ def load_policy(
     Raises:
         FileNotFoundError: the folder is not a run's, or holds no such policy nor a checkpoint.
         CheckpointError: its policy, or all of its checkpoints, are damaged.
-        ValueError: its ``config.json`` is damaged, or names a module from the folder itself as
-            that of its task, which a policy that somebody else trained might have beside it.
+        ValueError: its ``config.json`` is damaged, or names a task module inside the folder
+            itself, which would execute code of whoever trained the policy.
         SettingError: a scale of noise that is negative or not finite, or a seed that NumPy does
             not take.
 
@@ -133,8 +133,8 @@ def _check_origin(env_id: str, folder: Path) -> None:
         if place in (run, *run.parents) or run in place.parents:
             raise UserError(
                 f"{folder / 'config.json'}: task.env_id={env_id!r} would execute {place}, which is "
-                "no module of yours but comes with the run. Put it beside your own code if you "
-                "trust it, or install it."
+                "no module of yours but comes with the run. If you trust it, install it or "
+                "move it to your own code."
             )
 
 

@@ -32,7 +32,7 @@ def by_step(player: Player, learner: Learner, algorithm: OffPolicyConfig) -> Ite
 
 
 def by_episode(player: Player, learner: Learner, algorithm: OffPolicyConfig) -> Iterator[Episode]:
-    """Updates after every episode: the paper's, as far as it can be inferred."""
+    """Updates after every episode: the schedule inferred for the paper."""
     while True:
         episodes = player.play()
         for episode in episodes:

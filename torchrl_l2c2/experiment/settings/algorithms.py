@@ -37,7 +37,7 @@ class AlgorithmConfig:
 
     @property
     def reward_factor(self) -> float:
-        """What rewards are multiplied with to be learned from."""
+        """Factor on rewards while learning."""
         return 1.0 - self.gamma if self.reward_scale is None else self.reward_scale
 
 
@@ -64,7 +64,7 @@ class OffPolicyConfig(AlgorithmConfig):
             )
 
     def updates_after(self, frames: int, last_frame: int, stored: int, batch_size: int) -> int:
-        """How many updates follow some frames.
+        """Returns the number of updates that follow some frames.
 
         Args:
             frames (int): frames that were played.
@@ -83,29 +83,36 @@ class OffPolicyConfig(AlgorithmConfig):
 
 @settings
 class PerStepConfig(OffPolicyConfig):
-    """One that makes an update after every step, with target networks that follow."""
+    """Base of the algorithms with an update after every step and with target networks."""
 
     name: str = ""
-    gamma: float = Field(default=0.99, ge=0, lt=1, description="discount")
-    tau: float = Field(default=0.005, gt=0, le=1, description="pace of the target networks")
+    gamma: float = Field(default=0.99, ge=0, lt=1, description="discount factor")
+    tau: float = Field(
+        default=0.005,
+        gt=0,
+        le=1,
+        description="rate of the soft update of the target networks; larger values follow faster",
+    )
     random_frames: int = Field(
-        default=1000, ge=0, description="frames with random actions, before learning starts"
+        default=1000, ge=0, description="frames with random actions before learning starts"
     )
     reward_scale: float | None = Field(
         default=1.0, gt=0, description="factor on rewards while learning; null: 1 - gamma"
     )
-    schedule: Literal["step", "episode"] = Field(default="step", description="when updates happen")
+    schedule: Literal["step", "episode"] = Field(
+        default="step", description="time of the updates: after every step or episode"
+    )
     replay_ratio: float | None = Field(
         default=None,
         gt=0,
-        description="times that a transition is drawn on average, instead of updates: "
-        "ratio * frames / batch_size of them",
+        description="average number of times that a transition is drawn, instead of updates: "
+        "ratio * frames / batch_size updates",
     )
     updates: int | None = Field(
         default=1,
         ge=1,
-        description="per step, or per episode; null: by the replay ratio, else one, or one pass "
-        "over the buffer",
+        description="updates per step, or per episode; null: by the replay ratio, otherwise one"
+        " per step, or one pass over the buffer per episode",
     )
 
 
@@ -118,38 +125,43 @@ class PPORPEConfig(OffPolicyConfig):
     usual_replay_ratio: ClassVar[float | None] = 10.0
 
     name: str = "ppo_rpe"
-    gamma: float = Field(default=0.99, ge=0, lt=1, description="discount")
+    gamma: float = Field(default=0.99, ge=0, lt=1, description="discount factor")
     kappa: float = Field(
-        default=0.5, gt=0, description="share of the largest ratio deviation that is allowed"
+        default=0.5, gt=0, description="allowed share of the largest ratio deviation"
     )
     beta: float = Field(
-        default=0.5, gt=0, lt=1, description="mixture of the relative density ratio"
+        default=0.5, gt=0, lt=1, description="mixture factor of the relative density ratio"
     )
     decay: float = Field(
-        default=0.999, ge=0, le=1, description="of the largest deviation, per update"
+        default=0.999, ge=0, le=1, description="decay of the largest deviation, per update"
     )
-    delta_min: float = Field(default=0.1, gt=0, le=1, description="floor of that deviation")
+    delta_min: float = Field(
+        default=0.1, gt=0, le=1, description="smallest value of the largest deviation"
+    )
     threshold: Literal["max", "ema"] = Field(
-        default="max", description="how the deviation is tracked [inferred: max]"
+        default="max", description="tracking of the largest deviation: max or ema [inferred: max]"
     )
     critic_weighting: Literal["ratio", "none"] = Field(
-        default="none", description="weight of the value loss [inferred: none]"
+        default="none", description="weight of the value loss: ratio or none [inferred: none]"
     )
     baseline: Literal["stored", "target"] = Field(
-        default="stored", description="likelihood that the ratio is taken to [inferred: stored]"
+        default="stored",
+        description="likelihood in the denominator of the ratio: stored or target [inferred: "
+        "stored]",
     )
     importance: Literal["max", "mean"] = Field(
         default="max",
-        description="what the weights of prioritized replay are divided by [inferred: max]",
+        description="divisor of the weights of prioritized replay: max or mean [inferred: max]",
     )
     reduction: Literal["mean", "sum"] = Field(
         default="sum",
-        description="of losses and regularization over the batch; a sum lifts gradients above the "
-        "optimizer's eps [inferred: sum]",
+        description="reduction of losses and regularization over the batch; a sum lifts "
+        "gradients above the optimizer's eps [inferred: sum]",
         json_schema_extra=neutral("mean"),
     )
     acting_policy: Literal["target", "online"] = Field(
-        default="target", description="which copy of the policy acts [inferred: target]"
+        default="target",
+        description="copy of the policy that acts: target or online [inferred: target]",
     )
     reward_scale: float | None = Field(
         default=None,
@@ -157,51 +169,57 @@ class PPORPEConfig(OffPolicyConfig):
         description="factor on rewards while learning; null: 1 - gamma [inferred]",
     )
     squash: Literal["tanh", "sigmoid", "none"] = Field(
-        default="tanh", description="how actions are kept in their bounds [inferred: tanh]"
+        default="tanh", description="function that keeps actions in their bounds [inferred: tanh]"
     )
     time_limit: Literal["truncated", "terminated"] = Field(
         default="truncated",
-        description="whether the value at a time limit is that of the state, or 0 as at a terminal "
-        "one [inferred: truncated]",
+        description="value at a time limit: of the state (truncated), or 0 as at a terminal "
+        "state [inferred: truncated]",
         json_schema_extra=neutral("truncated"),
     )
     initial_scale: float = Field(
         default=1.0,
         gt=0.01,
-        description="deviation of the policy's normal at first, before the squashing [inferred: 1]",
+        description="initial standard deviation of the policy, before the squashing [inferred: 1]",
         json_schema_extra=neutral(1.0),
     )
     hidden: Layers = Field(
         default=(100, 100), description="neurons of the hidden layers of both networks [paper]"
     )
     num_heads: int = Field(
-        default=5, ge=1, description="outputs of the value network; the value is their mean [paper]"
+        default=5, ge=1, description="heads of the value network; the value is their mean [paper]"
     )
     squish_b: float = Field(
         default=4.0, gt=0, description="bend of the Squish activation [inferred]"
     )
     schedule: Literal["episode", "step"] = Field(
-        default="episode", description="when updates happen [inferred: after each episode]"
+        default="episode",
+        description="time of the updates: after every episode or step [inferred: after each "
+        "episode]",
     )
     replay_ratio: float | None = Field(
         default=usual_replay_ratio,
         gt=0,
-        description="times that a transition is drawn on average: ratio * frames / batch_size "
-        "updates [inferred: 10]",
+        description="average number of times that a transition is drawn: ratio * frames / "
+        "batch_size updates [inferred: 10]",
     )
     updates: int | None = Field(
         default=None,
         ge=1,
-        description="per episode, or per step, instead; null: by the replay ratio, and where that "
-        "is null too, one pass over the buffer, or one",
+        description="updates per episode, or per step; null: by the replay ratio. If that is "
+        "null, too: one pass over the buffer per episode, or one update per step",
     )
     tau: float = Field(
-        default=0.1, gt=0, le=1, description="t-soft update: pace of the target networks [paper]"
+        default=0.1,
+        gt=0,
+        le=1,
+        description="rate of the t-soft update of the target networks [paper]",
     )
     nu: float = Field(
         default=1.0,
         ge=1e-30,
-        description="t-soft update: degrees of freedom; larger is less robust [paper]",
+        description="degrees of freedom of the t-soft update; larger values are less robust "
+        "[paper]",
     )
 
     def __post_init__(self) -> None:
@@ -219,18 +237,21 @@ class SACConfig(PerStepConfig):
     """Soft actor-critic with a learned temperature."""
 
     name: str = "sac"
-    alpha_init: float = Field(default=1.0, gt=0, description="first temperature; it is learned")
+    alpha_init: float = Field(
+        default=1.0, gt=0, description="initial temperature, which is learned"
+    )
     target_entropy: float | None = Field(
         default=None,
-        description="entropy that the temperature keeps, of actions in the task's units: actions "
-        "over twice the range have log 2 more; null: minus the number of their dimensions",
+        description="target of the policy's entropy, of actions in the task's units: twice the "
+        "range adds log 2 per action; null: minus the number of action dimensions",
     )
     hidden: Layers = Field(
         default=(256, 256), description="neurons of the hidden layers of all networks"
     )
     scale_mapping: Literal["softplus", "exp"] = Field(
         default="softplus",
-        description="from the network's output to the policy's scale; exp: cut to e^-20 and e^2",
+        description="function from the network's output to the policy's scale; exp is cut to "
+        "e^-20 and e^2",
         json_schema_extra=neutral("softplus"),
     )
 
@@ -243,16 +264,23 @@ class TD3Config(PerStepConfig):
     exploration_noise: float = Field(
         default=0.1,
         ge=0,
-        description="standard deviation of the noise on actions, of half their range",
+        description="standard deviation of the action noise, relative to half the action's range",
     )
     policy_noise: float = Field(
-        default=0.2, ge=0, description="of the noise on the target's actions, likewise"
+        default=0.2,
+        ge=0,
+        description="standard deviation of the noise on target actions, relative to half the "
+        "action's range",
     )
-    noise_clip: float = Field(default=0.5, ge=0, description="largest such noise, likewise")
+    noise_clip: float = Field(
+        default=0.5,
+        ge=0,
+        description="largest noise on target actions, relative to half the action's range",
+    )
     policy_delay: int = Field(
         default=2,
         ge=1,
-        description="updates of the value per update of the policy and of the target networks",
+        description="updates of the value per update of the policy and the target networks",
     )
     hidden: Layers = Field(
         default=(256, 256), description="neurons of the hidden layers of all networks"
@@ -266,27 +294,34 @@ class PPOConfig(AlgorithmConfig):
     usual_replay: ClassVar[str] = "rollout"
 
     name: str = "ppo"
-    gamma: float = Field(default=0.99, ge=0, lt=1, description="discount")
+    gamma: float = Field(default=0.99, ge=0, lt=1, description="discount factor")
     gae_lambda: float = Field(
         default=0.95,
         ge=0,
         le=1,
-        description="of the advantage estimate: 0 is one-step, 1 is Monte Carlo",
+        description="lambda of the advantage estimate (GAE); 0: one step, 1: Monte Carlo",
     )
     clip_epsilon: float = Field(
-        default=0.2, gt=0, lt=1, description="largest change of the likelihood ratio that pays"
+        default=0.2,
+        gt=0,
+        lt=1,
+        description="clip range of the likelihood ratio; larger values allow larger updates",
     )
-    entropy_coeff: float = Field(default=0.0, ge=0, description="bonus on the policy's entropy")
-    critic_coeff: float = Field(default=0.5, gt=0, description="gain of the value loss")
+    entropy_coeff: float = Field(
+        default=0.0, ge=0, description="weight of the entropy bonus; larger values explore more"
+    )
+    critic_coeff: float = Field(default=0.5, gt=0, description="weight of the value loss")
     max_grad_norm: float = Field(
-        default=0.5, gt=0, description="gradients are scaled down to this norm"
+        default=0.5,
+        gt=0,
+        description="largest norm of the gradient; larger gradients are scaled down",
     )
     frames: int = Field(
         default=2048,
         ge=1,
-        description="at least so many, in whole episodes, are learned from at once",
+        description="frames per rollout; without num_envs at least so many, in whole episodes",
     )
-    epochs: int = Field(default=10, ge=1, description="passes over them")
+    epochs: int = Field(default=10, ge=1, description="passes over a rollout")
     hidden: Layers = Field(
         default=(64, 64), description="neurons of the hidden layers of both networks"
     )
@@ -294,40 +329,42 @@ class PPOConfig(AlgorithmConfig):
         default=1.0, gt=0, description="factor on rewards while learning; null: 1 - gamma"
     )
     schedule: Literal["rollout"] = Field(
-        default="rollout", description="updates follow every rollout"
+        default="rollout", description="time of the updates: after every rollout"
     )
     num_envs: int | None = Field(
         default=None,
         ge=1,
-        description="simulators that one policy plays at once, in turn, each for frames / num_envs "
-        "frames of a rollout, which an episode may outlast; null: whole episodes of one",
+        description="number of simulators, played in turn by one policy, each for frames / "
+        "num_envs frames per rollout; episodes may outlast a rollout. null: whole "
+        "episodes of one simulator",
     )
     clip_actions: bool = Field(
         default=False,
-        description="actions are those of a normal, clipped into their bounds for the task alone, "
-        "instead of squashed; needs num_envs",
+        description="normal policy whose actions are clipped into their bounds for the task "
+        "only, instead of a squashed one; needs num_envs",
     )
     log_scale: float | None = Field(
         default=None,
-        description="what the logarithm of the policy's scale begins with, where that does not "
-        "depend on the state; null: it does",
+        description="initial logarithm of the policy's scale, which then does not depend on the"
+        " state; null: it depends on the state",
     )
     orthogonal: bool = Field(
-        default=False, description="orthogonal first weights, small ones of the policy's output"
+        default=False, description="orthogonal initial weights, small at the policy's output"
     )
     activation: Literal["tanh", "relu"] = Field(
         default="tanh",
-        description="of the hidden layers of both networks",
+        description="activation of the hidden layers of both networks",
         json_schema_extra=neutral("tanh"),
     )
     normalize_observations: bool = Field(
         default=False,
-        description="by their running mean and deviation, which the policy keeps; needs num_envs",
+        description="normalization of observations by running mean and deviation, which the "
+        "policy keeps; needs num_envs",
     )
     normalize_rewards: bool = Field(
         default=False,
-        description="by the running deviation of their discounted sum while learning; needs "
-        "num_envs",
+        description="normalization of rewards by the running deviation of their discounted sum,"
+        " while learning; needs num_envs",
     )
 
     def __post_init__(self) -> None:
@@ -349,9 +386,11 @@ class DQNConfig(PerStepConfig):
     """Double deep Q-learning, for discrete actions."""
 
     name: str = "dqn"
-    epsilon_end: float = Field(default=0.05, ge=0, le=1, description="last share of random actions")
+    epsilon_end: float = Field(
+        default=0.05, ge=0, le=1, description="final probability of a random action"
+    )
     epsilon_frames: int = Field(
-        default=10_000, ge=1, description="frames until that share is reached"
+        default=10_000, ge=1, description="frames until epsilon_end is reached"
     )
     hidden: Layers = Field(default=(120, 84), description="neurons of the hidden layers")
 

@@ -31,7 +31,7 @@ from torchrl_l2c2.experiment.settings.tasks import TASKS, TaskConfig
 
 @settings
 class LoggerConfig:
-    """Where metrics go: metrics.csv, a line per episode; the others get them as well."""
+    """Logger of the metrics, in addition to metrics.csv, which has a line per episode."""
 
     name: Literal["csv", "tensorboard", "wandb", "mlflow"] = Field(
         default="csv", json_schema_extra=CHANGES_NO_NUMBERS
@@ -60,7 +60,7 @@ STEERING = {"outputs", "experiment", "preset", "resume", "allow_other_versions"}
 
 @settings
 class ExperimentConfig:
-    """Everything one run depends on; the defaults are those of ``python train.py``.
+    """Settings of a run, with the defaults of ``python train.py``.
 
     Left out, ``replay`` and ``optimizer`` are the algorithm's usual ones, and
     ``regularizer`` is L2C2 with the preset of the algorithm, or else the paper's settings; an
@@ -87,43 +87,44 @@ class ExperimentConfig:
         default=0,
         ge=0,
         lt=2**31,
-        description="of everything that is random in the run",
+        description="random seed of the run",
     )
     device: str = Field(
         default="cpu",
-        description="of the updates and what they learn from: cpu, cuda or cuda:N; episodes are "
-        "played on the CPU, by a copy of the policy",
+        description="device of the updates: cpu, cuda or cuda:N; episodes are played on the "
+        "CPU, by a copy of the policy",
         json_schema_extra=neutral("cpu"),
     )
     threads: int = Field(
         default=1,
         ge=1,
         le=1024,
-        description="of PyTorch; networks so small gain nothing from more",
+        description="threads of PyTorch; more do not speed up networks of this size",
         json_schema_extra=CHANGES_NO_NUMBERS,
     )
     num_workers: int = Field(
         default=1,
         ge=1,
         le=1024,
-        description="processes that play episodes, one each in a round with one policy, the last "
-        "round whole: 4 play 352 episodes where 350 are asked for; more than 1 needs "
-        "algorithm.schedule other than step",
+        description="processes that play episodes, one episode each per round; the last round "
+        "is played whole: 4 processes play 352 episodes instead of 350. More than 1"
+        " needs algorithm.schedule other than step",
     )
     compile: bool = Field(
         default=True,
-        description="compile updates and policies where a C++ compiler is found; false: eager",
+        description="compilation of updates and policies, where a C++ compiler is found; false:"
+        " eager",
     )
     on_nonfinite: Literal["stop", "skip"] = Field(
         default="stop",
-        description="what a batch whose loss or gradient is NaN or infinite does (skipped ones are "
-        "counted)",
+        description="reaction to a batch whose loss or gradient is NaN or infinite: stop the "
+        "run, or skip and count the batch",
     )
     test_episodes: int = Field(
         default=100,
         ge=0,
-        description="episodes played with the policy's mean, and as many with samples, after "
-        "training; 0: none, and no evaluation.json, so that reports pass the run over",
+        description="test episodes after training, with mean actions, and as many with sampled "
+        "actions; 0: no evaluation.json, and reports leave the run out",
         json_schema_extra=CHANGES_NO_NUMBERS,
     )
     evaluate_every: int = Field(
@@ -135,26 +136,26 @@ class ExperimentConfig:
     )
     record: bool = Field(
         default=False,
-        description="a test episode as video.mp4, after training (extra video)",
+        description="video.mp4 of a test episode, after training (extra video)",
         json_schema_extra=CHANGES_NO_NUMBERS,
     )
     late_share: float = Field(
         default=0.1,
         ge=0,
         le=1,
-        description="final fraction of training whose policies play one test episode each; 0: none",
+        description="final fraction of training whose policies play a test episode each; 0: none",
         json_schema_extra=CHANGES_NO_NUMBERS,
     )
     checkpoint_interval: float = Field(
         default=60.0,
         ge=0,
-        description="seconds between checkpoints, after episodes or rollouts",
+        description="seconds between checkpoints, which are written after episodes or rollouts",
         json_schema_extra=CHANGES_NO_NUMBERS,
     )
     checkpoint_keep: int = Field(
         default=2,
         ge=1,
-        description="newest checkpoints that stay in the folder",
+        description="number of newest checkpoints to keep",
         json_schema_extra=CHANGES_NO_NUMBERS,
     )
 
@@ -177,10 +178,10 @@ class ExperimentConfig:
         """Reads nested mappings, such as a resolved Hydra configuration.
 
         Args:
-            values (Mapping): by group and name; what a group leaves out is the default of its name,
-                which for ``l2c2`` is the paper's; ``outputs``, ``resume``, ``experiment`` and
-                ``allow_other_versions``, which steer where, whether and how often runs happen, are
-                passed over.
+            values (Mapping): Settings by group and name. Missing settings have the defaults of the
+                group's name, for ``l2c2`` the paper's settings. ``outputs``, ``resume``,
+                ``experiment`` and ``allow_other_versions`` are settings of the command, and are
+                ignored.
 
         Raises:
             SettingError: an unknown key, an unknown name, or a value outside its range.

@@ -1,7 +1,6 @@
-"""What a group of settings is: a frozen dataclass whose every field has a default, a range, a word.
+"""Groups of settings: frozen dataclasses whose fields have a default, a range and a meaning.
 
-Settings are read without importing torch, so that help and errors come at once: a setting imports
-what it makes when it makes it.
+Settings do not import torch: help and errors appear at once.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ def neutral(value: Any) -> dict[str, Any]:
 
 
 class SettingError(UserError):
-    """A setting that cannot be.
+    """A setting that is unknown or outside its range.
 
     Attributes:
         setting: its name within its group; empty where it is about several.
@@ -97,12 +96,12 @@ def read(make: Callable[..., Group], values: Mapping[str, Any], prefix: str) -> 
 def _plain(value: Any) -> Any:
     if isinstance(value, list):
         return tuple(map(_plain, value))
-    # Where a float is wanted, pydantic makes one of the integer.
+    # Pydantic turns the integer into a float where the field is a float.
     whole = isinstance(value, float) and value.is_integer() and abs(value) < 2**63
     return int(value) if whole else value
 
 
-# Of every group that was asked for: the command's help and its nodes ask many times.
+# A cache: the command's help and its nodes ask many times.
 _described: dict[type, dict[str, tuple[str, str]]] = {}
 
 

@@ -1,4 +1,4 @@
-"""Which settings tell a run from others: as a short code, and as the difference from defaults.
+"""Identity of a run: a short code, and the settings that differ from the defaults.
 
 The fields of the settings say it: their metadata are :data:`~.fields.CHANGES_NO_NUMBERS` and
 :func:`~.fields.neutral`.
@@ -60,12 +60,13 @@ def is_neutral(name: str, value: Any) -> bool:
 
 
 def by_name(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings by the names of the command line, those of groups as ``group.name``.
+    """Settings by the names of the command line; settings of groups as ``group.name``.
 
     As JSON has them, where a tuple and a list are the same.
 
     Args:
-        settings (Mapping): of ``config.json``, of a checkpoint, or ``ExperimentConfig.to_dict()``.
+        settings (Mapping): Content of ``config.json`` or of a checkpoint, or result of
+            ``ExperimentConfig.to_dict()``.
     """
     flat: dict[str, Any] = {}
     for name, value in json.loads(json.dumps(settings)).items():
@@ -74,14 +75,14 @@ def by_name(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def differing(saved: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """The settings that decide a run's numbers, and are others now than they were then.
+    """Settings that change a run's numbers and have changed.
 
     Args:
-        saved (Mapping): of ``config.json`` or of a checkpoint.
-        now (Mapping): of ``ExperimentConfig.to_dict()``.
+        saved (Mapping): Content of ``config.json`` or of a checkpoint.
+        now (Mapping): Result of ``ExperimentConfig.to_dict()``.
 
     Returns:
-        dict: by their names, what is chosen by name first, the value then and the one now.
+        dict: The old and the new value by name; choices of a group first.
     """
     before, after = by_name(saved), by_name(now)
     # The settings of another choice are others anyway.
@@ -110,19 +111,19 @@ def of_length(config: ExperimentConfig) -> list[str]:
     return [setting for setting, chosen in going.items() if chosen]
 
 
-# Chosen by name; what else these groups have are settings of what was chosen.
+# Groups that are chosen by name; their other fields are settings of the choice.
 _COMPARED = ("task", "algorithm", "regularizer")
 
 
 def fingerprint(config: Mapping[str, Any]) -> str:
     """Ten hexadecimal digits that two runs share if, and only if, they may be pooled.
 
-    They stand for every setting but the seed, the logger, the task's name, and those that change
-    none of the numbers or only the length of the training. A setting that is off (null, false, or
-    as older runs had it) does not count: one that is added later leaves the codes of older runs.
+    The seed, the logger and the task's name do not count. Neither do settings that change none of
+    the numbers, or only the length of the training. A setting that is off (null, false, or the
+    value of older runs) does not count either: a new setting keeps the codes of older runs.
 
     Args:
-        config (Mapping): of :func:`~.saved.read_config`; settings that it lacks have defaults.
+        config (Mapping): Content of ``config.json``; missing settings have their defaults.
 
     Raises:
         SettingError: a setting that is not known.
@@ -140,7 +141,7 @@ def differences(config: Mapping[str, Any]) -> dict[str, str]:
     """The settings that differ from the defaults of what the run's names choose.
 
     Args:
-        config (Mapping): of :func:`~.saved.read_config`.
+        config (Mapping): Content of ``config.json``.
 
     Returns:
         dict: such as ``{"algorithm.replay_ratio": "10", "task.episodes": "400"}``, sorted; without

@@ -1,4 +1,4 @@
-"""What a run's folder is called: its task, algorithm and regularizer, then what is not usual in it.
+"""Names of run folders: task, algorithm, regularizer, and settings that are not the defaults.
 
 Names are taken as they are by shells, Hydra's command line and every file system, and are the same
 for single runs and sweeps. The whole of the settings is in the folder's ``config.json``.
@@ -26,13 +26,12 @@ def run_name(config: ExperimentConfig) -> str:
     """The path of a run's folder below ``outputs``.
 
     Args:
-        config (ExperimentConfig): its settings.
+        config (ExperimentConfig): The run's settings.
 
     Returns:
         str: ``task/algorithm/regularizer/setting-value_setting-value/seed_0``, of letters, digits
-        and ``.+-_`` alone; without the fourth part where every setting is the usual one. Too long
-        a part is cut, and a hash of the whole stands for the rest; the regularizer's settings
-        come first then.
+        and ``.+-_`` only. The fourth part is missing if every setting has its default. A long part
+        is cut and ends with a hash; the regularizer's settings then come first.
 
     Examples:
         >>> from torchrl_l2c2.experiment import ExperimentConfig, L2C2Config
@@ -47,13 +46,13 @@ def run_name(config: ExperimentConfig) -> str:
 def _settings_part(config: ExperimentConfig) -> list[str]:
     unusual = list(_unusual(config))
     if sum(len(_written(*each[1:])) + 1 for each in unusual) > LONGEST + 1:
-        # What runs are compared in is not to be cut off.
+        # Keep the settings that runs are compared by.
         unusual.sort(key=lambda each: each[0] != "regularizer")
     return ["_".join(_written(*each[1:]) for each in unusual)] if unusual else []
 
 
 def _unusual(config: ExperimentConfig) -> Iterator[tuple[str, str, Any]]:
-    """The settings that change a run's numbers and are not those of its choices, with groups."""
+    """Settings that change a run's numbers and differ from its choices, with their groups."""
     usual_names = {
         "replay": config.algorithm.usual_replay,
         "optimizer": config.algorithm.usual_optimizer,

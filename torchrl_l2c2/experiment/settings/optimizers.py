@@ -33,11 +33,15 @@ class AdamConfig:
     betas: tuple[float, float] = Field(
         default=(0.9, 0.999), description="decay of the first and second moment, each in [0, 1)"
     )
-    eps: float = Field(default=1e-8, ge=0, description="added to the denominator")
+    eps: float = Field(
+        default=1e-8,
+        ge=0,
+        description="constant in the denominator; larger values make smaller steps",
+    )
     linear: bool = Field(
         default=False,
-        description="the learning rate falls to 0 in a line over the training that is asked for: a "
-        "run that is later continued for longer had a steeper line",
+        description="linear decay of the learning rate to 0 over the training. If a run is "
+        "later extended, its decay was steeper than in a run of the full length",
     )
 
     def __post_init__(self) -> None:

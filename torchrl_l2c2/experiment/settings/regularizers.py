@@ -21,8 +21,8 @@ READ_BY = {
 # The setting of regularizers that compare means.
 COMPARED_MEAN: Any = Field(
     default="loc",
-    description="loc: compare means before the squashing; action: after it. No difference for "
-    "deterministic policies (td3) [inferred: loc]",
+    description="means that are compared: before the squashing (loc) or after it (action); "
+    "no difference for deterministic policies (td3) [inferred: loc]",
 )
 
 
@@ -65,7 +65,7 @@ class GainConfig(RegularizerConfig):
     )
     gain_of: str = Field(
         default="action_variation",
-        description="metrics.csv column that gain=target keeps at or below gain_target; its "
+        description="column of metrics.csv that gain=target keeps at or below gain_target; its "
         "numbers must be at least 0",
         json_schema_extra=neutral("action_variation"),
     )
@@ -86,7 +86,7 @@ class GainConfig(RegularizerConfig):
         default=1.0,
         gt=0,
         le=1,
-        description="share of training after which the gain of gain=ramp is 1",
+        description="share of training after which gain=ramp is at full strength",
         json_schema_extra=neutral(1.0),
     )
 
@@ -146,8 +146,8 @@ class L2C2Config(GainConfig):
     num_samples: int = Field(default=1, ge=1, description="neighbors per transition [inferred: 1]")
     over_neighbors: Literal["mean", "max"] = Field(
         default="mean",
-        description="mean over a transition's neighbors [paper] or the largest penalty, which "
-        "needs num_samples above 1",
+        description="reduction over a transition's neighbors: their mean [paper], or the "
+        "largest penalty, which needs num_samples above 1",
         json_schema_extra=neutral("mean"),
     )
     fraction: float = Field(
@@ -284,7 +284,12 @@ class SR2LConfig(GainConfig):
         default=0.05, gt=0, description="half the width of the box, in the observation's units"
     )
     coeff: float = Field(default=0.1, ge=0, description="gain of the largest distance in the box")
-    steps: int = Field(default=10, ge=1, description="ascent steps to the largest distance")
+    steps: int = Field(
+        default=10,
+        ge=1,
+        description="ascent steps towards the worst state in the box; each costs a pass of the "
+        "policy",
+    )
     policy_distance: Literal["jeffreys", "hellinger", "mean", "mse", "kl"] = Field(
         default="jeffreys",
         description="distance of policies; deterministic policies are compared by their actions, "

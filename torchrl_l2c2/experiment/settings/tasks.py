@@ -21,11 +21,11 @@ TASKS: dict[str, TaskConfig] = {}  # by their names; filled below
 
 @dataclass(frozen=True)
 class Budget:
-    """How long a training is.
+    """Length of a training.
 
     Attributes:
-        total: so many episodes, or so many frames and what is left of their last episode.
-        unit: which of the two.
+        total: Number of episodes, or of frames; the last episode is played to its end.
+        unit: ``episode`` or ``frame``.
     """
 
     total: int
@@ -36,11 +36,11 @@ class Budget:
         return other if other.unit == self.unit and other.total > self.total else self
 
     def spent(self, episodes: int, frames: int) -> int:
-        """What a training of so many episodes and frames has used of it."""
+        """Returns the part that a training of these episodes and frames has used."""
         return episodes if self.unit == "episode" else frames
 
     def is_late(self, spent: int, share: float) -> bool:
-        """Whether a training is in the last share of it, which has one unit at least."""
+        """Checks whether a training is in its last share, of at least one unit."""
         return share > 0.0 and self.total - spent < max(1, round(self.total * share))
 
 
@@ -57,41 +57,43 @@ class TaskConfig:
         default=None,
         ge=0,
         le=1e9,
-        description="standard deviation of the white noise on every observation; null: the paper's "
-        ".01 for Swingup, none for other ids [paper]",
+        description="standard deviation of the noise on every observation; null: 0.01 for "
+        "Swingup, none for other tasks [paper]",
     )
     episodes: int = Field(
         default=350,
         ge=1,
-        description="to train for, unless frames are given [inferred: the paper states none]",
+        description="length of training in episodes, unless frames are given [inferred: the "
+        "paper states none]",
         json_schema_extra=CHANGES_NO_NUMBERS,
     )
     max_steps: int | None = Field(
         default=None,
         ge=1,
-        description="longest episode; null: as the task is registered with Gymnasium",
+        description="longest episode in steps; null: the task's own limit in Gymnasium",
     )
     solved_at: float | None = Field(
         default=None,
-        description="return at which the task counts as solved, a line in the picture",
+        description="return at which the task counts as solved: a line in the picture",
         json_schema_extra=CHANGES_NO_NUMBERS,
     )
     frames: int | None = Field(
         default=None,
         ge=1,
-        description="to train for instead of episodes, such as 1e6: training ends with the first "
-        "episode that reaches them, with algorithm.num_envs with the first rollout",
+        description="length of training in frames, instead of episodes, such as 1e6; it ends "
+        "with the first episode that reaches them, or with the first rollout if "
+        "algorithm.num_envs is set",
         json_schema_extra=CHANGES_NO_NUMBERS,
     )
     flatten: bool = Field(
         default=False,
-        description="make one vector of matrices, nested entries and labels (as one-hot vectors) "
-        "that are observed; several vectors become one, in the order of their names, without it",
+        description="one vector of matrices, nested entries and labels (as one-hot vectors). "
+        "Without it, several vectors are joined in the order of their names",
     )
     images: bool = Field(
         default=False,
-        description="the observation is an image, which small convolutional networks see, with its "
-        "values from 0 to 1; the replay buffer keeps two of them for every transition, as floats",
+        description="images as observations, with values from 0 to 1, for convolutional "
+        "networks; the replay buffer keeps two images of floats per transition",
     )
 
     action_rate: float = Field(
@@ -128,7 +130,7 @@ class TaskConfig:
 
     @property
     def budget(self) -> Budget:
-        """How long to train."""
+        """Length of the training."""
         return Budget(self.episodes) if self.frames is None else Budget(self.frames, "frame")
 
     def for_test(self) -> TaskConfig:
@@ -144,14 +146,14 @@ def _bullet(name: str, **settings: Any) -> TaskConfig:
     return TaskConfig(name.lower(), f"pybullet_envs_gymnasium:{name}BulletEnv-v0", **settings)
 
 
-# Noise, steps and the returns that count as solved are the paper's; episodes are inferred.
+# Noise, steps and the returns that count as solved are from the paper; episodes are inferred.
 PAPER_TASKS: dict[str, TaskConfig] = {
     "swingup": TaskConfig(max_steps=1000, solved_at=800.0),
     "reacher": _bullet("Reacher", noise_scale=0.01, episodes=4500, max_steps=150, solved_at=18.0),
     "hopper": _bullet("Hopper", noise_scale=0.001, episodes=750, max_steps=1000, solved_at=2500.0),
     "ant": _bullet("Ant", noise_scale=0.001, episodes=750, max_steps=1000, solved_at=2500.0),
 }
-# Those of the methods after it, without noise; conf/preset/rl_zoo/ says how long they train.
+# Tasks of later methods, without noise; conf/preset/rl_zoo/ has the length of training.
 FIELD_TASKS: dict[str, TaskConfig] = {
     "pendulum": TaskConfig("pendulum", "Pendulum-v1"),
     "lunarlander": TaskConfig("lunarlander", "LunarLanderContinuous-v3"),

@@ -1,4 +1,4 @@
-"""A video of policies beside one another, with the strip of their actions below."""
+"""A video of policies side by side, with their actions below."""
 
 from __future__ import annotations
 

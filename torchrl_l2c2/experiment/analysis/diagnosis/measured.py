@@ -38,9 +38,9 @@ class TermShare:
     """How much of a loss one of its terms is; NaN where it is not known.
 
     Attributes:
-        added: whether a regularizer has added it.
-        size: its part of the sum of all terms' sizes, late in training.
-        gradient: the norm of its gradient relative to that of the loss's own terms.
+        added: whether a regularizer added the term.
+        size: size divided by the sum of all terms' sizes, late in training.
+        gradient: norm of its gradient, divided by the norm of the gradient of the loss's own terms.
     """
 
     added: bool
@@ -50,35 +50,35 @@ class TermShare:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was measured of a policy, for words and pictures.
+    """Measurements of a policy, for findings and pictures.
 
     Attributes:
-        name: of the policy.
-        measures: means over the episodes: return, length, the paper's action variation, and the
-            field's measures as :func:`~torchrl_l2c2.experiment.evaluate_policy` names them.
+        name: name of the policy.
+        measures: means over the episodes: return, length, action variation, and the other measures
+            of :func:`~torchrl_l2c2.experiment.evaluate_policy`.
         actions: mean actions of the first episode, ``[T, A]``.
-        low: lower bounds of the actions, ``[A]``; of those that were seen, where there are none.
-        high: upper bounds, likewise.
-        bounded: whether the bounds are the task's.
-        observations: of the first episode, ``[T, F]``.
+        low: lower bounds of the actions, ``[A]``; without bounds, the smallest actions.
+        high: upper bounds of the actions, ``[A]``; without bounds, the largest actions.
+        bounded: whether the task has these bounds.
+        observations: observations of the first episode, ``[T, F]``.
         policy_lipschitz: local Lipschitz constants of the mean action there, ``[T]``; NaN where
             the observation does not move.
-        value_lipschitz: those of the value function; ``None`` without one.
-        distance: of the neighbors from their states, the largest :math:`|u_i|`, ``[T * K]``.
-        neighborhood: that the neighbors were drawn from.
+        value_lipschitz: local Lipschitz constants of the value function, or ``None``.
+        distance: distances of the neighbors, the largest :math:`|u_i|`, ``[T * K]``.
+        neighborhood: neighborhood that the neighbors were drawn from.
         unmoved: share of the steps in which a coordinate does not change at all, ``[F]``.
-        noise_scale: standard deviation of the noise that sensitivity was measured with.
+        noise_scale: standard deviation of the noise on observations.
         noise_action: root mean square change of the action by this noise.
-        noise_share: the part of the action's mean squared change from step to step that such
-            noise, drawn anew at every step, makes alone.
-        spread: standard deviation of the policy's samples, clipped into their bounds, of half the
-            actions' range; 0 for a deterministic policy, NaN for discrete actions.
-        rate: actions per second; ``None`` where it is not known.
-        shares: of the loss's terms.
-        entries: what the coordinates of an observation are called.
+        noise_share: mean squared change of the action per step that this noise causes, divided by
+            the whole mean squared change.
+        spread: standard deviation of the policy's samples, clipped into their bounds, relative to
+            half the actions' range; 0 for a deterministic policy, NaN for discrete actions.
+        rate: actions per second, or ``None``.
+        shares: shares of the loss's terms.
+        entries: names of the observation's coordinates.
         pictures: pictures ``[H, W, 3]`` of the first episode, from the reset on; may be empty.
         picture_every: steps from one picture to the next.
-        task: a run's, by its id; empty where it is not known.
+        task: id of the task, or empty.
     """
 
     name: str
@@ -120,10 +120,9 @@ class Diagnosis:
         return self.neighborhood.gain(self.distance + self.neighborhood.epsilon)
 
     def worst(self, number: int = 5) -> list[int]:
-        """Steps with the largest local Lipschitz constants of the policy, from the worst on.
+        """Steps with the largest local Lipschitz constants of the policy, the worst first.
 
-        No two are within a fiftieth of the episode or within ``SAME_PLACE``, so that one place is
-        not listed twice.
+        Steps that are within a fiftieth of the episode, or within ``SAME_PLACE``, count once.
         """
         left = self.policy_lipschitz.nan_to_num(-math.inf).clone()
         left[left <= 0.0] = -math.inf
@@ -152,32 +151,32 @@ def diagnose(
     noise_scale: float = 0.01,
     seed: int = 0,
 ) -> Diagnosis:
-    """Plays test episodes with any TorchRL actor, and measures what its shaking is made of.
+    """Plays test episodes with any TorchRL actor, and measures how and why it shakes.
 
     Args:
         policy (TensorDictModule): reads one observation and writes the action, its mean under
             ``ExplorationType.DETERMINISTIC`` and a sample under ``RANDOM``.
-        env (EnvBase): a single environment, seeded by who made it.
+        env (EnvBase): a single environment, already seeded.
 
     Keyword Args:
-        name (str): what it is called beside others. Default ``"policy"``.
-        episodes (int): how many, at least 1. The measures are means over them, all else is of the
-            first. Default 3.
+        name (str): name of the policy, for comparisons. Default ``"policy"``.
+        episodes (int): number of episodes, at least 1. The measures are means over episodes; all
+            other results are from the first episode. Default 3.
         max_steps (int): longest episode. Default 1000.
-        neighborhood (Neighborhood, optional): where local Lipschitz constants are taken. Default:
+        neighborhood (Neighborhood, optional): region of the local Lipschitz constants. Default:
             ``Neighborhood()``.
-        num_neighbors (int): of every state, at least 1; more find steeper places. Default 16.
+        num_neighbors (int): neighbors per state, at least 1; more find steeper places. Default 16.
         value (callable, optional): observations ``[N, *F]`` and actions ``[N, *A]`` to values, to
-            see how steep the value function is. Default: none is looked at.
-        noise_scale (float): standard deviation of the noise on observations that the policy's
-            sensitivity is measured with, greater than 0. Default .01.
-        seed (int): of neighbors, noise and samples. Default 0.
+            measure the value function, too. Default: none.
+        noise_scale (float): standard deviation of the noise on observations, greater than 0.
+            Default 0.01.
+        seed (int): random seed of neighbors, noise and samples. Default 0.
 
     Returns:
-        Diagnosis: for :func:`~.words.findings` and :func:`~.page.write_page`.
+        Diagnosis: The input of :func:`~.words.findings` and :func:`~.page.write_page`.
 
     Raises:
-        TypeError: the environment is none of TorchRL's.
+        TypeError: the environment is not an environment of TorchRL.
         ValueError: the environment is a batch of several, the policy reads more than one of its
             observations, or an episode is shorter than four steps.
         FloatingPointError: an observation, an action or a reward is not finite.
@@ -245,8 +244,8 @@ def _observed(policy: TensorDictModule, env: EnvBase) -> NestedKey:
         )
     if env.batch_size:
         raise ValueError(
-            f"one environment is diagnosed, got a batch of {tuple(env.batch_size)}: give the one "
-            "that it is made of."
+            f"Expected one environment, got a batch of {tuple(env.batch_size)}: pass a single "
+            "environment."
         )
     if len(keys := list(policy.in_keys)) != 1:
         raise ValueError(
@@ -275,7 +274,7 @@ def _steepness(
     num_neighbors: int,
     generator: torch.Generator,
 ) -> dict[str, Any]:
-    """Distances, and local Lipschitz constants along an episode, some of its steps at a time."""
+    """Distances, and local Lipschitz constants along an episode, some steps at a time."""
     found: dict[str, list[Tensor]] = {"policy": [], "value": [], "distance": []}
     for part in episode.split(STEPS_AT_ONCE):
         state, action = part[key].float(), part[action_key]
@@ -317,7 +316,7 @@ def _means(played: Sequence[TensorDictBase], env: EnvBase) -> dict[str, float]:
 
 
 def _bounds(spec: TensorSpec, actions: Tensor) -> tuple[Tensor, Tensor, bool]:
-    """Of the task, else of what was seen."""
+    """Bounds of the task, or else of the played actions."""
     if isinstance(spec, Bounded) and spec.dtype.is_floating_point:
         low, high = (bound.flatten().float().cpu() for bound in (spec.space.low, spec.space.high))
         if low.isfinite().all() and high.isfinite().all():

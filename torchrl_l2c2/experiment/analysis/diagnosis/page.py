@@ -1,4 +1,4 @@
-"""One page that shows why policies shake, beside one another."""
+"""One page that shows why policies shake, side by side."""
 
 from __future__ import annotations
 
@@ -53,14 +53,14 @@ FIRST = {"return": "return", "length": "steps", "action_variation": "action vari
 
 
 def write_page(path: str | Path, diagnoses: Diagnosis | Sequence[Diagnosis]) -> Path:
-    """Writes the page of one or several diagnoses, beside one another; it needs no other file.
+    """Writes one page with one or several diagnoses side by side; it needs no other file.
 
     Args:
-        path (str or Path): of the HTML file.
-        diagnoses (Diagnosis or sequence of them): at least one, with names of their own.
+        path (str or Path): The HTML file.
+        diagnoses (Diagnosis or sequence of them): At least one, with different names.
 
     Returns:
-        Path: of the file.
+        Path: The file.
 
     Raises:
         ValueError: there is no diagnosis.

@@ -1,4 +1,4 @@
-"""What is wrong with a policy and where, in words: rules on what was measured."""
+"""Findings about a policy in words: rules and thresholds on the measurements."""
 
 from __future__ import annotations
 
@@ -73,17 +73,17 @@ THRESHOLDS = {
         "share of something within a tenth of the episode from which it is said where",
     ),
 }
-"""Number and meaning of every constant of the rules."""
+"""Value and meaning of every threshold."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that is so about a policy.
+    """A finding about a policy.
 
     Attributes:
-        kind: which rule it is of, such as ``"flips"``.
-        text: a sentence or two with the numbers, and where in the episode.
-        fault: whether it is something to mend.
+        kind: name of the rule, such as ``"flips"``.
+        text: one or two sentences, with the numbers and the place in the episode.
+        fault: whether it is a problem.
     """
 
     kind: str
@@ -92,10 +92,10 @@ class Finding:
 
 
 def findings(diagnosis: Diagnosis) -> list[Finding]:
-    """What the rules say, the most important first; never empty.
+    """Lists the findings, the most important first; never empty.
 
     Args:
-        diagnosis (Diagnosis): of :func:`~.measured.diagnose`.
+        diagnosis (Diagnosis): Result of :func:`~.measured.diagnose`.
     """
     if all(_still(diagnosis)):
         told = [_stillness(diagnosis)]
@@ -114,10 +114,10 @@ def summary(diagnosis: Diagnosis) -> str:
 
 
 def comparison(diagnoses: Sequence[Diagnosis]) -> list[str]:
-    """What is different about each policy, in a sentence, beside the first of them.
+    """Compares each policy with the first one, in a sentence.
 
     Args:
-        diagnoses (sequence of Diagnosis): at least one; those of another task are not compared.
+        diagnoses (sequence of Diagnosis): At least one; policies of other tasks are not compared.
     """
     first, *others = diagnoses
     return [
@@ -160,7 +160,7 @@ def _stillness(diagnosis: Diagnosis) -> Finding:
 
 
 def _actions(diagnosis: Diagnosis) -> Iterator[Finding]:
-    """Of every dimension that moves, by itself."""
+    """Findings about each action dimension that moves."""
     relative, still = diagnosis.relative, _still(diagnosis)
     for number in range(relative.shape[1]):
         if still[number]:
@@ -209,12 +209,12 @@ def _flips(name: str, action: Tensor, gain: float, rate: float | None) -> Findin
         "flips",
         f"{name} flips from step to step, which is shaking at {speed}: its gain on the action "
         f"before is {gain:.2f} and it turns back at {back.mean():.0%} of the steps, by "
-        f"{_change(action):.1%} of its range in the mean; {_where(back * change[1:].abs())}.",
+        f"{_change(action):.1%} of its range on average; {_where(back * change[1:].abs())}.",
     )
 
 
 def _steepest(diagnosis: Diagnosis) -> Iterator[Finding]:
-    """Where among the observations."""
+    """The observation at which the policy is steepest."""
     for step in diagnosis.worst(1):
         values = diagnosis.observations[step].tolist()
         seen = [f"{e} = {v:.2g}" for e, v in zip(diagnosis.entries, values, strict=True)]
@@ -229,7 +229,7 @@ def _steepest(diagnosis: Diagnosis) -> Iterator[Finding]:
 
 
 def _reasons(diagnosis: Diagnosis) -> Iterator[Finding]:
-    """Why the actions move as they do."""
+    """Causes of the movement."""
     shaking = _change(diagnosis.relative) > SMOOTH
     if diagnosis.noise_share >= NOISY and shaking:
         yield Finding(
@@ -259,7 +259,7 @@ def _reasons(diagnosis: Diagnosis) -> Iterator[Finding]:
 
 
 def _training(diagnosis: Diagnosis) -> Iterator[Finding]:
-    """Of the regularizer's terms, by their gradients where these are known."""
+    """Findings about the regularizer's terms, by their gradients if these are known."""
     for measured, what in (
         ("gradient", "of the gradient of the loss's own terms"),
         ("size", "of the loss, late in training"),
@@ -305,7 +305,7 @@ def _change(relative: Tensor) -> float:
 
 
 def _where(amount: Tensor) -> str:
-    """In which tenth of an episode most of something ``[T, 1]`` is."""
+    """The tenth of an episode that has most of an amount ``[T, 1]``."""
     length = -(-len(amount) // 10)
     tenths = [part.sum().item() for part in amount.split(length)]
     most = max(range(len(tenths)), key=tenths.__getitem__)

@@ -210,7 +210,7 @@ def _matrix(groups: Sequence[Group], test: str, quantity: str) -> Scores:
 
 
 def estimate_cell(estimate: Estimate | None, quantity: str) -> str:
-    """With its interval, and the digits that its quantity is told with; a dash without one."""
+    """Cell of an estimate with its interval, in the digits of its quantity; a dash for ``None``."""
     if estimate is None:
         return "-"
-    return estimate.text(partial(number, quantity=quantity, beside=estimate.value))
+    return estimate.text(partial(number, quantity=quantity, like=estimate.value))

@@ -19,12 +19,12 @@ td { white-space: nowrap; } img { max-width: 100%; } p { font-size: 13px; color:
 
 
 def whole_page(title: str, parts: Iterable[str], style: str = "") -> str:
-    """A page of these elements.
+    """Returns a page of these elements.
 
     Args:
-        title (str): of the browser's window.
+        title (str): title of the browser window.
         parts (iterable of str): elements, as HTML.
-        style (str): rules beside those of ``STYLE``.
+        style (str): CSS rules in addition to ``STYLE``.
     """
     head = (
         f'<meta charset="utf-8"><title>{html.escape(title)}</title>\n'

@@ -172,8 +172,8 @@ def subplots(across: int, down: int, size: tuple[float, float]) -> tuple[Any, li
     """A figure without a window, and its axes row by row.
 
     Args:
-        across (int): axes beside one another.
-        down (int): rows of axes.
+        across (int): number of axes per row.
+        down (int): number of rows.
         size (tuple): width and height in inches.
     """
     # Imported here: drawing takes a second to import and no other function needs it.
@@ -191,11 +191,11 @@ def finish(
     """Gives a figure its grid, title and legend, and writes it.
 
     Args:
-        figure: of :func:`subplots`.
-        axes: likewise.
-        title (str): above all of them.
-        path (str or Path): of the file; its ending decides what it is.
-        description (str, optional): of what it is drawn, for the file's own description.
+        figure: figure of :func:`subplots`.
+        axes: axes of :func:`subplots`.
+        title (str): title above all axes.
+        path (str or Path): the file; its ending is the format.
+        description (str, optional): description that is stored in the file.
     """
     named: dict[str, Any] = {}
     for axis in axes:

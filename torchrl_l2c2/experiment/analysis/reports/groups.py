@@ -76,9 +76,10 @@ def by_task(groups: Iterable[Group]) -> list[list[Group]]:
 
 
 def baseline_of(group: Group, groups: Iterable[Group]) -> Group | None:
-    """The vanilla runs with the same other settings; ``None`` for themselves or without any.
+    """Finds the baseline runs with the same other settings.
 
-    And where there are several, of other defaults: nothing says beside which of them it belongs.
+    ``None`` for the baseline itself, if there are none, and if there are several with different
+    defaults.
     """
     if group.first.method == "none":
         return None

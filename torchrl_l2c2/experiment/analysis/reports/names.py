@@ -33,14 +33,14 @@ def method_name(method: str) -> str:
 
 
 def name_with_settings(method: str, settings: Mapping[str, str | None]) -> tuple[str, set[str]]:
-    """How a method is called with settings of its own, and which of them the name tells.
+    """Name of a method with its own settings, and the settings that the name contains.
 
-    L2C2 is told by its distance and its gain, or what this follows: by itself it is the paper's,
-    with Hellinger's and the paper's gains, whatever else it may be elsewhere.
+    The name of L2C2 contains its distance and its gain, or the target of the gain. "L2C2" without
+    them has the Hellinger distance and the gains of the paper.
 
     Args:
-        method (str): its name.
-        settings (Mapping): what differs from its defaults, as records have it.
+        method (str): The method's name.
+        settings (Mapping): Settings that differ from the defaults, as in records.
 
     Examples:
         >>> name_with_settings("l2c2", {"regularizer.beta": "0.5"})

@@ -2,7 +2,7 @@
 
 As proposed by Agarwal et al., *Deep Reinforcement Learning at the Edge of the Statistical
 Precipice*, NeurIPS 2021, arXiv:2108.13264. Their package ``rliable`` (1.2.0) cannot be imported
-beside pandas 3, which it needs and does not pin; its definitions are kept.
+with pandas 3, so its definitions are repeated here.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def mean(scores: Scores) -> Scores:
 
 
 def interquartile_mean(scores: Scores) -> Scores:
-    """Mean of the middle half of all scores: outliers count less than in the mean.
+    """Mean of the middle half of all scores: outliers count less than in a mean.
 
     Of ``n`` scores the ``floor(n / 4)`` smallest and largest are left out; fewer than four are
     all kept.
@@ -73,7 +73,7 @@ def probability_of_improvement(scores: Scores, baseline: Scores) -> Scores:
     Args:
         scores (array): ``[..., runs, tasks]``; larger is better, so negate what should be small.
             NaN where a task has fewer runs than others.
-        baseline (array): ``[..., other runs, tasks]``, likewise.
+        baseline (array): ``[..., other runs, tasks]``, in the same form.
 
     Returns:
         Array of shape ``[...]``.

@@ -101,15 +101,15 @@ def runs_table(records: Sequence[Record]) -> Table:
     return Table("Every run", columns, rows)
 
 
-def number(value: float, quantity: str, beside: float | None = None) -> str:
-    """A number with the digits that its quantity is told with; a dash where it is not known.
+def number(value: float, quantity: str, like: float | None = None) -> str:
+    """Formats a number with the digits of its quantity; a dash if it is unknown.
 
     Args:
-        value (float): to write.
+        value (float): The number.
         quantity (str): returns of 100 and more have one digit, others two; all else has three.
-        beside (float, optional): the number that it belongs to and whose digits it gets.
+        like (float, optional): The number whose digits it gets, such as the mean of an interval.
     """
-    size = abs(value if beside is None else beside)
+    size = abs(value if like is None else like)
     digits = 3 if quantity != "return" else 1 if size >= 100 else 2
     return or_dash(value, f".{digits}f")
 
