@@ -8,12 +8,15 @@ which sum the losses by name. With the regularizer they have two lines more: ``s
 
 from __future__ import annotations
 
+import argparse
 import csv
 import subprocess
-import sys
 import time
+from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 
+import numpy as np
 import torch
 from tensordict.nn import TensorDictSequential
 from torchrl.collectors import Collector
@@ -30,20 +33,23 @@ from torchrl.objectives import ClipPPOLoss, LossModule, SACLoss, SoftUpdate, TD3
 from torchrl.objectives.value import GAE
 
 from torchrl_l2c2 import action_variation, make_actor, make_critic, smooth
+from torchrl_l2c2.experiment.analysis.reports.comparison import Estimate
+from torchrl_l2c2.experiment.analysis.reports.statistics import mean, probability_of_improvement
 
 SEEDS = range(10)
 TEST_EPISODES = 10
+METHODS = ("baseline", "smooth")
 COLUMNS = ["algorithm", "method", "seed", "return", "action_variation", "seconds", "commit"]
 
 
-def train_sac(seed: int, smoothed: bool, frames: int = 5_000) -> torch.nn.Module:
+def train_sac(seed: int, strength: float | None, frames: int = 5_000) -> torch.nn.Module:
     """SAC, an update every other frame, on losses that are summed by name."""
     env = pendulum(seed)
     actor, qvalue = make_actor(3, env.action_spec, hidden=(64, 64)), make_qvalue()
     loss: LossModule = SACLoss(actor, qvalue, action_spec=env.action_spec)
     loss.make_value_estimator(gamma=0.95)
-    if smoothed:
-        loss = smooth(loss)
+    if strength is not None:
+        loss = smooth(loss, strength=strength)
     updater = SoftUpdate(loss, tau=0.01)
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
     replay = TensorDictReplayBuffer(storage=LazyTensorStorage(frames), batch_size=64)
@@ -51,7 +57,7 @@ def train_sac(seed: int, smoothed: bool, frames: int = 5_000) -> torch.nn.Module
         env, actor, frames_per_batch=50, total_frames=frames, init_random_frames=500
     )
     for number, collected in enumerate(collector):
-        if smoothed:
+        if strength is not None:
             loss.set_progress(50 * number / frames)
         replay.extend(collected)
         for _ in range(25 if len(replay) >= 500 else 0):
@@ -64,7 +70,7 @@ def train_sac(seed: int, smoothed: bool, frames: int = 5_000) -> torch.nn.Module
     return actor
 
 
-def train_td3(seed: int, smoothed: bool, frames: int = 5_000) -> torch.nn.Module:
+def train_td3(seed: int, strength: float | None, frames: int = 5_000) -> torch.nn.Module:
     """TD3, which calls the parts of the loss by themselves."""
     env = pendulum(seed)
     network = MLP(in_features=3, out_features=1, num_cells=[64, 64])
@@ -73,8 +79,8 @@ def train_td3(seed: int, smoothed: bool, frames: int = 5_000) -> torch.nn.Module
     noise = AdditiveGaussianModule(env.action_spec, sigma_init=0.2, sigma_end=0.2)
     loss: LossModule = TD3Loss(actor, make_qvalue(), action_spec=env.action_spec)
     loss.make_value_estimator(gamma=0.95)
-    if smoothed:
-        loss = smooth(loss)
+    if strength is not None:
+        loss = smooth(loss, strength=strength)
     updater = SoftUpdate(loss, tau=0.01)
     actor_optimizer = torch.optim.Adam(loss.actor_network_params.flatten_keys().values(), lr=1e-3)
     critic_optimizer = torch.optim.Adam(loss.qvalue_network_params.flatten_keys().values(), lr=1e-3)
@@ -87,7 +93,7 @@ def train_td3(seed: int, smoothed: bool, frames: int = 5_000) -> torch.nn.Module
         init_random_frames=500,
     )
     for number, collected in enumerate(collector):
-        if smoothed:
+        if strength is not None:
             loss.set_progress(50 * number / frames)
         replay.extend(collected)
         for update in range(50 if len(replay) >= 500 else 0):
@@ -106,21 +112,21 @@ def train_td3(seed: int, smoothed: bool, frames: int = 5_000) -> torch.nn.Module
     return actor
 
 
-def train_ppo(seed: int, smoothed: bool, frames: int = 30_720) -> torch.nn.Module:
+def train_ppo(seed: int, strength: float | None, frames: int = 30_720) -> torch.nn.Module:
     """PPO on rollouts of 2,048 frames, with rewards of about 1."""
     env = TransformedEnv(pendulum(seed), RewardScaling(loc=0.0, scale=0.1))
     actor, critic = make_actor(3, env.action_spec, hidden=(64, 64)), make_critic(3, hidden=(64, 64))
     loss: LossModule = ClipPPOLoss(actor, critic, normalize_advantage=True, entropy_coeff=0.0)
     advantage = GAE(gamma=0.9, lmbda=0.95, value_network=critic)
-    if smoothed:
-        loss = smooth(loss)
+    if strength is not None:
+        loss = smooth(loss, strength=strength)
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
     replay = TensorDictReplayBuffer(
         storage=LazyTensorStorage(2_048), sampler=SamplerWithoutReplacement(), batch_size=128
     )
     collector = Collector(env, actor, frames_per_batch=2_048, total_frames=frames)
     for number, rollout in enumerate(collector):
-        if smoothed:
+        if strength is not None:
             loss.set_progress(number * 2_048 / frames)
         for _ in range(8):
             with torch.no_grad():
@@ -166,32 +172,68 @@ def evaluate(actor: torch.nn.Module) -> tuple[float, float]:
     return torch.stack(returns).mean().item(), torch.stack(variations).mean().item()
 
 
-def main(path: Path) -> None:
+def table(path: Path) -> str:
+    """Means with 95% intervals over the seeds that both methods have, and probabilities."""
+    with path.open(newline="") as file:
+        found = {(r["algorithm"], r["method"], r["seed"]): r for r in csv.DictReader(file)}
+    columns = ["algorithm (seeds)", "action variation: baseline", "with `smooth`", "P(smoother)"]
+    columns += ["return: baseline", "with `smooth`", "P(returns more)"]
+    rows = [columns, ["---"] * len(columns)]
+    for algorithm in ALGORITHMS:
+        both = [
+            seed
+            for seed in map(str, SEEDS)
+            if all((algorithm, method, seed) in found for method in METHODS)
+        ]
+        cells = [f"{algorithm} ({len(both)})"]
+        for name, sign, digits in (("action_variation", -1.0, 3), ("return", 1.0, 1)):
+            scores = [
+                np.array([[float(found[algorithm, method, seed][name])] for seed in both])
+                for method in METHODS
+            ]
+            means = [Estimate.of(mean, each) for each in scores]
+            better = Estimate.of(
+                probability_of_improvement, *(sign * each for each in scores[::-1])
+            )
+            write = f"{{:.{digits}f}}".format
+            cells += ["" if each is None else each.text(write) for each in means]
+            cells.append("" if better is None else better.text("{:.2f}".format))
+        rows.append(cells)
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
     """Makes the runs that the file lacks."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("file", type=Path)
+    parser.add_argument("--algorithms", nargs="+", choices=ALGORITHMS, default=list(ALGORITHMS))
+    parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
+    parser.add_argument("--strengths", nargs="+", type=float, default=[1.0])
+    chosen = parser.parse_args(arguments)
     torch.set_num_threads(1)
     describe = ["git", "rev-parse", "--short=12", "HEAD"]
     commit = subprocess.run(describe, capture_output=True, text=True, check=True).stdout.strip()
-    done = set()
+    methods = {"baseline": None}
+    methods |= {"smooth" if each == 1.0 else f"smooth {each:g}": each for each in chosen.strengths}
+    path, done = chosen.file, set()
     if path.exists():
         with path.open() as file:
             done = {(r["algorithm"], r["method"], r["seed"]) for r in csv.DictReader(file)}
     else:
         with path.open("w", newline="") as file:
             csv.writer(file).writerow(COLUMNS)
-    for seed in SEEDS:
-        for algorithm, train in ALGORITHMS.items():
-            for method in ("baseline", "smooth"):
-                if (algorithm, method, str(seed)) in done:
-                    continue
-                started = time.monotonic()
-                actor = train(seed, method == "smooth")
-                total, variation = evaluate(actor)
-                seconds = round(time.monotonic() - started)
-                row = [algorithm, method, seed, f"{total:.3f}", f"{variation:.5f}", seconds, commit]
-                with path.open("a", newline="") as file:
-                    csv.writer(file).writerow(row)
-                print(*row, flush=True)
+    for seed, algorithm, method in product(chosen.seeds, chosen.algorithms, methods):
+        if (algorithm, method, str(seed)) in done:
+            continue
+        started = time.monotonic()
+        actor = ALGORITHMS[algorithm](seed, methods[method])
+        total, variation = evaluate(actor)
+        seconds = round(time.monotonic() - started)
+        row = [algorithm, method, seed, f"{total:.3f}", f"{variation:.5f}", seconds, commit]
+        with path.open("a", newline="") as file:
+            csv.writer(file).writerow(row)
+        print(*row, flush=True)
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main()

@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from studies import field, paper
+from studies import field, front_door, paper
 from studies.field import BETTER, TEST, field_groups, field_table
 from studies.methods import against_table, choice_table, pairwise_tables
 from studies.paper import (
@@ -40,6 +40,7 @@ from torchrl_l2c2.experiment.run.files import write_atomically
 from torchrl_l2c2.experiment.run.finished import Record
 
 ROOT = Path(__file__).parents[1]
+FRONT_DOOR = ROOT / "results" / "front_door.csv"
 FIELD_PAGES = ("field", "hopper", "sac_lunarlander", "sac_pendulum", "walker2d")
 # PPO's one setting of L2C2, and the methods that one page compares it with.
 OURS = "L2C2, mse 1, ramp"
@@ -120,6 +121,9 @@ def pages() -> dict[str, Page]:
         "results/batch_mean.md": Page({"results": paper_table(group_records(averaged)).markdown()}),
         "results/reacher_3000.md": Page({"results": paper_table(group_records(short)).markdown()}),
         "results/parts.md": Page({"parts": parts()}),
+        "results/front_door.md": Page(
+            {"results": front_door.table(ROOT / "results" / "front_door.csv")}
+        ),
         "results/td3.md": Page({"test": td3_test(), "choice": td3_choice()}),
         "results/field_gains.md": Page(dict(zip(("rivals", "one", "caps"), chosen, strict=True))),
         "results/targets.md": Page(dict(zip(("all", "swingup", "hopper"), targets, strict=True))),
