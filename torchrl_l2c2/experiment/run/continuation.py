@@ -47,21 +47,21 @@ def check_same_versions(saved: Mapping[str, str], now: Mapping[str, str]) -> Non
     if differing:
         raise OtherRunError(
             f"the checkpoint was made with {'; '.join(differing)}: the numbers may "
-            "differ from those of a run in one go. allow_other_versions=True continues "
+            "differ from a run in one go. allow_other_versions=True continues "
             "anyway. Nothing was changed."
         )
 
 
 def check_length(asked: Budget, before: Budget, played: int) -> None:
-    """Refuses to be asked for less than a run already has.
+    """Refuses a length that is shorter than the run already is.
 
-    A training ends with the episode, or the round of them, that reaches what was asked for: what is
-    beyond that may be asked for again, or not.
+    A training ends with the episode, or the round of episodes, that reaches its length. The frames
+    beyond it may be asked for again.
 
     Args:
-        asked (Budget): how long the training is to be.
-        before (Budget): how long it was to be.
-        played (int): how long it is, in the unit that is asked for.
+        asked (Budget): The new length of the training.
+        before (Budget): The old length of the training.
+        played (int): The part that was played, in the unit of the new length.
 
     Raises:
         OtherRunError: with both numbers.
@@ -76,10 +76,10 @@ def check_length(asked: Budget, before: Budget, played: int) -> None:
 
 
 def tell_past(saved: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Says which settings come too late, as the training that reads them is over.
+    """Warns about changed settings that have no effect, because the training is over.
 
     Warns:
-        UserWarning: names each one that differs.
+        UserWarning: Names each setting that differs.
     """
     for name in OF_TRAINING:
         if saved[name] != now[name]:
@@ -93,11 +93,11 @@ def tell_past(saved: Mapping[str, Any], now: Mapping[str, Any]) -> None:
 def find_checkpoint(
     folder: str | Path, config: ExperimentConfig, *, allow_other_versions: bool
 ) -> tuple[Path, dict[str, Any]] | None:
-    """The newest checkpoint in a folder that is whole, with its path, if it can be gone on from.
+    """Finds the newest intact checkpoint in a folder, with its path.
 
     Raises:
-        CheckpointError: there are checkpoints, but none can be read; or there are none any more,
-            of a run that has ended, whose results one that began anew would take the place of.
+        CheckpointError: No checkpoint can be read, or the run has ended and has none any more: a
+            new run would replace its results.
         OtherRunError: as :func:`check_continuable`.
 
     Warns:
@@ -138,13 +138,13 @@ def find_elsewhere(
     *,
     allow_other_versions: bool,
 ) -> tuple[Path, dict[str, Any]] | None:
-    """The checkpoint in another folder that a run begins from, unless it has one of its own.
+    """Finds the checkpoint in another folder, unless the run has its own checkpoint.
 
-    The same command again continues what it began. The run's own folder need not exist yet, and
+    The same command again continues the run. The run's own folder need not exist yet, and
     does not after a refusal.
 
     Raises:
-        CheckpointError: none is where it was to be; and as :func:`find_checkpoint`.
+        CheckpointError: The folder has none; and as :func:`find_checkpoint`.
         OtherRunError: as :func:`find_checkpoint`, which has the same options.
     """
     check_elsewhere(folder)

@@ -35,7 +35,7 @@ from torchrl_l2c2.metrics import (
     spectral_smoothness,
 )
 
-# The field's measures beside the paper's, each of the actions of an episode [T, A].
+# Further measures of smoothness, of the actions [T, A] of an episode.
 ACTION_MEASURES: dict[str, Callable[[Tensor], Tensor]] = {
     "action_rate": action_rate,
     "action_fluctuation_ratio": action_fluctuation_ratio,
@@ -45,15 +45,15 @@ ACTION_MEASURES: dict[str, Callable[[Tensor], Tensor]] = {
     "sm_asap": partial(spectral_smoothness, form="asap"),
     "previous_action_gain": previous_action_gain,
 }
-# Of one episode of a late policy, by their names in metrics.csv.
+# Columns of metrics.csv with the test episode of a late policy.
 TESTED = ("test_return", "test_action_variation")
-LEAST_STEPS = 4  # of an episode, for all of these measures
-NOISE = 0.01  # standard deviation, that sensitivity is measured with: that of the paper's tasks
+LEAST_STEPS = 4  # shortest episode that all of these measures accept
+NOISE = 0.01  # standard deviation for noise_sensitivity, as in the paper's tasks
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What a policy's mean does over test episodes; one entry per episode in every list.
+    """Results of test episodes; one entry per episode in every list.
 
     Attributes:
         returns: sums of rewards. Larger is better.
@@ -61,9 +61,9 @@ class Evaluation:
             paper's "L2 norm of temporal actions". Smaller is smoother.
         lengths: steps of the episodes.
         measures: other measures of the mean action's smoothness (``torchrl_l2c2.metrics``), with
-            ``saturation`` where actions have bounds and ``noise_sensitivity``, to noise of .01,
-            where they are numbers; of an episode that played samples, those of the samples as
-            well, as ``sampled_...``. NaN where an episode is too short.
+            ``saturation`` where actions have bounds and ``noise_sensitivity``, to noise of 0.01,
+            where they are numbers. An episode with sampled actions also has the measures of the
+            samples, as ``sampled_...``. NaN where an episode is too short.
     """
 
     returns: list[float]
@@ -224,14 +224,14 @@ def _sensitivity(policy: TensorDictModule, episode: TensorDictBase) -> float:
 
 
 class LateTests:
-    """One test episode of a policy as it is now, for every policy late in training.
+    """Plays one test episode with every policy late in training.
 
-    The mean over them is steadier than any number of test episodes of the last policy alone. An
-    episode is seeded by its number: whether and when others are played changes nothing.
+    The mean over these policies varies less than tests of only the last policy. An episode is
+    seeded by its number, and does not depend on other episodes.
 
     Args:
-        task (TaskConfig): what is played.
-        seed (int): of the run.
+        task (TaskConfig): The task.
+        seed (int): The run's seed.
         policy (TensorDictModule): acts deterministically under ``ExplorationType.DETERMINISTIC``.
         compile_policy (bool): whether to compile it.
     """

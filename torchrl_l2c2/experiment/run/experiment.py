@@ -56,12 +56,12 @@ class Experiment:
 
     Keyword Args:
         resume (str or Path, optional): another run's folder to continue from, in ``folder``.
-        allow_other_versions (bool): whether to continue, with a warning, what other versions of
-            PyTorch, TorchRL or a simulator began; the numbers may then differ from those of a run
-            in one go. Default ``False``.
+        allow_other_versions (bool): whether to continue, with a warning, a run of other versions of
+            PyTorch, TorchRL or a simulator; the numbers may then differ from a run in one go.
+            Default ``False``.
 
     Attributes:
-        agent: what learns.
+        agent: The agent that learns.
         player: plays episodes, and counts frames.
         learner: remembers transitions and updates the agent, and counts updates.
         metrics: a dictionary of metrics per episode.
@@ -128,8 +128,8 @@ class Experiment:
         with a checkpoint; a second one ends it at once.
 
         Args:
-            episodes (int, optional): how many there are to be in all, which ``config.json`` has
-                then. Default: the task's, or its frames.
+            episodes (int, optional): Length of the whole training, also written to
+                ``config.json``. Default: the task's episodes or frames.
             progress (bool or str): whether to show a progress bar; a text goes before it.
 
         Returns:
@@ -150,7 +150,7 @@ class Experiment:
         task = self.config.task if episodes is None else self.config.task.for_episodes(episodes)
         full, budget = self.config.task.budget, task.budget
         check_length(budget, full, self._spent(budget))
-        full = full.at_least(budget)  # Of which a part is trained now.
+        full = full.at_least(budget)  # A part of it is trained now.
         algorithm, saved = self.config.algorithm, time.monotonic()
         schedule = SCHEDULES[algorithm.schedule](self.player, self.learner, algorithm)
         bar = Progress(
@@ -168,7 +168,7 @@ class Experiment:
             self._log.check_unchanged()
             begin_folder(self.folder, settings, begun=True, ended=ended)
         with self._process, bar, stop_on_signals() as signals, checkpoint_named(self.folder):
-            # What goes on for longer begins at another rate than it had ended with.
+            # A longer training begins at another rate than the shorter one ended with.
             anneal(self.config.optimizer, self.agent.optimizer, self._spent(full) / full.total)
             while not ended:
                 episode = next(schedule)
@@ -260,8 +260,8 @@ class Experiment:
         """Writes the policy and the test episodes, which mark the run as finished.
 
         Args:
-            result (Evaluation): of :meth:`test`.
-            sampled (Evaluation, optional): of :meth:`test` with samples.
+            result (Evaluation): Result of :meth:`test`.
+            sampled (Evaluation, optional): Result of :meth:`test` with samples.
 
         Returns:
             FinishedRun: the folder, read back.
@@ -307,7 +307,7 @@ class Experiment:
         say(self.folder, f"continuing after episode {len(self.metrics)} from {path}")
 
     def _parts(self) -> dict[str, Any]:
-        """What has a state of its own, by its name in checkpoints."""
+        """Objects with a state, by their names in checkpoints."""
         named = ("loss", "optimizer", "target_updater", "exploration", "normalization")
         parts = {name: getattr(self.agent, name) for name in named}
         parts |= {"best_policy": self._best_policy, "gain": self._gain, "metrics_log": self._log}

@@ -42,7 +42,7 @@ def make_folder_of(path: str | Path) -> None:
     """Makes the folder of a file, before there is anything that could be lost with it.
 
     Raises:
-        OSError: as :func:`make_folder`, or the path is that of a folder.
+        OSError: As :func:`make_folder`, or the path is a folder.
     """
     if Path(path).is_dir():
         raise OSError(f"{str(path)!r} is a folder; name a file.")
@@ -50,10 +50,10 @@ def make_folder_of(path: str | Path) -> None:
 
 
 def write_atomically(path: str | Path, content: bytes) -> None:
-    """Writes a file whole or not at all: a temporary file, flushed to the disk, then renamed.
+    """Writes a file in one step: a temporary file, flushed to the disk, then renamed.
 
     Raises:
-        OSError: names the file; what was there before is untouched.
+        OSError: Names the file; the old file is unchanged.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.partial")
@@ -94,12 +94,12 @@ def _named(path: Path) -> Iterator[None]:
 
 
 def write_json(path: str | Path, value: Any) -> None:
-    """Writes a value as indented JSON, whole or not at all; what is no number is ``null`` there."""
+    """Writes a value as indented JSON in one step; NaN and infinity become ``null``."""
     write_atomically(path, (to_json(value) + "\n").encode())
 
 
 def to_json(value: Any) -> str:
-    """A value as indented JSON; what is no number is ``null`` there."""
+    """Returns a value as indented JSON; NaN and infinity become ``null``."""
     return json.dumps(_strict(value), indent=2)
 
 
@@ -170,7 +170,7 @@ def read_config(run: str | Path) -> dict[str, Any]:
     """Reads a run's ``config.json``.
 
     Raises:
-        ValueError: as :func:`read_json`; or it does not say what was run, which no default may.
+        ValueError: As :func:`read_json`, or the file lacks the task, algorithm or regularizer.
     """
     path = Path(run) / "config.json"
     config = read_json(path)
@@ -191,7 +191,7 @@ def read_evaluation(run: str | Path) -> dict[str, Any]:
     evaluation = read_json(path)
     for test in (evaluation, evaluation.get("sampled") or {}):
         summary = test.get("summary", {}) if isinstance(test, dict) else None
-        # Of what could not be measured there is null.
+        # Values that could not be measured are null.
         numbers = isinstance(summary, dict) and all(
             value is None or isinstance(value, int | float) for value in summary.values()
         )

@@ -1,4 +1,4 @@
-"""A run's folder: what its files are, what a run begins it with, and what it takes along."""
+"""A run's folder: its files, its beginning, and the files that a continued run copies."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ config.json           every setting
 versions.json         of the packages that decide the numbers
 metrics.csv           a line per training episode
 train.log             what the run said
-checkpoint_*.pt       what it continues from: the same command again, or resume=FOLDER
+checkpoint_*.pt       to continue: run the same command again, or use resume=FOLDER
 policy.pt             the acting policy at the end of training, a state_dict
 policy_best.pt        the best policy of evaluations.json (evaluate_every)
 evaluations.json      tests during training (evaluate_every)
@@ -45,23 +45,24 @@ To play test episodes with it:
 
     python -m torchrl_l2c2 evaluate FOLDER --episodes 100
 """
-# What the end of a training leaves, beside the test that marks a run as finished.
+# Files of a training's end, in addition to the test that marks a run as finished.
 OF_THE_END = ("video.mp4", "policy.pt", "learning_curves.png", "diagnosis.html")
 EXPORTED = tuple(f"export/{name}" for name in ("policy.onnx", "policy.pt2", "contract.json"))
-# What it writes on the way, which one that begins anew does not go on with.
+# Files that are written during training; a run that begins anew does not keep them.
 OF_THE_WAY = ("metrics.csv", "evaluations.json", "policy_best.pt")
 
 
 def begin_folder(folder: Path, settings: dict[str, Any], *, begun: bool, ended: bool) -> None:
-    """Writes what a run begins with.
+    """Writes the first files of a run.
 
-    A test that was of other settings is removed before, and of a shorter run that goes on the end:
-    killed at any moment, the folder is that of the older run or of an unfinished one, and never a
-    longer one's with an older policy. A test of the same policy stays till another one replaces it.
+    A test with other settings is removed first, and so are the last files of a shorter run that is
+    continued. Killed at any moment, the folder holds the older run or an unfinished run, and never
+    the settings of a longer run with an older policy. A test of the same policy stays until another
+    one replaces it.
 
     Args:
-        folder (Path): of the run.
-        settings (dict): of the run, as in ``config.json``.
+        folder (Path): The run's folder.
+        settings (dict): The run's settings, as in ``config.json``.
 
     Keyword Args:
         begun (bool): whether it continues from a checkpoint.

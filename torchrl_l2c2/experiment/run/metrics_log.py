@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from torchrl.record.loggers import Logger
 
 PROJECT = "torchrl_l2c2"
-# As the user has it: MLflow itself sets the variable to what it was told last.
+# The user's value: MLflow itself changes the variable later.
 TRACKING_URI = os.environ.get("MLFLOW_TRACKING_URI")
-# What is no part of the experiment extra.
+# Packages that are not part of the experiment extra.
 PACKAGES = {"wandb": "wandb", "mlflow": "mlflow"}
 
 
@@ -82,11 +82,11 @@ class MetricsLog:
             )
 
     def state_dict(self) -> dict[str, Any]:
-        """How far the file goes."""
+        """Columns and size of the file."""
         return {"columns": self.columns, "size": self._size}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Cuts off what was written after the state was taken, so that no line comes twice.
+        """Removes lines that were written after the state was taken; no line appears twice.
 
         Raises:
             ValueError: the file is shorter than it was, or another.
@@ -137,7 +137,7 @@ def make_logger(name: str, folder: Path) -> Logger | None:
 
     Args:
         name (str): ``"csv"``, ``"tensorboard"``, ``"wandb"`` or ``"mlflow"``.
-        folder (Path): of the run, whose last parts are the run's name there.
+        folder (Path): The run's folder; its last parts are the run's name in the logger.
     """
     run = "/".join(folder.absolute().parts[-5:])
     if name == "tensorboard":
@@ -163,7 +163,7 @@ def make_logger(name: str, folder: Path) -> Logger | None:
 
 
 def close_logger(name: str) -> None:
-    """Ends what the logger's package keeps open in the process, so that another run can begin."""
+    """Closes the logger's package in this process, for the next run."""
     if name == "wandb":
         import wandb
 

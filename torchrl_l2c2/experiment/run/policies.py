@@ -1,4 +1,4 @@
-"""A run's policy: written to its folder, and read back from that alone."""
+"""A run's policy: written to the run's folder, and read back from it."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ def load_policy(
     best: bool = False,
     render: Drawing | None = None,
 ) -> tuple[TensorDictModule, EnvBase, int]:
-    """A run's acting policy and a fresh environment of its task, from its folder alone.
+    """Loads a run's acting policy and makes an environment of its task.
 
     The policy is a TorchRL actor: it reads ``"observation"`` and writes ``"action"``, the mean
     under ``set_exploration_type(ExplorationType.DETERMINISTIC)`` and a sample otherwise. Torch's
     global generator is left as it was.
 
     Args:
-        folder (str or Path): of a run, finished or not.
+        folder (str or Path): The run's folder, finished or not.
 
     Keyword Args:
-        seed (int, optional): of the environment and its noise. Default: that of the run's test.
-        noise_scale (float, optional): of the environment's noise; larger values are harder.
+        seed (int, optional): Seed of the environment and its noise. Default: the test's seed.
+        noise_scale (float, optional): Scale of the environment's noise; larger values are harder.
             Default: the task's.
         best (bool): whether to take the best policy of the tests during training, where
             ``evaluate_every`` had some, instead of the last. Default ``False``.
@@ -99,11 +99,11 @@ def load_policy(
 
 
 def seed_of_test(folder: str | Path, seed: int | None = None) -> int:
-    """The seed of all that is drawn in the test of a run, or another one that is given.
+    """Returns the seed of a run's test, or checks another seed.
 
     Args:
-        folder (str or Path): of the run.
-        seed (int, optional): another one.
+        folder (str or Path): The run's folder.
+        seed (int, optional): Another seed.
 
     Raises:
         FileNotFoundError: the folder is not a run's.
@@ -120,8 +120,8 @@ def seed_of_test(folder: str | Path, seed: int | None = None) -> int:
 def _check_origin(env_id: str, folder: Path) -> None:
     """Refuses a task whose module is in the run's folder, or in a package around it.
 
-    A run's settings may be somebody else's, and importing executes; not what is imported already,
-    as a script's or a notebook's own task is.
+    A run's settings may come from somebody else, and an import executes code. Modules that are
+    already imported, such as a script's own task, are accepted.
     """
     module = env_id.rpartition(":")[0]
     name = "" if module in sys.modules else module.partition(".")[0]
@@ -143,7 +143,7 @@ def _load_weights(policy: TensorDictModule, path: Path) -> None:
         policy.load_state_dict(torch.load(path, "cpu", weights_only=True))
     except OSError:
         raise
-    # Of damaged bytes torch raises errors of many kinds, on many lines.
+    # With damaged bytes torch raises errors of many kinds, on many lines.
     except Exception as error:
         what = f"{path} does not hold this run's policy ({type(error).__name__})"
         raise CheckpointError(f"{what}: {REMEDY}") from error

@@ -1,4 +1,4 @@
-"""What belongs to the whole process, as one run has it, whatever else the process does."""
+"""State of the whole process: random generators, threads and memory, for one run at a time."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from typing import Any
 import numpy as np
 import torch
 
-# Of glibc's mallopt: what is larger is mapped anew at every allocation, and how much may be free at
-# the heap's end before it is given back; both are bytes, up to the largest int.
+# glibc's mallopt, in bytes up to the largest int: blocks above the one threshold are mapped anew at
+# every allocation; free memory above the other is given back to the system.
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 _LARGEST = 2**31 - 1
 
 _States = tuple[Any, Any, torch.Tensor, list[torch.Tensor]]
-"""Of Python, of NumPy, of PyTorch and of its CUDA devices, where there are any."""
+"""States of the generators of Python, NumPy, PyTorch and its CUDA devices."""
 
 
 class ProcessState:
     """The global random generators and the number of threads, as a run of its own has them.
 
-    Within the context they are the run's; after it they are those of the process again. Networks
-    are initialized from the generators, policies sample from them.
+    Within the context they belong to the run; after it the process has its own again. Networks are
+    initialized from the generators, and policies sample from them.
 
     Args:
-        seed (int): what the generators of Python, NumPy and PyTorch begin with.
-        threads (int): of PyTorch. Default 1.
+        seed (int): seed of the generators of Python, NumPy and PyTorch.
+        threads (int): number of threads of PyTorch. Default 1.
 
     Examples:
         >>> import torch
@@ -121,5 +121,5 @@ def _set_states(states: _States) -> None:
     random.setstate(states[0])
     np.random.set_state(states[1])
     torch.set_rng_state(states[2])
-    if torch.cuda.is_available():  # Of a machine with more devices there are more states.
+    if torch.cuda.is_available():  # A machine with more devices has more states.
         torch.cuda.set_rng_state_all(states[3][: torch.cuda.device_count()])

@@ -1,4 +1,4 @@
-"""What a run's folder gives to a diagnosis: its policy and value function, and its training."""
+"""Diagnosis of a run: its policy, its value function and its training."""
 
 from __future__ import annotations
 
@@ -60,14 +60,14 @@ def diagnose_run(
     """Diagnoses a run's policy, with its own neighborhood, value function and training.
 
     Args:
-        folder (str or Path): of a run, finished or not.
+        folder (str or Path): The run's folder, finished or not.
 
     Keyword Args:
-        name (str, optional): what it is called. Default: the folder.
+        name (str, optional): Name of the run. Default: the folder.
         episodes (int): as for :func:`~.measured.diagnose`. Default 3.
-        seed (int): of the environment and its noise, the same for all that are compared.
-        noise_scale (float, optional): of the environment's noise. Default: the task's. Where there
-            is none, sensitivity is measured with .01.
+        seed (int): Seed of the environment and its noise; use the same one to compare runs.
+        noise_scale (float, optional): Scale of the environment's noise. Default: the task's noise.
+            Without noise, sensitivity is measured with 0.01.
         best (bool): whether to take ``policy_best.pt``. Default ``False``.
         with_pictures (bool): whether the first episode is drawn as well. Default ``True``.
 
@@ -110,8 +110,8 @@ def value_function(loss: LossModule, normalization: Normalization | None = None)
     """The value function of a loss, all of its heads; ``None`` where it has none.
 
     Args:
-        loss (LossModule): any that says what its networks read and write.
-        normalization (Normalization, optional): of the observations that it reads. Default: none.
+        loss (LossModule): A loss that declares the keys of its networks.
+        normalization (Normalization, optional): Normalization of its observations. Default: none.
 
     Returns:
         callable: observations ``[N, *F]`` and actions ``[N, *A]`` to values ``[N, M]``. State
@@ -137,7 +137,7 @@ def value_function(loss: LossModule, normalization: Normalization | None = None)
 
 
 def _trained(folder: Path, config: ExperimentConfig, env: EnvBase) -> Agent | None:
-    """What learned in the run, as its newest checkpoint has it; ``None`` without one."""
+    """The agent of the newest checkpoint; ``None`` without one."""
     newest = load_newest(folder)
     if newest is None:
         return None
@@ -208,7 +208,7 @@ def _pictures(
         (played,) = play_pictures(
             folder, 1, seed=seed, noise_scale=noise_scale, best=best, drawing=DRAWING
         )
-    # The task draws none, or not without what is not there.
+    # The task draws no pictures, or a package is missing.
     except (ValueError, DependencyNotInstalled, SimulatorError):
         return [], 1
     return played.pictures, played.every
