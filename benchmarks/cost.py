@@ -6,10 +6,10 @@ regularizer, and the times of a round are divided by one another, so other load 
 affects both. The table has the medians of these ratios; the first row divides the baseline by
 itself. Times on the CPU are processor times of one thread.
 
-Memory on CUDA is the peak that torch.cuda.max_memory_allocated reports for one step, without what
-is allocated before it. On the CPU it is the largest total size of the tensors that are saved for
-the backward pass at one time (torch.autograd.graph.saved_tensors_hooks), without parameters and the
-minibatch. Both grow with the number of states.
+Memory on CUDA is the peak that torch.cuda.max_memory_allocated reports for one step, without the
+memory allocated before it. On the CPU it is the largest total size of the tensors that are saved
+for the backward pass at one time (torch.autograd.graph.saved_tensors_hooks), without parameters and
+the minibatch. Both grow with the number of states.
 """
 
 from __future__ import annotations
@@ -63,10 +63,10 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
 """Method and settings that replace the preset, by the name in the table."""
 
 MEASURES = {
-    "cuda": "peak of torch.cuda.max_memory_allocated in a step, less what is allocated before it",
+    "cuda": "peak of torch.cuda.max_memory_allocated in a step, less the memory before it",
     "cpu": "largest size of the tensors saved for the backward pass, without parameters and batch",
 }
-"""What the memory is, by kind of device."""
+"""Measure of the memory, by kind of device."""
 
 
 @dataclass
@@ -77,11 +77,11 @@ class Cost:
         method: the name in the table.
         fraction: share of the states that the regularizer uses.
         states: number of states in the minibatch.
-        time: time by that of the baseline, median over the rounds.
+        time: time divided by the time of the baseline, median over the rounds.
         time_low: first quartile of these ratios.
         time_high: third quartile of these ratios.
         milliseconds: median time of a step.
-        memory: memory by that of the baseline.
+        memory: memory divided by the memory of the baseline.
         memory_mib: memory of a step, in MiB.
     """
 

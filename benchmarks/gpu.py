@@ -1,7 +1,7 @@
 """Parts of ``benchmarks/gpu.sh``: ``python -m benchmarks.gpu tests|brax --json FILE``.
 
 Each part writes its file again after every test or iteration, so a part that is stopped by its time
-limit keeps what it has measured.
+limit keeps its measurements.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def write(path: Path, content: dict[str, Any]) -> None:
 
 
 def test(path: Path, where: dict[str, Any]) -> None:
-    """Runs the tests that need a CUDA device; those that compile come last."""
+    """Runs the tests that need a CUDA device, compiled updates last."""
     import pytest
 
     found: list[dict[str, Any]] = []

@@ -88,7 +88,7 @@ def main(arguments: list[str] | None = None) -> None:
                 "minutes": (time.monotonic() - started) / 60,
                 "rows": [row.to_dict() for row in rows],
             }
-            if options.json:  # After each row: what is interrupted keeps the others.
+            if options.json:  # After each row: an interrupted run keeps its rows.
                 options.json.write_text(json.dumps(result, indent=2) + "\n")
     if options.markdown:
         given = sys.argv[1:] if arguments is None else arguments

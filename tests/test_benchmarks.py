@@ -15,8 +15,10 @@ from benchmarks import gpu as benchmarks_gpu
 from benchmarks.setups import matrix_products
 from benchmarks.timing import Row, alternate, to_markdown
 from benchmarks.zoo import arguments
+from studies import cost as studies_cost
 from studies import gpu
 from studies.gpu import NOT_MEASURED
+from studies.pages import fill
 
 REPOSITORY = Path(__file__).parent.parent
 WHERE = {
@@ -150,6 +152,40 @@ def test_the_cost_command_writes_every_regularizer(tmp_path, capsys):
     assert written["quick"] and written["device"] == "cpu" and "name" not in written["machine"]
     assert written["machine"]["versions"]["torch"] and written["machine"]["commit"]
     assert written["command"].startswith("python -m benchmarks.cost --quick")
+
+
+def test_the_page_shows_the_measured_costs():
+    """``python -m studies.cost`` would change nothing, and a quick run is not shown."""
+    measured = json.loads(studies_cost.MEASURED.read_text())
+    page = studies_cost.PAGE.read_text()
+    assert fill(page, "cost", studies_cost.cost_table(measured)) == page
+    assert not measured["quick"] and measured["machine"]["commit"] in page
+
+
+def test_the_table_of_costs_by_hand():
+    """The baseline's own numbers, and for the others multiples with their quartiles."""
+    row = {"states": 4096, "fraction": 1.0, "time": 1.0, "time_low": 0.98, "time_high": 1.03}
+    row |= {"method": "baseline", "milliseconds": 1234.5, "memory": 1.0, "memory_mib": 59.4}
+    other = row | {"method": "L2C2", "time": 2.125, "memory": 2.02}
+    quarter = other | {"fraction": 0.25, "time": 1.25}
+    measured = {
+        "command": "python -m benchmarks.cost",
+        "machine": WHERE
+        | {"cuda": None, "versions": dict.fromkeys(("torch", "torchrl", "tensordict"), "1")},
+        "device": "cpu",
+        "memory": "m",
+        "rounds": 5,
+        "networks": {"observations": 3, "actions": 2, "layers": [8, 4]},
+        "rows": [row, other, quarter],
+    }
+    lines = studies_cost.cost_table(measured).splitlines()
+    assert lines[0].startswith("`python -m benchmarks.cost`, commit abc1234, c, load 0.0")
+    assert lines[2] == "| method | `fraction` | time, 4,096 states | memory, 4,096 states |"
+    assert lines[4:7] == [
+        "| baseline | 1 | 1,234 ms | 59 MiB |",
+        "| L2C2 | 1 | 2.12 (0.98, 1.03) | 2.02 |",
+        "| L2C2 | 0.25 | 1.25 (0.98, 1.03) | 2.02 |",
+    ]
 
 
 def test_the_cost_command_refuses_a_device_without_a_measure_of_memory():
