@@ -65,7 +65,7 @@ def main() -> None:
             for chosen in torch.randperm(len(rows), device=options.device).chunk(MINIBATCHES):
                 terms = loss(rows[chosen])
                 optimizer.zero_grad()
-                sum(term for key, term in terms.items() if key.startswith("loss_")).backward()
+                sum(term for key, term in terms.items() if key.startswith("loss")).backward()
                 torch.nn.utils.clip_grad_norm_(loss.parameters(), 1.0)
                 optimizer.step()
         with torch.no_grad():
