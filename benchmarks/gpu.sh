@@ -4,7 +4,7 @@
 #   OUT=FOLDER benchmarks/gpu.sh [--wheels FOLDER] [--cpu] [--quick]
 #   python -m studies.gpu FOLDER          # afterwards, anywhere: the page of results
 #
-# Needs Python 3.11 with torch 2.11 or newer, and the packages of the extra "experiment" except
+# Needs Python 3.11 or newer, torch 2.11 or newer, and the packages of the extra "experiment" except
 # PyBullet. Those that the machine lacks may lie in the folder of --wheels; they are installed
 # into a folder of their own for this script. JAX is too large to bring along in 64 MB (jaxlib 0.10.2
 # is 85 MB, jax-cuda12-pjrt 174 MB), so it has to be on the machine; Brax 0.14.2 with MuJoCo
