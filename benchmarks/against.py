@@ -24,8 +24,7 @@ logging.getLogger("torchrl").setLevel(logging.ERROR)
 torch.set_num_threads(1)
 from benchmarks.setups import Effort, updates
 from torchrl_l2c2 import make_actor
-from torchrl_l2c2.experiment import TaskConfig, make_env
-from torchrl_l2c2.experiment.collect.episodes import EpisodeCollector
+from torchrl_l2c2.experiment import EpisodeCollector, TaskConfig, make_env
 
 update = updates(Effort(), 32, "l2c2", True)
 env = make_env(TaskConfig(), 0)
