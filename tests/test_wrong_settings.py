@@ -99,7 +99,7 @@ def test_a_wrong_setting_gives_its_line(settings_of, line, message):
     [
         ("task.epsodes=3", "task.epsodes is not a setting; did you mean task.episodes? --help"),
         ("sed=1", "sed is not a setting; did you mean seed? --help lists every setting."),
-        ("algorithm.num_envs=4", "algorithm.num_envs is a setting of algorithm=ppo alone."),
+        ("algorithm.num_envs=4", "algorithm.num_envs is only a setting of algorithm=ppo."),
         (
             "regularizer=lipsnet",
             "In 'config': Could not find 'regularizer/lipsnet' Available",
