@@ -22,6 +22,7 @@ from dataclasses import replace
 import torch
 
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig, TaskConfig
+from torchrl_l2c2.experiment.learn import update as update_module
 from torchrl_l2c2.experiment.learn.update import ReplayUpdate
 from torchrl_l2c2.experiment.settings.algorithms import ALGORITHMS
 
@@ -46,6 +47,9 @@ def make_update(algorithm: str, compiler: str) -> Callable[[], object]:
     draw = update.draw()
     if compiler == "own":
         return lambda: update.update(True, *draw)
+    # Traced, TorchRL's losses keep detached parameters, which our own compiler has them forget;
+    # torch.compile would replay the forgetting at every call, where there is nothing to forget.
+    update_module.forget_traced = lambda loss: None
     torch._dynamo.config.trace_autograd_ops = True
     compiled = torch.compile(
         update.update,

@@ -280,7 +280,9 @@ def test_a_finished_run_without_checkpoints_is_not_begun_anew(ended):
     for path in list_checkpoints(ended):
         path.unlink()
     before = contents(ended)
-    with pytest.raises(CheckpointError, match=r"has ended, and no checkpoint.* any more to continue"):
+    with pytest.raises(
+        CheckpointError, match=r"has ended, and no checkpoint.* any more to continue"
+    ):
         Experiment(small(test_episodes=3), ended)
     assert contents(ended) == before
 
