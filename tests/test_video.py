@@ -12,7 +12,7 @@ from processes import run_train
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig, PPORPEConfig, TaskConfig
 from torchrl_l2c2.experiment.analysis.video import play_pictures, record_video
 from torchrl_l2c2.experiment.cli.video import main
-from torchrl_l2c2.experiment.envs.pictures import Drawing
+from torchrl_l2c2.experiment.envs.pictures import Drawing, PictureRecorder
 from torchrl_l2c2.experiment.run.policies import load_policy
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
@@ -71,6 +71,28 @@ def test_a_drawing_leaves_states_out(pendulum):
     assert (len(some), rate, every) == (3, 20.0, 4)
     for number, picture in enumerate(some):
         assert np.array_equal(picture, whole[4 * number])
+
+
+def test_an_untold_rate_is_30_steps_a_second():
+    """Half a second is 15 steps, at 15 pictures a second every second one."""
+
+    class Blank(gymnasium.Env):
+        observation_space = action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))
+
+        def reset(self, **options):
+            return np.zeros(1), {}
+
+        def step(self, action):
+            return np.zeros(1), 0.0, False, False, {}
+
+        def render(self):
+            return np.zeros((2, 2, 3), np.uint8)
+
+    recorder = PictureRecorder(Blank(), Drawing(rate=15.0, seconds=0.5))
+    recorder.reset()
+    for _ in range(40):
+        recorder.step(np.zeros(1))
+    assert recorder.every == 2 and len(recorder.pictures()) == 1 + 7
 
 
 def test_the_pictures_are_those_of_the_test_episode(pendulum):

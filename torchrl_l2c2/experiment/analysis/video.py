@@ -19,7 +19,7 @@ from tensordict import TensorDictBase
 from torchrl_l2c2.experiment.agents._torchrl_internals import simulator_of
 from torchrl_l2c2.experiment.collect.episodes import play_episodes
 from torchrl_l2c2.experiment.envs.environments import make_env, untransformed
-from torchrl_l2c2.experiment.envs.pictures import Drawing, control_rate
+from torchrl_l2c2.experiment.envs.pictures import USUAL_RATE, Drawing, control_rate
 from torchrl_l2c2.experiment.errors import MissingPackageError, UserError
 from torchrl_l2c2.experiment.run.files import make_folder_of
 from torchrl_l2c2.experiment.run.policies import load_policy, seed_of_test
@@ -103,7 +103,7 @@ def record_video(
     path = Path(path or Path(run) / "video.mp4")
     played = play_pictures(run, episodes, seed=seed, noise_scale=noise_scale, best=best)
     seen = [picture for each in played for picture in each.pictures]
-    write_video(path, seen, played[0].rate or 30.0)
+    write_video(path, seen, played[0].rate or USUAL_RATE)
     return path
 
 

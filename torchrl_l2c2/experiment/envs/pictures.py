@@ -10,10 +10,11 @@ import gymnasium
 from torchrl_l2c2.experiment.envs.spaces import Env
 
 QUICK_SIZE = 320  # pixels of a side
+USUAL_RATE = 30.0  # steps per second, if the simulator does not tell its rate
 
 
 class Drawing(NamedTuple):
-    """Which states of an episode are drawn, and how.
+    """A choice of the states of an episode that are drawn, and how.
 
     Attributes:
         rate: most pictures per second of simulated time.
@@ -49,7 +50,7 @@ class PictureRecorder(gymnasium.Wrapper[Any, Any, Any, Any]):
         super().__init__(env)
         self._drawing = drawing
         self.every = 1
-        self._steps = 0
+        self._steps, self._last = 0, math.inf
         self._pictures: list[Any] = []
         quality = getattr(getattr(env.unwrapped, "model", None), "vis", None)
         if drawing.quick and quality is not None:
@@ -57,17 +58,16 @@ class PictureRecorder(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def reset(self, **options: Any) -> Any:
         begun = self.env.reset(**options)
-        rate = control_rate(self.env)
-        if rate is not None:
-            self.every = max(1, round(rate / self._drawing.rate))
+        rate = control_rate(self.env) or USUAL_RATE
+        self.every = max(1, round(rate / self._drawing.rate))
+        self._last = rate * self._drawing.seconds
         self._steps, self._pictures = 0, [self.env.render()]
         return begun
 
     def step(self, action: Any) -> Any:
         result = self.env.step(action)
         self._steps += 1
-        drawn = self._steps / (control_rate(self.env) or 1.0) <= self._drawing.seconds
-        if drawn and self._steps % self.every == 0:
+        if self._steps <= self._last and self._steps % self.every == 0:
             self._pictures.append(self.env.render())
         return result
 

@@ -14,11 +14,11 @@ from torchrl_l2c2.experiment.analysis.diagnosis.measured import Diagnosis
 from torchrl_l2c2.experiment.analysis.diagnosis.pictures import COLORS, busiest
 from torchrl_l2c2.experiment.analysis.reports.figures import drawn, subplots
 from torchrl_l2c2.experiment.analysis.video import Picture, write_video
+from torchrl_l2c2.experiment.envs.pictures import USUAL_RATE
 
 WIDTH = 320  # of a policy's column, in pixels
 STRIP = 100  # height of its strip
 FASTEST = 30.0  # pictures a second; of more some are left out
-USUAL_RATE = 30.0  # where the simulator does not say
 CURSOR = (194, 24, 43)
 
 
