@@ -1,8 +1,7 @@
-"""Compares this package's compiler of an update with ``torch.compile``.
+"""Times an update that this package's compiler, or ``torch.compile``, has compiled.
 
-``python -m benchmarks.compilers`` prints, for PPO-RPE and SAC with L2C2, the seconds of the first
-update with an empty and with a filled compiler cache, and the time of a later update; processes of
-the two compilers alternate. ``torch.compile`` runs with the public filter
+``python -m benchmarks.compilers ppo_rpe own`` prints the seconds of the first update and the time
+of later ones, with L2C2; ``torch.compile`` instead of ``own`` runs with the public filter
 ``torch.compiler.skip_all_guards_unsafe``, which removes all checks of a call.
 """
 
@@ -10,11 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import statistics
-import subprocess
-import sys
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -77,46 +72,14 @@ def measure(algorithm: str, compiler: str) -> None:
     print(json.dumps({"first_s": first, "update_us": 1e6 * statistics.median(times)}))
 
 
-def in_a_process(algorithm: str, compiler: str, cache: str) -> dict[str, float]:
-    """The numbers of :func:`measure`, from a process of its own."""
-    done = subprocess.run(
-        [sys.executable, "-m", "benchmarks.compilers", "--one", algorithm, compiler],
-        env={**os.environ, "TORCHINDUCTOR_CACHE_DIR": cache},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    found: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
-    return found
-
-
-def compare(algorithm: str, rounds: int) -> dict[str, dict[str, float]]:
-    """Medians of both compilers for an algorithm's update; the processes alternate."""
-    found: dict[str, list[tuple[float, float, float]]] = {name: [] for name in COMPILERS}
-    for _ in range(rounds):
-        for compiler in COMPILERS:
-            with tempfile.TemporaryDirectory() as cache:
-                cold, warm = (in_a_process(algorithm, compiler, cache) for _ in range(2))
-            found[compiler].append((cold["first_s"], warm["first_s"], warm["update_us"]))
-    names = ("first_cold_s", "first_warm_s", "update_us")
-    return {
-        compiler: dict(zip(names, map(statistics.median, zip(*each, strict=True)), strict=True))
-        for compiler, each in found.items()
-    }
-
-
 def main() -> None:
-    """Prints the comparison as JSON."""
+    """Prints the times of one compiler as JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--algorithms", nargs="+", default=["ppo_rpe", "sac"])
-    parser.add_argument("--one", nargs=2, metavar=("ALGORITHM", "COMPILER"))
+    parser.add_argument("algorithm", choices=ALGORITHMS)
+    parser.add_argument("compiler", choices=COMPILERS)
     chosen = parser.parse_args()
     torch.set_num_threads(1)
-    if chosen.one:
-        measure(*chosen.one)
-        return
-    print(json.dumps({name: compare(name, chosen.rounds) for name in chosen.algorithms}, indent=2))
+    measure(chosen.algorithm, chosen.compiler)
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ import pytest
 import torch
 from processes import ROOT, run_train
 
+from torchrl_l2c2.experiment.cli.main import main
 from torchrl_l2c2.experiment.cli.train import _tell
 from torchrl_l2c2.experiment.errors import (
     MissingPackageError,
@@ -204,3 +205,10 @@ def test_a_bug_in_a_users_own_code_shows_its_traceback_and_logs_it(tmp_path, bug
     for text in (done.stderr, (run / "train.log").read_text()):
         assert "Traceback (most recent call last):" in text
         assert str(script) in text and line in text and told in text
+
+
+def test_a_command_names_the_packages_that_are_missing(monkeypatch):
+    """Before it imports anything that needs them."""
+    monkeypatch.setattr("torchrl_l2c2.experiment.cli.main.find_spec", lambda name: None)
+    with pytest.raises(SystemExit, match=r"error: evaluate needs the packages gymnasium, hydra"):
+        main(["evaluate", "anywhere"])

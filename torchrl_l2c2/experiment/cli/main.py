@@ -5,10 +5,13 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from importlib.util import find_spec
 
 from torchrl_l2c2._version import __version__
 
-# Name: module, what it does. Each module has a ``main(arguments)``.
+# Packages of the experiment extra, which the components do not need.
+PACKAGES = ("gymnasium", "hydra", "pydantic", "matplotlib", "tqdm", "filelock")
+# Name: module and help. Each module has a ``main(arguments)``.
 COMMANDS = {
     "train": ("train", "trains a run; task=hopper seed=1, for example"),
     "evaluate": ("evaluate", "plays test episodes, also with noise on the observations"),
@@ -44,13 +47,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if name not in COMMANDS:
         hint = f" Write: train {' '.join(given)}" if "=" in name else ""
         sys.exit(f"error: Expected one of {', '.join(COMMANDS)}, got {name!r}.{hint}")
-    try:
-        command = import_module(f"torchrl_l2c2.experiment.cli.{COMMANDS[name][0]}")
-    except ModuleNotFoundError as error:
-        if (error.name or "").startswith("torchrl_l2c2"):
-            raise
+    if missing := [each for each in PACKAGES if find_spec(each) is None]:
         sys.exit(
-            f"error: {name} needs the package {error.name}. In a clone of the repository, run: "
-            'pip install -e ".[experiment]"'
+            f"error: {name} needs the packages {', '.join(missing)}. In a clone of the repository, "
+            'run: pip install -e ".[experiment]"'
         )
+    command = import_module(f"torchrl_l2c2.experiment.cli.{COMMANDS[name][0]}")
     command.main(rest)

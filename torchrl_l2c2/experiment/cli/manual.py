@@ -7,7 +7,7 @@ import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from torchrl_l2c2.experiment.settings.config import GROUPS, ExperimentConfig
+from torchrl_l2c2.experiment.settings.config import GROUPS, STEERING, ExperimentConfig
 from torchrl_l2c2.experiment.settings.fields import describe
 from torchrl_l2c2.experiment.settings.regularizers import BEGIN_WITH_PRESET, preset_settings
 from torchrl_l2c2.presets import KINDS
@@ -20,27 +20,13 @@ Trains a policy: python train.py task=swingup regularizer=l2c2 seed=1
   -m seed=0,1,2       runs every combination, one after another
 
 """
-# Settings of the command: they are no settings of a run.
-OF_THE_COMMAND = {
-    "outputs": ("outputs", "folder that holds every run's folder"),
-    "preset": ("null", "settings of a task and an algorithm: baselines, rl_zoo, field"),
-    "experiment": ("null", "a whole comparison, with -m; conf/experiment/ holds them"),
-    "resume": (
-        "null",
-        "folder of another run to continue from; the same command continues its own run",
-    ),
-    "allow_other_versions": (
-        "false",
-        "continue a checkpoint made with other versions of torch, TorchRL or a simulator",
-    ),
-}
 ANY_TASK = "gymnasium: any other task, by its task.env_id"
 WIDTH, COLUMN = 100, 38
 
 
 def manual() -> str:
     """The help of the command: every choice, and every setting in one line."""
-    lines = [f"{f'  {n}={v[0]}':{COLUMN}}{v[1]}" for n, v in OF_THE_COMMAND.items()]
+    lines = [f"{f'  {n}={v[0]}':{COLUMN}}{v[1]}" for n, v in STEERING.items()]
     for name, (_, meaning) in describe(ExperimentConfig).items():
         lines.append(_line(name, getattr(ExperimentConfig(), name), meaning))
     for group, choices in GROUPS.items():
@@ -77,7 +63,7 @@ def page() -> str:
     """Every setting as a page of the docs."""
     lines = ["# Settings", "", "Made by `python -m torchrl_l2c2 settings`.", ""]
     lines += ["## The command", "", "| setting | default | meaning |", "| --- | --- | --- |"]
-    lines += [f"| `{n}` | `{v[0]}` | {v[1]} |" for n, v in OF_THE_COMMAND.items()]
+    lines += [f"| `{n}` | `{v[0]}` | {v[1]} |" for n, v in STEERING.items()]
     lines += ["", "## The run as a whole", "", *_table(ExperimentConfig(), ""), ""]
     for group, choices in GROUPS.items():
         for name, chosen, first in _by_kind(choices):

@@ -54,8 +54,20 @@ GROUPS: dict[str, Mapping[str, Any]] = {
     "optimizer": OPTIMIZERS,
     "logger": LOGGERS,
 }
-# What steers where and how often runs happen, and is no setting of a run.
-STEERING = {"outputs", "experiment", "preset", "resume", "allow_other_versions"}
+# Settings of the command, which are no settings of a run: default and meaning.
+STEERING = {
+    "outputs": ("outputs", "folder that holds every run's folder"),
+    "preset": ("null", "settings of a task and an algorithm: baselines, rl_zoo, field"),
+    "experiment": ("null", "a whole comparison, with -m; conf/experiment/ holds them"),
+    "resume": (
+        "null",
+        "folder of another run to continue from; the same command continues its own run",
+    ),
+    "allow_other_versions": (
+        "false",
+        "continue a checkpoint made with other versions of torch, TorchRL or a simulator",
+    ),
+}
 
 
 @settings
