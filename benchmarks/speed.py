@@ -20,7 +20,7 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-# Module and function of each group of rows; imported when it is measured, so that --help is quick.
+# Module and function of each group of rows; imported when it is measured: --help is quick.
 ROWS = {
     "import": "run_rows.import_rows",
     "update": "update_rows.update_rows",

@@ -36,7 +36,7 @@ class ChildFailedError(RuntimeError):
 
 
 class CompilerError(ChildFailedError):
-    """The compiler failed: of its hundreds of lines the one that says why."""
+    """The compiler failed; the text is the line of its output with the reason."""
 
 
 # What fails outside of the program: a simulator, a process, the numbers of a training, a disk.

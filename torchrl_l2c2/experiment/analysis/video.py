@@ -134,7 +134,7 @@ def play_pictures(
 ) -> list[PlayedPictures]:
     """Plays test episodes with pictures.
 
-    The arguments are those of :func:`record_video`, and ``drawing``, which says which states are
+    Takes the arguments of :func:`record_video`, and ``drawing``, a choice of the states that are
     drawn. Default: all.
     """
     with _without_a_screen():

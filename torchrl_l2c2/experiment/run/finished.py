@@ -268,7 +268,7 @@ class FinishedRun:
 
 
 def is_tested(run: str | Path, settings: Mapping[str, Any]) -> bool:
-    """Whether a folder has the test of a run with these settings.
+    """Checks whether a folder has the test of a run with these settings.
 
     Settings that change none of the numbers may differ, but for how long the training is.
 
