@@ -51,7 +51,7 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     "L2C2": ("l2c2", {}),
     "L2C2 as in the paper": (
         "l2c2",
-        {"policy_distance": "hellinger", "shared": False, "beta": 0.1},
+        {"policy_distance": "hellinger", "neighbors": "box", "beta": 0.1},
     ),
     "CATS": ("cats", {}),
     "LCP": ("lcp", {}),

@@ -68,17 +68,17 @@ SUMMARIZED = [label for label in HEADLINES if "Swingup" not in label]
 # What the page of the setting's parts calls them, by their names in tables and in its order.
 PARTS = {
     "vanilla": "vanilla",
-    f"{OURS}, beta=0, shared=true": "`regularizer=l2c2`",
-    "L2C2, mse 0.01, ramp, beta=0, shared=true": "with the paper's gain",
-    "L2C2, Hellinger 1, ramp, beta=0, shared=true": "with the Hellinger distance",
-    "L2C2, Hellinger 4, ramp, beta=0, shared=true": (
+    f"{OURS}, beta=0, neighbors=line": "`regularizer=l2c2`",
+    "L2C2, mse 0.01, ramp, beta=0, neighbors=line": "with the paper's gain",
+    "L2C2, Hellinger 1, ramp, beta=0, neighbors=line": "with the Hellinger distance",
+    "L2C2, Hellinger 4, ramp, beta=0, neighbors=line": (
         "with the Hellinger distance, as strong (`lambda_min=4`)"
     ),
-    "L2C2, Hellinger 0.5, ramp, beta=0, shared=true": (
+    "L2C2, Hellinger 0.5, ramp, beta=0, neighbors=line": (
         "with the Hellinger distance, as strong (`lambda_min=0.5`)"
     ),
     f"{OURS}, beta=0": "with neighbors in the box",
-    f"{OURS}, shared=true": "with the value term",
+    f"{OURS}, neighbors=line": "with the value term",
     "L2C2, the paper's": "the paper's L2C2",
     "L2C2, Hellinger 1": "the paper's, at a hundred times its gain",
 }

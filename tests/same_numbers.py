@@ -44,7 +44,7 @@ PAPERS = [
     "regularizer.lambda_min=0.01",
     "regularizer.lambda_max=1.0",
     "regularizer.beta=0.1",
-    "regularizer.shared=true",
+    "regularizer.neighbors=line",
     "regularizer.gain=constant",
 ]
 RUNS = {

@@ -399,7 +399,7 @@ def test_documented_smooth_composes(tmp_path):
     changes = ["loss.strength=2", "+loss.overrides.lambda_max=500"]
     loss = instantiate(documented(0, tmp_path, *changes).loss)
     assert isinstance(loss, SACLoss) and isinstance(loss, L2C2Loss)
-    assert loss.l2c2_neighborhood == Neighborhood(lambda_min=10, lambda_max=500, shared=True)
+    assert loss.l2c2_neighborhood == Neighborhood(lambda_min=10, lambda_max=500, neighbors="line")
     assert loss.regularizer_gain == 2.0 and loss.folded
 
 
@@ -408,7 +408,7 @@ def test_documented_components_compose(tmp_path):
     cfg = documented(1, tmp_path, "near.lambda_max=500")
     loss, transform = instantiate(cfg.loss), instantiate(cfg.replay_buffer.transform)
     assert isinstance(loss, SACLoss) and isinstance(loss, L2C2Loss)
-    near = Neighborhood(lambda_min=10.0, lambda_max=500.0, shared=True)
+    near = Neighborhood(lambda_min=10.0, lambda_max=500.0, neighbors="line")
     assert loss.l2c2_neighborhood == transform.neighborhood == near
     assert loss.l2c2_policy_distance == "mean" and loss.policy_terms == loss.added_terms
 

@@ -590,7 +590,7 @@ class TestWhichStatesAreMoved:
 
     def test_one_draw_moves_all_dimensions_of_all_keys(self):
         """Where it is shared, in the loss as in the transform."""
-        near = Neighborhood(sigma=1.0, lambda_min=0.2, lambda_max=1.0, shared=True)
+        near = Neighborhood(sigma=1.0, lambda_min=0.2, lambda_max=1.0, neighbors="line")
         loss, batch = self.two_part_loss(neighborhood=near)
         torch.manual_seed(0)
         mean = loss.policy_regularizer(batch)["l2c2_distance"].item() - near.epsilon

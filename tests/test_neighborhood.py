@@ -219,7 +219,7 @@ def test_numbers_of_another_shape_are_refused():
 
 def test_a_shared_draw_leads_along_the_line_to_the_successor():
     """u = 1/2 halfway to it, at the distance 1/2 + epsilon, for features of any shape."""
-    near = Neighborhood(sigma=1.0, lambda_min=0.2, lambda_max=1.0, shared=True)
+    near = Neighborhood(sigma=1.0, lambda_min=0.2, lambda_max=1.0, neighbors="line")
     state, later = torch.zeros(2, 3, 2), torch.arange(12.0).reshape(2, 3, 2)
     neighbor, distance = near.place(state, later, torch.tensor([[0.75], [0.0]]))
     torch.testing.assert_close(neighbor, torch.stack((0.5 * later[:1], -later[1:]))[:, 0][:, None])
@@ -242,7 +242,7 @@ def test_steps_beyond_the_bound_are_infinitely_far():
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
-        ({"shared": 1}, TypeError, "shared must be True or False, got 1"),
+        ({"neighbors": "ball"}, ValueError, "Expected neighbors='box' or 'line', got 'ball'"),
         (
             {"max_step": 0.0},
             ValueError,

@@ -151,7 +151,7 @@ def test_the_batch_has_the_entries_and_neighbors_that_the_buffer_gives():
 @pytest.mark.parametrize("name", ["prioritized", "sac"])
 def test_where_a_transition_lies_says_nothing_of_its_neighbor(name):
     """Neither of one number for a neighbor, as many as the sampler draws."""
-    regularizer = L2C2Config(shared=True)
+    regularizer = L2C2Config(neighbors="line")
     replay = PrioritizedReplayConfig(capacity=50, batch_size=8)
     chosen = replace(CASES[name], regularizer=regularizer, replay=replay)
     experiment = Experiment(chosen)

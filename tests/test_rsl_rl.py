@@ -156,7 +156,7 @@ def gradients(terms: TensorDictBase, loss: ClipPPOLoss) -> list[Tensor]:
 
 
 FIXED = {"schedule": "fixed", "max_grad_norm": 1e9}
-NEAR = {"sigma": 1.5, "lambda_min": 0.2, "lambda_max": 2.0, "shared": False}
+NEAR = {"sigma": 1.5, "lambda_min": 0.2, "lambda_max": 2.0, "neighbors": "box"}
 PAPER = {"policy_distance": "hellinger", "beta": 0.1}
 
 
@@ -255,14 +255,14 @@ def test_zero_rewards_leave_a_shared_deviation_where_it_is() -> None:
     [
         (
             {},
-            "L2C2PPO: method='l2c2', policy_distance='mse', shared=True, lambda_min=1.0, "
+            "L2C2PPO: method='l2c2', policy_distance='mse', neighbors='line', lambda_min=1.0, "
             "lambda_max=100.0, beta=0.0, strength=1.0 (the preset: there is no regularizer_cfg). "
             "The gain is constant; for the preset's ramp, set ramp_updates in regularizer_cfg to "
             "the number of the runner's iterations (max_iterations).",
         ),
         (
             {"max_iterations": 30, "regularizer_cfg": {"beta": 0.5, "strength": 2}},
-            "L2C2PPO: method='l2c2', policy_distance='mse', shared=True, lambda_min=1.0, "
+            "L2C2PPO: method='l2c2', policy_distance='mse', neighbors='line', lambda_min=1.0, "
             "lambda_max=100.0, beta=0.5, strength=2. The gain rises over 30 updates.",
         ),
     ],
@@ -609,7 +609,7 @@ def test_the_pages_configuration_builds(monkeypatch: pytest.MonkeyPatch) -> None
     assert regularization.ramp_updates == 1500
     chosen = dict(preset("l2c2", "ppo").settings)
     near = regularization.loss.l2c2_neighborhood
-    for name in ("shared", "lambda_min", "lambda_max"):
+    for name in ("neighbors", "lambda_min", "lambda_max"):
         assert getattr(near, name) == chosen.pop(name)
     assert regularization.loss.l2c2_policy_distance == chosen.pop("policy_distance")
     assert chosen == {"beta": 0.0} and regularization.loss.added_terms == {"loss_l2c2_actor"}
@@ -651,7 +651,7 @@ def test_the_runner_builds_it_by_its_name(monkeypatch: pytest.MonkeyPatch, tmp_p
     runner = OnPolicyRunner(NoisyPoints(8), copy.deepcopy(config), log_dir=str(tmp_path))
     loss = runner.alg.regularization.loss
     assert isinstance(runner.alg, rsl.L2C2PPO)
-    near = Neighborhood(0.5, lambda_min=1.0, lambda_max=3.0, shared=True)
+    near = Neighborhood(0.5, lambda_min=1.0, lambda_max=3.0, neighbors="line")
     assert (loss.l2c2_neighborhood, loss.l2c2_beta) == (near, 0.25)
     logged = []
     monkeypatch.setattr(runner.logger, "log", lambda **told: logged.append(told["loss_dict"]))

@@ -49,7 +49,7 @@ from torchrl_l2c2 import (
 from torchrl_l2c2.presets import KINDS, METHODS, NEAREST, PRESETS
 
 # Settings for losses without a preset.
-GIVEN = {"policy_distance": "mean", "shared": True, "lambda_min": 10.0, "lambda_max": 1000.0}
+GIVEN = {"policy_distance": "mean", "neighbors": "line", "lambda_min": 10.0, "lambda_max": 1000.0}
 
 
 def seeded(make, *args, seed=0, **kwargs):
@@ -606,7 +606,7 @@ class TestPresets:
             near = loss.l2c2_neighborhood
             assert near.lambda_min == settings["lambda_min"]
             assert near.lambda_max == settings["lambda_max"]
-            assert near.shared == settings.get("shared", False)
+            assert near.neighbors == settings.get("neighbors", "box")
             assert loss.l2c2_policy_distance == settings.get("policy_distance", "hellinger")
             assert loss.regularizer_gain.item() == 1.0
 
@@ -694,9 +694,9 @@ class TestPresets:
             ),
             ({"method": "caps", "beta": 0.1}, TypeError, r"settings of caps, .*got \['beta'\]"),
             (
-                {"method": "caps", "shared": True},
+                {"method": "caps", "neighbors": "line"},
                 TypeError,
-                r"settings of caps, .*got \['shared'\]",
+                r"settings of caps, .*got \['neighbors'\]",
             ),
             ({"method": "l2c3"}, ValueError, r"one of \['l2c2', .*got 'l2c3'"),
             (

@@ -61,7 +61,7 @@ def test_one_number_for_all_entries_leaves_each_its_dtype(order):
     data = transitions(6, wide=(3,), thin=(2,))
     for key in ("wide", ("next", "wide")):
         data[key] = data[key].double()
-    near = Neighborhood(shared=True)
+    near = Neighborhood(neighbors="line")
     NeighborTransform(near, in_keys=list(order), generator=generator())(data)
     found = {key: data["neighbor", key] for key in order}
     assert {key: each.dtype for key, each in found.items()} == {
@@ -335,8 +335,8 @@ def test_a_loss_that_draws_by_itself_refuses_a_reserved_name_too():
 def test_reprs_show_the_settings():
     """What is printed of a pipeline shows what the transforms do."""
     assert repr(NeighborTransform(NEAR, num_samples=4)) == (
-        "NeighborTransform(Neighborhood(sigma=2.0, lambda_min=0.1, lambda_max=1.0, shared=False, "
-        "max_step=None), keys=['observation'], out_key='neighbor', num_samples=4)"
+        "NeighborTransform(Neighborhood(sigma=2.0, lambda_min=0.1, lambda_max=1.0, "
+        "neighbors='box', max_step=None), keys=['observation'], out_key='neighbor', num_samples=4)"
     )
     assert repr(ObservationNoise(0.5)) == "ObservationNoise(scale=0.5, keys=['observation'])"
 

@@ -47,10 +47,11 @@ class Neighborhood:
         lambda_max: gain at the center, greater than ``lambda_min`` and than
             ``sigma * lambda_min``. Larger values smooth more where the neighbor is close to the
             state, and change nothing at the edge. Defaults to ``1.0``.
-        shared: one :math:`u` for all dimensions of a state. Neighbors then lie on the line through
-            :math:`s` and :math:`s'`, as in implementations for robots. Their distances are uniform,
-            and the mean gain is as large as for a state of one dimension. Defaults to ``False``,
-            one number for each dimension (the paper).
+        neighbors: ``"box"`` or ``"line"``. With ``"box"`` each dimension of a state has its own
+            :math:`u_i` (the paper). With ``"line"`` all dimensions have the same :math:`u`:
+            neighbors lie on the line through :math:`s` and :math:`s'`, as in implementations for
+            robots. Their distances are uniform, and the mean gain is as large as for a state of one
+            dimension. Defaults to ``"box"``.
         max_step: the largest :math:`\lVert s' - s \rVert_2`, greater than 0, in the state's units.
             If a state has several entries, the bound applies to each, and one longer entry is
             enough. A transition with a longer step is a reset or a teleport and does not count:
@@ -58,8 +59,8 @@ class Neighborhood:
             of 0. Defaults to ``None``, no bound.
 
     Raises:
-        TypeError: if a value is not a real number, or ``shared`` is not a boolean.
-        ValueError: if a value is not finite or out of its range.
+        TypeError: if a value is not a real number.
+        ValueError: if a value is not finite or out of its range, or ``neighbors`` is unknown.
 
     Examples:
         >>> import torch
@@ -78,15 +79,15 @@ class Neighborhood:
     sigma: float = 1.0
     lambda_min: float = 0.01
     lambda_max: float = 1.0
-    shared: bool = False
+    neighbors: str = "box"
     max_step: float | None = None
 
     def __post_init__(self) -> None:
         hint = "To switch the regularization off, leave it out instead of setting its gain to 0."
         for name in ("sigma", "lambda_min", "lambda_max"):
             check_real(name, getattr(self, name), above=0, hint=hint)
-        if not isinstance(self.shared, bool):
-            raise TypeError(f"shared must be True or False, got {self.shared!r}.")
+        if self.neighbors not in ("box", "line"):
+            raise ValueError(f"Expected neighbors='box' or 'line', got {self.neighbors!r}.")
         if self.max_step is not None:
             check_real("max_step", self.max_step, above=0, hint="None is no bound.")
         if self.lambda_max <= self.sigma * self.lambda_min:
@@ -102,6 +103,11 @@ class Neighborhood:
                 f"and lambda_min={self.lambda_min!r}: the neighborhood's radius would be "
                 f"{self.radius!r}. Raise lambda_max or lower lambda_min."
             )
+
+    @property
+    def on_line(self) -> bool:
+        """Whether neighbors lie on the line through a state and its successor."""
+        return self.neighbors == "line"
 
     @property
     def epsilon(self) -> float:
@@ -187,8 +193,8 @@ class Neighborhood:
             batch_dims: as in :meth:`sample`.
 
         Returns:
-            Numbers in ``[0, 1)``, shape ``[*B, K, *F]``, or ``[*B, K]`` if ``shared``, in the dtype
-            of ``state``.
+            Numbers in ``[0, 1)``, shape ``[*B, K, *F]``, or ``[*B, K]`` on a line, in the dtype of
+            ``state``.
 
         Raises:
             TypeError: if the states are not floating point, or ``num_samples`` is no integer.
@@ -196,7 +202,7 @@ class Neighborhood:
         """
         check_positive_int("num_samples", num_samples)
         _check_states(state, state, batch_dims)
-        features = () if self.shared else state.shape[batch_dims:]
+        features = () if self.on_line else state.shape[batch_dims:]
         shape = (*state.shape[:batch_dims], num_samples, *features)
         # The argument generator=None would not compile where the batch size is dynamic.
         if generator is None:
@@ -211,7 +217,7 @@ class Neighborhood:
         Args:
             state: states, shape ``[*B, *F]``, floating point.
             next_state: their successors, the same shape.
-            uniform: numbers in ``[0, 1)``, shape ``[*B, K, *F]``, or ``[*B, K]`` if ``shared``: 0.5
+            uniform: numbers in ``[0, 1)``, shape ``[*B, K, *F]``, or ``[*B, K]`` on a line: 0.5
                 is the state itself, 0 and 1 are the edges of the box.
             batch_dims: how many leading dimensions are batch dimensions. Defaults to ``1``.
 
@@ -232,14 +238,14 @@ class Neighborhood:
         """
         _check_states(state, next_state, batch_dims)
         batch, features = state.shape[:batch_dims], state.shape[batch_dims:]
-        drawn = torch.Size() if self.shared else features
+        drawn = torch.Size() if self.on_line else features
         if uniform.shape != (*batch, *uniform.shape[batch_dims : batch_dims + 1], *drawn):
             raise ValueError(
-                f"uniform must have the shape [*B, K{'' if self.shared else ', *F'}] of states "
+                f"uniform must have the shape [*B, K{'' if self.on_line else ', *F'}] of states "
                 f"{tuple(state.shape)} with {batch_dims} batch dimensions, got "
                 f"{tuple(uniform.shape)}."
             )
-        # Shared numbers may come from an entry of another dtype.
+        # On a line, the numbers may come from an entry of another dtype.
         u = ((2.0 * uniform - 1.0) * self.radius).to(state.dtype)
         displacement = (next_state - state).to(state.dtype)
         known = displacement.isfinite().reshape(*batch, features.numel()).any(-1)
@@ -253,7 +259,7 @@ class Neighborhood:
             distance = distance.masked_fill(too_long.unsqueeze(-1), math.inf)
             too_long = too_long.reshape(*batch, *(1 for _ in features))
             displacement = displacement.masked_fill(too_long, 0.0)
-        u = u.reshape(*u.shape, *(1 for _ in features)) if self.shared else u
+        u = u.reshape(*u.shape, *(1 for _ in features)) if self.on_line else u
         neighbor = state.unsqueeze(batch_dims) + displacement.unsqueeze(batch_dims) * u
         return neighbor, distance
 

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-NEIGHBORHOOD_FIELDS = frozenset({"sigma", "lambda_min", "lambda_max", "shared", "max_step"})
+NEIGHBORHOOD_FIELDS = frozenset({"sigma", "lambda_min", "lambda_max", "neighbors", "max_step"})
 """Settings of L2C2 that are fields of ``Neighborhood``."""
 
 
@@ -87,7 +87,7 @@ PRESETS: dict[str, dict[str, Preset]] = {
         "ppo": Preset(
             {
                 "policy_distance": "mse",
-                "shared": True,
+                "neighbors": "line",
                 "lambda_min": 1.0,
                 "lambda_max": 100.0,
                 "beta": 0.0,
@@ -99,7 +99,7 @@ PRESETS: dict[str, dict[str, Preset]] = {
         "sac": Preset(
             {
                 "policy_distance": "mean",
-                "shared": True,
+                "neighbors": "line",
                 "lambda_min": 10.0,
                 "lambda_max": 1000.0,
                 "beta": 0.0,
@@ -110,7 +110,7 @@ PRESETS: dict[str, dict[str, Preset]] = {
         "td3": Preset(
             {
                 "policy_distance": "mean",
-                "shared": True,
+                "neighbors": "line",
                 "lambda_min": 10.0,
                 "lambda_max": 1000.0,
                 "beta": 0.0,

@@ -56,7 +56,7 @@ def _draw(
     uniform = TensorDict(batch_size=tensordict.batch_size, device=tensordict.device)
     numbers, dims = None, tensordict.batch_dims
     for key, (state, _) in transitions.items():
-        if numbers is None or not neighborhood.shared:
+        if numbers is None or not neighborhood.on_line:
             numbers = neighborhood.draw(state, num_samples, generator, batch_dims=dims)
         uniform.set(key, numbers)
     return uniform
@@ -137,7 +137,8 @@ class NeighborTransform(RandomTransform):
             "distance": [*B, K],          # infinite where the transition does not count
         }
 
-    Several keys are parts of one state. Their displacements are independent, unless ``shared``, and
+    Several keys are parts of one state. Their displacements are independent in a box and the
+    same on a line;
     the state's distance is the largest distance of its parts.
 
     .. note::

@@ -145,7 +145,7 @@ def neighborhood_of(config: RegularizerConfig) -> Neighborhood | None:
         config.sigma,
         config.lambda_min,
         config.lambda_max,
-        shared=config.shared,
+        neighbors=config.neighbors,
         max_step=config.max_step,
     )
 

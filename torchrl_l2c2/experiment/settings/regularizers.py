@@ -126,10 +126,12 @@ class L2C2Config(GainConfig):
     lambda_max: float = Field(
         default=1.0, gt=0, description="gain at the center of the neighborhood [paper]"
     )
-    shared: bool = Field(
-        default=False,
-        description="line neighborhood (one random number for all dimensions of the state) instead "
-        "of a box neighborhood (one for each) [paper: box]",
+    neighbors: Literal["box", "line"] = Field(
+        default="box",
+        description="shape of the neighborhood: a box around s with s' at a corner (one random "
+        "number for each dimension of the state) [paper], or the line through s and s' (one number "
+        "for all)",
+        json_schema_extra=neutral("box"),
     )
     max_step: float | None = Field(
         default=None,
