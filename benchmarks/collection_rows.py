@@ -16,7 +16,6 @@ from benchmarks.timing import Row, alternate
 from torchrl_l2c2.experiment import (
     PAPER_TASKS,
     EpisodeCollector,
-    MultiEpisodeCollector,
     TaskConfig,
     make_env,
 )
@@ -58,45 +57,9 @@ def collection_rows(effort: Effort) -> Iterable[Row]:
         )
 
 
-def worker_rows(effort: Effort) -> Iterable[Row]:
-    """Episodes of two processes at once, against one after another in this process."""
-    for name in ("swingup", "ant"):
-        task = dataclasses.replace(PAPER_TASKS[name], max_steps=min(1000, effort.steps))
-        env = make_env(task, seed=0)
-        actor = make_actor(env.observation_spec["observation"].shape[-1], env.action_spec)
-        one = EpisodeCollector(
-            env, actor, frames_per_batch=time_limit(task), compile_policy=effort.compile
-        )
-        two = MultiEpisodeCollector(
-            partial(make_env, task, 0),
-            actor,
-            num_workers=2,
-            max_steps=time_limit(task),
-            compile_policy=effort.compile,
-        )
-        times = alternate(
-            {
-                "one": partial(_rollout, one),
-                "two": partial(_rollout, two),
-            },
-            repeats=effort.rounds,
-        )
-        fps = {what: 1.0 / seconds for what, seconds in times.items()}
-        one.shutdown()
-        two.shutdown()
-        yield Row(
-            "workers",
-            f"frames of num_workers=2 / frames of num_workers=1, {name}",
-            fps["two"] / fps["one"],
-            parts={"two frames/s": fps["two"], "one frames/s": fps["one"]},
-        )
-
-
-def _rollout(collector: EpisodeCollector | MultiEpisodeCollector) -> int:
-    """Plays what a collector plays at once, and counts its frames."""
-    played = collector.rollout()
-    episodes = played if isinstance(played, list) else [played]
-    return sum(episode.numel() for episode in episodes)
+def _rollout(collector: EpisodeCollector) -> int:
+    """Plays a batch and counts its frames."""
+    return collector.rollout().numel()
 
 
 def _simulation(

@@ -28,7 +28,6 @@ ROWS = {
     "regularizers": "regularizer_rows.regularizer_rows",
     "update_4096": "update_rows.large_update_rows",
     "collection": "collection_rows.collection_rows",
-    "workers": "collection_rows.worker_rows",
     "run": "run_rows.run_rows",
     "start": "run_rows.start_rows",
     "peers": "peers.peer_rows",

@@ -18,10 +18,7 @@ from gymnasium import spaces
 
 
 def observed(space: spaces.Space[Any], seen: Any, contract: dict[str, Any]) -> Any:
-    """The policy's input: a vector (entries of a dict in the order of their names) or an image."""
-    if image := contract.get("image"):
-        scaled = (seen - image["low"]) / (image["high"] - image["low"])
-        return scaled.transpose(image["axes"]).reshape(contract["shape"][1:])
+    """The policy's input: a vector, with the entries of a dict in the order of their names."""
     if isinstance(space, spaces.Dict):
         names = sorted(space.spaces)
         return np.concatenate([spaces.flatten(space[name], seen[name]) for name in names])

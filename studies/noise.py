@@ -120,7 +120,7 @@ def play_with_noise(
 
 def _observed(run: FinishedRun) -> tuple[Any, ...]:
     """What is observed: a task's states may be shown in several ways."""
-    return tuple(run.config["task"].get(name) for name in ("env_id", "flatten", "images"))
+    return tuple(run.config["task"].get(name) for name in ("env_id", "flatten"))
 
 
 def noise_table(played: Sequence[Played]) -> Table:

@@ -1,9 +1,5 @@
 """The lean collector gives what TorchRL's own gives, to the bit."""
 
-import subprocess
-import sys
-from functools import partial
-
 import gymnasium
 import numpy as np
 import pytest
@@ -26,7 +22,6 @@ from torchrl_l2c2.experiment import (
     EpisodeCollector,
     Experiment,
     ExperimentConfig,
-    MultiEpisodeCollector,
     SACConfig,
     TaskConfig,
     UniformReplayConfig,
@@ -208,127 +203,6 @@ def test_a_test_episode_that_is_cut_is_not_gone_on_with(transforms):
     first, second = play_episodes(make_actor(3, env.action_spec), env, 2, max_steps=5)
     assert len(first) == len(second) == 5
     assert not second["observation"][0].equal(first["next", "observation"][-1])
-
-
-class TestSeveralWorkers:
-    """Processes of their own; one collector serves all tests, as starting it takes seconds."""
-
-    @pytest.fixture(scope="class")
-    def actor(self):
-        return make(TaskConfig(max_steps=20))[1]
-
-    @pytest.fixture(scope="class")
-    def collector(self, actor):
-        env = partial(make_env, TaskConfig(max_steps=20), 3)
-        collector = MultiEpisodeCollector(
-            env, actor, num_workers=2, max_steps=20, seed=5, random_frames=41
-        )
-        yield collector
-        collector.shutdown()
-
-    def test_a_round_is_an_episode_of_each_with_draws_of_their_own(self, collector):
-        """The entries of the lean collector; noise, starts and actions differ between workers."""
-        first, second = collector.rollout()
-        env, actor = make(TaskConfig(max_steps=20))
-        alone = EpisodeCollector(env, actor, frames_per_batch=20).rollout()
-        for episode in (first, second):
-            assert set(episode.keys(True, True)) == set(alone.keys(True, True))
-            assert episode.shape == (20,) and episode["next", "done"][-1]
-        for key in ("observation", "action"):
-            assert (first[key] != second[key]).any(-1).all()
-        noise = first["observation"][:, 1] - second["observation"][:, 1]
-        assert noise.unique().numel() == 20
-
-    def test_first_frames_are_random_and_later_ones_the_policys(self, collector, actor):
-        """Rounds that begin before frame 41; a stored likelihood tells which action was drawn."""
-        collector.set_generator_state({"rounds_played": 1, "frames": 40})
-        drawn, chosen = collector.rollout()[0], collector.rollout()[0]
-        expected = actor.get_dist(chosen.select("observation")).log_prob(chosen["action"])
-        torch.testing.assert_close(chosen["action_log_prob"], expected, rtol=1e-3, atol=1e-3)
-        unlike = actor.get_dist(drawn.select("observation")).log_prob(drawn["action"])
-        assert ((drawn["action_log_prob"] - unlike).abs() > 0.1).any()
-
-    def test_from_a_saved_state_the_rounds_are_the_same_again(self, collector):
-        """To the bit, and no round is like the one before."""
-        collector.rollout()
-        state = collector.generator_state()
-        rounds = [torch.stack(collector.rollout()) for _ in range(2)]
-        collector.set_generator_state(state)
-        again = [torch.stack(collector.rollout()) for _ in range(2)]
-        for ours, theirs in zip(again, rounds, strict=True):
-            assert (ours == theirs).all()
-        assert (rounds[0]["observation"] != rounds[1]["observation"]).any()
-
-    def test_workers_act_with_the_policy_as_it_is_now(self, collector, actor):
-        """Parameters that training has changed in place."""
-        state = collector.generator_state()
-        before = collector.rollout()[0]
-        with torch.no_grad():
-            list(actor.parameters())[-1].add_(1.0)
-        collector.set_generator_state(state)
-        after = collector.rollout()[0]
-        assert torch.equal(before["observation"][0], after["observation"][0])
-        assert (after["scale"][0] > before["scale"][0]).all()
-
-    def test_what_sends_weights_is_known_and_keeps_no_buffers(self, collector):
-        """TorchRL's names for both, which ``shutdown`` and the workers use."""
-        assert collector._weight_sync_schemes and collector._use_buffers is False
-
-    def test_an_error_of_the_pipes_says_what_it_means(self, collector, monkeypatch):
-        """What TorchRL raises while it cleans up differs with the time that a process takes."""
-
-        def closes(*_):
-            raise ValueError("Cannot close a process while it is still running.")
-
-        monkeypatch.setattr(collector, "set_seed", closes)
-        with pytest.raises(RuntimeError, match=r"a worker process died .*still running"):
-            collector.rollout()
-
-    def test_the_death_of_a_worker_is_an_error_and_no_endless_wait(self, collector):
-        """Last, as it ends the collector: killed between rounds, as by a lack of memory."""
-        collector.procs[1].kill()
-        collector.procs[1].join()
-        with pytest.raises(RuntimeError):
-            collector.rollout()
-
-
-class LosesAJoint(gymnasium.Wrapper):
-    """An environment whose simulator fails in its first step."""
-
-    def step(self, action):
-        raise KeyError("joint_7")
-
-
-def make_failing_env():
-    """As a worker makes it; a function of a module, which pickle finds."""
-    return GymWrapper(LosesAJoint(gymnasium.make("Pendulum-v1")))
-
-
-def test_what_failed_in_a_worker_is_told():
-    """TorchRL has ended the processes by then, and says only that one has failed."""
-    actor = make_actor(3, make_failing_env().action_spec)
-    collector = MultiEpisodeCollector(make_failing_env, actor, num_workers=1, max_steps=5)
-    with pytest.raises(RuntimeError, match=r"a worker process died \(KeyError: 'joint_7'\)"):
-        collector.rollout()
-    collector.shutdown()
-
-
-@pytest.mark.slow
-def test_a_script_that_leaves_its_workers_running_ends(tmp_path):
-    """They are ended with it, also where nobody closed the experiment."""
-    script = tmp_path / "script.py"
-    script.write_text(
-        "from torchrl_l2c2.experiment import Experiment, ExperimentConfig, TaskConfig\n"
-        "if __name__ == '__main__':\n"
-        "    task = TaskConfig('pendulum', 'Pendulum-v1', episodes=2, max_steps=20)\n"
-        "    config = ExperimentConfig(task=task, compile=False, num_workers=2)\n"
-        "    experiment = Experiment(config)\n"
-        "    print('episodes', len(experiment.train()))\n"
-    )
-    done = subprocess.run(
-        [sys.executable, script], capture_output=True, text=True, timeout=120, check=True
-    )
-    assert "episodes 2" in done.stdout
 
 
 class Counting(gymnasium.Env):

@@ -1,6 +1,5 @@
 """Runs of the experiment, as a user starts them: short, but of every task and regularizer."""
 
-import contextlib
 import csv
 import json
 import math
@@ -299,7 +298,7 @@ def test_nan_in_a_test_episode_gives_no_result():
 
 def broken_after(experiment, frames, outcome):
     """Lets the simulator give (or raise) something else once so many frames were played."""
-    original, left = experiment.player.collector._gymnasium.step, [frames]
+    original, left = experiment.player.collector._simulation._gymnasium.step, [frames]
 
     def step(action):
         left[0] -= 1
@@ -310,7 +309,7 @@ def broken_after(experiment, frames, outcome):
         observation, _, *ends = original(action)
         return observation, outcome, *ends
 
-    experiment.player.collector._gymnasium.step = step
+    experiment.player.collector._simulation._gymnasium.step = step
 
 
 @pytest.mark.parametrize(
@@ -355,29 +354,6 @@ def test_a_batch_that_is_not_finite_can_be_skipped(entry):
     rows.copy_(finite)
     assert experiment.learner.update(True)[0].isfinite().all()
     assert experiment.metrics[-1]["skipped_updates"] == 0
-
-
-def test_workers_play_rounds_that_are_learned_from_as_episodes(tmp_path):
-    """As many updates as of one process's episodes; a worker that dies leaves a checkpoint.
-
-    The round that reaches what was asked for is learned from to its end.
-    """
-    task = replace(PENDULUM, episodes=3)
-    one_pass = PPORPEConfig(replay_ratio=None)
-    config = small(num_workers=2, task=task, algorithm=one_pass, checkpoint_interval=0.0)
-    with contextlib.closing(Experiment(config, tmp_path)) as experiment:
-        rows = experiment.train()
-        assert [row["episode"] for row in rows] == [1, 2, 3, 4]
-        assert [row["frames"] for row in rows] == [40, 80, 120, 160]
-        # Two passes over what the buffer holds after the round: 80 frames, then 160.
-        assert [row["updates"] for row in rows] == [2, 4, 9, 14]
-        assert len({row["return"] for row in rows}) == 4
-        experiment.player.collector.procs[0].kill()
-        experiment.player.collector.procs[0].join()
-        message = r"Pendulum-v1 failed beyond frame 160.*Last good checkpoint: .*_0+4.pt"
-        with pytest.raises(SimulatorError, match=message):
-            experiment.train(6)
-        assert len(experiment.metrics) == 4
 
 
 def test_a_loss_that_is_not_finite_stops_the_run_with_its_name(monkeypatch):
@@ -559,27 +535,17 @@ gymnasium.register("Broken-v0", entry_point=Broken)
 """
 
 
-@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_an_error_of_the_users_own_task_is_shown_with_its_lines(tmp_path, monkeypatch, workers):
-    """Also where it happened in another process."""
+def test_an_error_of_the_users_own_task_is_shown_with_its_lines(tmp_path, monkeypatch):
+    """The traceback, then one line."""
     (tmp_path / "broken_task.py").write_text(BROKEN_TASK)
     monkeypatch.setenv("PYTHONPATH", str(ROOT))  # The task lies in the current folder.
-    settings = ["task.env_id=broken_task:Broken-v0", "task.episodes=4", f"num_workers={workers}"]
+    settings = ["task.env_id=broken_task:Broken-v0", "task.episodes=4"]
     done = run_train(*PENDULUM_OVERRIDES, *settings, folder=tmp_path, check=False)
     assert done.returncode == 1
     assert 'broken_task.py", line 9, in step' in done.stderr and "lower_the_boom" in done.stderr
     assert "KeyError: 'boom'" in done.stderr
     told = done.stderr.splitlines()[-1]
     assert told.startswith("error: broken_task:Broken-v0 failed beyond") and "'boom'" in told
-
-
-@pytest.mark.slow
-def test_what_is_refused_with_workers_ends(tmp_path):
-    """They had played nothing yet: the process waited for a thread that Python no longer starts."""
-    gain = ["gain=target", "gain_target=0.1", "gain_of=nonsense"]
-    settings = ["num_workers=2", *(f"regularizer.{setting}" for setting in gain)]
-    done = run_train(*PENDULUM_OVERRIDES, *settings, folder=tmp_path, check=False)
-    assert done.returncode == 1 and "gain_of" in done.stderr.splitlines()[-1]
 
 
 def test_a_sweep_gives_one_table(tmp_path):

@@ -466,15 +466,6 @@ def test_wrong_settings_are_refused_with_what_is_allowed(settings, message):
         ),
         ({"regularizer": L2C2Config(name="caps")}, r"regularizer.name must .*, got 'caps'"),
         ({"algorithm": SACConfig(name="td3")}, r"one of \['sac'\] with SACConfig, got 'td3'"),
-        ({"num_workers": 0}, "num_workers must be greater than or equal to 1, got 0"),
-        (
-            {"num_workers": 2, "algorithm": SACConfig()},
-            "num_workers must be 1 with algorithm.schedule=step.* algorithm.replay_ratio=256, one",
-        ),
-        (
-            {"num_workers": 2, "algorithm": PPOConfig(num_envs=2)},
-            "num_workers must be 1 with algorithm.num_envs",
-        ),
         ({"replay": GROUPS["replay"]["rollout"]}, "'rollout' is nothing that algorithm 'ppo_rpe'"),
         (
             {"algorithm": PPOConfig(), "replay": GROUPS["replay"]["uniform"]},

@@ -174,15 +174,8 @@ NESTED = OrderedDict(b=ANGLE, a=gymnasium.spaces.Dict(label=gymnasium.spaces.Dis
     [
         (gymnasium.spaces.Box(-9, 9, (2,), np.float64), {}),
         (gymnasium.spaces.Dict(NESTED), {"flatten": True}),
-        (gymnasium.spaces.Box(10, 250, (9, 8, 3), np.uint8), {"images": True}),
-        pytest.param(
-            gymnasium.spaces.Box(0, 255, (3, 9, 8), np.uint8),
-            {"images": True},
-            marks=pytest.mark.slow,
-        ),
-        (gymnasium.spaces.Box(0, 255, (9, 8), np.uint8), {"images": True}),
     ],
-    ids=["vector", "nested", "channels last", "channels first", "no channels"],
+    ids=["vector", "nested"],
 )
 def test_the_example_plays_what_the_run_tested(tmp_path, monkeypatch, capsys, space, task):
     """Numbers of actions, their variation and what is observed are those of training."""
@@ -203,7 +196,7 @@ def test_the_example_plays_what_the_run_tested(tmp_path, monkeypatch, capsys, sp
     assert float(told["return"]) == expected["return_mean"]
     variation = expected["action_variation_mean"]
     assert float(told["action variation"]) == pytest.approx(variation, abs=1e-3)
-    assert variation > 0 or "images" in task
+    assert variation > 0
 
 
 def test_episodes_of_one_step_are_enough_and_no_bounds_are_made_up(tmp_path):

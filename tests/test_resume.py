@@ -258,7 +258,7 @@ def test_what_changes_no_number_leaves_a_run_finished(ended):
 def test_a_setting_that_is_new_and_off_leaves_a_run_finished(ended):
     """A release that adds one has no test played again."""
     saved = json.loads((ended / "config.json").read_text())
-    del saved["task"]["images"], saved["task"]["frames"], saved["regularizer"]["max_step"]
+    del saved["task"]["flatten"], saved["task"]["frames"], saved["regularizer"]["max_step"]
     (ended / "config.json").write_text(json.dumps(saved))
     assert finished_run(ended, small().to_dict()) is not None
     longer = small(task=replace(small().task, episodes=7))
@@ -483,8 +483,8 @@ def test_which_policies_are_tested_may_not_change_where_a_gain_follows_the_tests
 def test_a_setting_that_a_checkpoint_does_not_know_is_named(tmp_path):
     """One of an earlier release, before there was such a setting."""
     saved = small().to_dict()
-    del saved["num_workers"]
-    with pytest.raises(OtherRunError, match=r"made with num_workers=none, as it is .*, not 1:"):
+    del saved["on_nonfinite"]
+    with pytest.raises(OtherRunError, match=r"made with on_nonfinite=none, as it is .*, not stop:"):
         check_same_settings(saved, small().to_dict())
 
 

@@ -44,7 +44,6 @@ from torchrl_l2c2.experiment import (
     Experiment,
     ExperimentConfig,
     GradCAPSConfig,
-    L2C2Config,
     LCPConfig,
     PPOConfig,
     PPORPEConfig,
@@ -913,7 +912,7 @@ def test_asap_goes_around_every_loss_with_a_policy(case):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "regularizer",
-    [LCPConfig(), SR2LConfig(steps=2), ASAPConfig(), L2C2Config(tchebycheff_mu=0.1)],
+    [LCPConfig(), SR2LConfig(steps=2), ASAPConfig()],
     ids=lambda v: v.name,
 )
 def test_with_gradients_of_their_own_their_update_is_one_graph_too(regularizer):

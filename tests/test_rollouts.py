@@ -180,7 +180,7 @@ def test_a_simulator_that_does_not_repeat_itself_is_told():
     """And begins another episode."""
     collector = collector_of(MOODY, [0], 10)
     collector.rollout()
-    with pytest.warns(UserWarning, match="plays an episode differently when it is played again"):
+    with pytest.warns(UserWarning, match="plays an episode differently the second time"):
         collector.set_generator_state(collector.generator_state())
     played(collector, 2)
     assert len(collector.ended[-1].transitions) == 20
@@ -211,7 +211,7 @@ def test_the_task_gets_clipped_actions_and_the_loss_those_that_were_drawn():
     run = experiment(MOODY, clip_actions=True, log_scale=0.0)
     frames = torch.cat(run.player.play_rollout()[0])
     drawn = frames["action"].flatten()
-    taken = [stream._gymnasium.unwrapped.taken for stream in run.player.collector._streams]
+    taken = [stream._gymnasium.unwrapped.taken for stream in run.player.collector._simulations]
     assert np.concatenate(taken).max() == np.float32(0.2) and drawn.max() > 0.2
     given = torch.from_numpy(np.concatenate(taken)).flatten()
     torch.testing.assert_close(given, drawn.clamp(-0.1, 0.2))

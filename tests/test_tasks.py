@@ -142,10 +142,10 @@ def test_what_is_no_numbers_is_refused(monkeypatch, space, flatten):
     assert "\n" not in str(refused.value)
 
 
-def test_images_are_refused_where_a_vector_is_to_be(monkeypatch):
-    """With both ways to have them observed."""
+def test_an_image_is_refused_with_the_setting_that_flattens_it(monkeypatch):
+    """The experiment has no convolutional networks."""
     still(monkeypatch, space=spaces.Box(0, 255, (8, 8, 3), np.uint8))
-    with pytest.raises(ValueError, match=r"task.images=true.*task.flatten=true"):
+    with pytest.raises(ValueError, match=r"observes a Box of uint8 .*task.flatten=true"):
         make_env(task(), 0)
 
 
@@ -171,7 +171,7 @@ def experiment(name, chosen, folder=None, **settings):
 
 
 def actions(run):
-    return np.array(run.player.collector._gymnasium.unwrapped.taken)
+    return np.array(run.player.collector._simulation._gymnasium.unwrapped.taken)
 
 
 @pytest.mark.parametrize("name", CONTINUOUS)
@@ -214,7 +214,7 @@ SEVERAL_ENVS = PPOConfig(frames=20, num_envs=2, epochs=1, hidden=(8,))
 
 @pytest.mark.parametrize(
     ("name", "settings"),
-    [("sac", {}), ("ppo", {}), ("ppo", {"algorithm": SEVERAL_ENVS, "num_workers": 1})],
+    [("sac", {}), ("ppo", {}), ("ppo", {"algorithm": SEVERAL_ENVS})],
     ids=["frame by frame", "episodes", "rollouts"],
 )
 def test_a_reward_may_be_an_array_of_one_number(monkeypatch, name, settings):
@@ -270,7 +270,7 @@ def test_what_a_task_raises_in_a_test_is_told_as_in_training(monkeypatch, where,
     """Tests play in environments of their own, which may fail where training's do not."""
     still(monkeypatch)
     trained, step = experiment("sac", task(episodes=1), **settings), Still.step
-    training = trained.player.collector._gymnasium.unwrapped
+    training = trained.player.collector._simulation._gymnasium.unwrapped
 
     def fail(self, action):
         if self is not training:

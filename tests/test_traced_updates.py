@@ -50,7 +50,6 @@ METHODS = {
     **{name: REGULARIZERS[name] for name in ("none", "l2c2", "l2c2_mean", "l2c2_ramp", *RIVALS)},
     "half of the batch": L2C2Config(fraction=0.5),
     "the worst of four": L2C2Config(num_samples=4, over_neighbors="max"),
-    "Tchebycheff": L2C2Config(tchebycheff_mu=0.1),
 }
 PAIRS = [(name, "l2c2") for name in ALGORITHMS]
 PAIRS += [("PPO", method) for method in METHODS if method != "l2c2"]

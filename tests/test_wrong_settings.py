@@ -53,8 +53,6 @@ def settings_of():
             "algorithm.hidden must be less than or equal to 1000000, got",
         ),
         ("threads=0", "threads must be greater than or equal to 1, got 0."),
-        ("num_workers=0", "num_workers must be greater than or equal to 1, got 0."),
-        ("num_workers=2 algorithm.schedule=step", "num_workers must be 1 with algorithm.schedule"),
         ("compile=maybe", "compile must be a valid boolean, got 'maybe'."),
         ("on_nonfinite=continue", "on_nonfinite must be 'stop' or 'skip', got 'continue'."),
         ("test_episodes=-1", "test_episodes must be greater than or equal to 0, got -1."),

@@ -1,6 +1,5 @@
 from .analysis.diagnosis import diagnose, findings, write_page
 from .collect.episodes import EpisodeCollector
-from .collect.workers import MultiEpisodeCollector
 from .envs.environments import make_env
 from .run.evaluation import Evaluation, evaluate_policy
 from .run.experiment import Experiment
@@ -39,7 +38,6 @@ __all__ = [
     "L2C2Config",
     "LCPConfig",
     "LoggerConfig",
-    "MultiEpisodeCollector",
     "NoRegularizerConfig",
     "PPOConfig",
     "PPORPEConfig",

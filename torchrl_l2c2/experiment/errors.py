@@ -31,16 +31,12 @@ class SimulatorError(RuntimeError):
     """The environment or the policy in it raised an error; the cause is chained."""
 
 
-class ChildFailedError(RuntimeError):
-    """A compiler or a worker process failed, perhaps because a signal ended it."""
-
-
-class CompilerError(ChildFailedError):
-    """The compiler failed; the text is the line of its output with the reason."""
+class CompilerError(RuntimeError):
+    """The compiler failed, perhaps because a signal ended it; the text has its reason."""
 
 
 # What fails outside of the program: a simulator, a process, the numbers of a training, a disk.
-OUTSIDE = (SimulatorError, ChildFailedError, FloatingPointError, OSError)
+OUTSIDE = (SimulatorError, CompilerError, FloatingPointError, OSError)
 # PyTorch has no class for a lack of CPU memory.
 NO_MEMORY = ("DefaultCPUAllocator: can't allocate memory", "Storage size calculation overflowed")
 

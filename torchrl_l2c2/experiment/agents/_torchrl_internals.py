@@ -12,7 +12,7 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torch.distributions import Distribution
-from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.collectors import Collector
 from torchrl.data import (
     LazyTensorStorage,
     TensorDictPrioritizedReplayBuffer,
@@ -46,24 +46,6 @@ def first_observation(collector: Collector) -> Tensor:
 def noisy(noise: ObservationNoise, observation: Tensor) -> Tensor:
     """The observation with noise; the public call takes a TensorDict, at every frame."""
     return noise._apply_transform(observation)
-
-
-def keep_no_buffers(collector: Collector) -> None:
-    """Has episodes of any length sent to the parent process as they are.
-
-    The public ``use_buffers=False`` also changes the random numbers that are drawn first.
-    """
-    collector._use_buffers = False
-
-
-def end_weight_senders(collector: MultiSyncCollector) -> None:
-    """Ends what sends weights to the processes.
-
-    Left to their ``__del__`` they would start a thread where Python ends, and wait for it.
-    """
-    # None where the collector could not begin.
-    for scheme in (collector._weight_sync_schemes or {}).values():
-        scheme.shutdown()
 
 
 def forget_traced(loss: LossModule) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from copy import deepcopy
-from math import ceil
 
 import torch
 from tensordict.nn import (
@@ -17,7 +16,6 @@ from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase, ExplorationType
 from torchrl.modules import (
     MLP,
-    ConvNet,
     IndependentNormal,
     ProbabilisticActor,
     TanhNormal,
@@ -25,7 +23,6 @@ from torchrl.modules import (
 )
 
 from torchrl_l2c2.experiment.errors import UserError
-from torchrl_l2c2.modules import EncodedNetwork
 
 
 def check_actions(
@@ -86,32 +83,10 @@ def clip_bounds(env: EnvBase) -> tuple[Tensor, Tensor]:
     return torch.full_like(low, -torch.inf), torch.full_like(high, torch.inf)
 
 
-# Channels of the convolutional layers; each layer halves the image.
-CHANNELS = (16, 32, 32)
-
-
-def image_encoder(env: EnvBase) -> nn.Module | None:
-    """Convolutional layers for a task that observes images; ``None`` for other tasks."""
-    shape = env.observation_spec["observation"].shape
-    if len(shape) == 1:
-        return None
-    return ConvNet(
-        in_features=shape[0],
-        num_cells=list(CHANNELS),
-        kernel_sizes=3,
-        strides=2,
-        paddings=1,
-        activation_class=nn.ReLU,
-    )
-
-
 def observation_size(env: EnvBase) -> int:
-    """Numbers in an observation, or what :func:`image_encoder` makes of it."""
-    shape = env.observation_spec["observation"].shape
-    if len(shape) == 1:
-        return shape[0]
-    height, width = (ceil(side / 2 ** len(CHANNELS)) for side in shape[1:])
-    return CHANNELS[-1] * height * width
+    """Returns the number of entries of an observation."""
+    size: int = env.observation_spec["observation"].shape[-1]
+    return size
 
 
 def sharing(network: TensorDictModule, parameters: TensorDictParams) -> TensorDictModule:
@@ -129,19 +104,17 @@ def perceptron(
     *,
     extra_features: int = 0,
 ) -> nn.Module:
-    """Fully connected layers on an observation; images first pass convolutional layers.
+    """Makes fully connected layers on an observation.
 
     Keyword Args:
         extra_features (int): size of a second input, such as the action. Default 0.
     """
-    encoder = image_encoder(env)
-    layers = MLP(
+    return MLP(
         in_features=observation_size(env) + extra_features,
         out_features=out_features,
         num_cells=list(hidden),
         activation_class=activation,
     )
-    return layers if encoder is None else EncodedNetwork(encoder, layers)
 
 
 def normal_actor(
@@ -209,7 +182,7 @@ def orthogonal(network: nn.Module, *, last: float) -> None:
     Keyword Args:
         last (float): gain of the last layer. Smaller ones have outputs nearer to 0 at first.
     """
-    layers = [layer for layer in network.modules() if isinstance(layer, nn.Linear | nn.Conv2d)]
+    layers = [layer for layer in network.modules() if isinstance(layer, nn.Linear)]
     for layer in layers:
         nn.init.orthogonal_(layer.weight, last if layer is layers[-1] else 2.0**0.5)
         if layer.bias is not None:

@@ -8,7 +8,6 @@ from torchrl.envs import EnvBase
 from torchrl_l2c2.experiment.agents.agent import Agent
 from torchrl_l2c2.experiment.agents.networks import (
     check_actions,
-    image_encoder,
     observation_size,
     sharing,
 )
@@ -35,14 +34,12 @@ def make_ppo_rpe(
         squash=config.squash,
         scale_mapping=f"biased_softplus_{config.initial_scale}",
         squish_b=config.squish_b,
-        encoder=image_encoder(env),
     )
     critic = make_critic(
         size,
         num_heads=config.num_heads,
         hidden=config.hidden,
         squish_b=config.squish_b,
-        encoder=image_encoder(env),
     )
     loss = PPORPELoss(
         actor,

@@ -32,7 +32,6 @@ from torchrl_l2c2.objectives import (
     LCPLoss,
     SR2LLoss,
 )
-from torchrl_l2c2.objectives.tchebycheff import TchebycheffLoss
 from torchrl_l2c2.transforms import NeighborTransform
 
 
@@ -75,7 +74,7 @@ def _none(config: NoRegularizerConfig, loss: LossModule) -> LossModule:
 
 @wrap.register
 def _l2c2(config: L2C2Config, loss: LossModule) -> LossModule:
-    loss = L2C2Loss(
+    return L2C2Loss(
         loss,
         neighborhood=neighborhood_of(config),
         beta=config.beta,
@@ -84,9 +83,6 @@ def _l2c2(config: L2C2Config, loss: LossModule) -> LossModule:
         fraction=config.fraction,
         policy_distance=config.policy_distance,
     )
-    if config.tchebycheff_mu is None:
-        return loss
-    return TchebycheffLoss(loss, config.tchebycheff_mu, (config.tchebycheff_ideal or 0.0, 0.0))
 
 
 @wrap.register

@@ -1,40 +1,64 @@
-"""What is played: episodes, checked and measured."""
+"""Episodes and rollouts of a run, checked, counted and measured."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.envs import ExplorationType, set_exploration_type
+from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 from torchrl.modules import EGreedyModule
 
 from torchrl_l2c2.experiment.agents.agent import Agent
 from torchrl_l2c2.experiment.collect.episodes import EpisodeCollector
 from torchrl_l2c2.experiment.collect.rollouts import RolloutCollector
-from torchrl_l2c2.experiment.collect.workers import MultiEpisodeCollector
-from torchrl_l2c2.experiment.envs.environments import simulating
+from torchrl_l2c2.experiment.envs.environments import make_env, simulating, time_limit
 from torchrl_l2c2.experiment.envs.frames import Frame, check_finite, stack_frames
+from torchrl_l2c2.experiment.settings.config import ExperimentConfig
 from torchrl_l2c2.metrics import action_variation
 
 Played = TypeVar("Played")
 
-# Of every episode, by their names in metrics.csv.
+# Measures of an episode, by their names in metrics.csv.
 EPISODE_COLUMNS = ("return", "action_variation", "policy_scale", "length")
+# Distance between the seeds of a run's simulators, so large that no two runs share one.
+SEEDS_APART = 15_485_863
+
+
+def make_collector(
+    config: ExperimentConfig, env: EnvBase, agent: Agent, *, compile: bool
+) -> EpisodeCollector | RolloutCollector:
+    """Makes the collector of a run: rollouts with ``algorithm.num_envs``, otherwise episodes."""
+    algorithm = config.algorithm
+    options: dict[str, Any] = {
+        "compile_policy": compile,
+        "keep_previous": config.regularizer.reads_previous,
+    }
+    if algorithm.num_envs is not None:
+        seeds = (config.seed + SEEDS_APART * i for i in range(1, algorithm.num_envs))
+        envs = [env, *(make_env(config.task, seed) for seed in seeds)]
+        return RolloutCollector(envs, agent.policy, frames_per_batch=algorithm.frames, **options)
+    return EpisodeCollector(
+        env,
+        agent.policy,
+        frames_per_batch=1 if algorithm.schedule == "step" else time_limit(config.task),
+        random_frames=algorithm.random_frames,
+        **options,
+    )
 
 
 @dataclass
 class Episode:
-    """An episode and what was measured of it.
+    """An episode and its measures.
 
     Attributes:
-        transitions: of the whole episode, ``[T]``.
-        last_frame: frames of the run up to and with its last.
-        measures: return, smoothness of the policy's mean, length.
-        ends_round: whether no other episode was played with the same policy after it.
+        transitions: the whole episode, ``[T]``.
+        last_frame: number of the run's frames up to the end of the episode.
+        measures: return, smoothness of the mean actions, mean scale of the policy, length.
+        ends_round: whether it is the last episode that was played with the same policy.
     """
 
     transitions: TensorDictBase
@@ -44,66 +68,63 @@ class Episode:
 
 
 class Player:
-    """Plays an agent's episodes, and measures and counts what is played.
+    """Plays, measures and counts an agent's episodes.
 
     Args:
-        collector: plays, as :func:`~.workers.make_collector` makes it.
-        agent (Agent): whose policy it plays.
-        env_id (str): for errors.
+        collector: the collector, from :func:`make_collector`.
+        agent (Agent): the agent whose policy acts.
+        env_id (str): the environment's id, for errors.
 
     Attributes:
-        frames: played so far.
+        frames: number of frames so far.
     """
 
     def __init__(
-        self,
-        collector: EpisodeCollector | MultiEpisodeCollector | RolloutCollector,
-        agent: Agent,
-        env_id: str,
+        self, collector: EpisodeCollector | RolloutCollector, agent: Agent, env_id: str
     ) -> None:
         self.collector = collector
         self.frames = 0
         self._agent = agent
         self._env_id = env_id
 
-    def play(self) -> list[Episode]:
-        """One episode of every process, all by the policy as it is now.
+    def play(self) -> Episode:
+        """Plays one episode.
 
         Raises:
-            FloatingPointError: NaN or infinity in what the environment or the policy gave.
+            FloatingPointError: NaN or infinity from the environment or the policy.
             SimulatorError: the environment failed.
         """
-        last_frame, batches = self.frames, self._batches()
-        episodes = []
-        for batch in batches:
-            last_frame += batch.numel()
-            episodes.append(self.measured(batch, last_frame, ends_round=batch is batches[-1]))
-        return episodes
+        assert isinstance(self.collector, EpisodeCollector)  # make_collector ensures it.
+        transitions = self._simulate(self.collector.rollout)
+        self._check_and_count(transitions)
+        return self.measured(transitions, self.frames)
 
     def play_rollout(self) -> tuple[list[TensorDictBase], list[Episode]]:
-        """The next frames ``[T]`` of every simulator, and the episodes that ended in them.
+        """Plays a rollout: the next frames ``[T]`` of every simulator, and the ended episodes.
 
         Raises:
             FloatingPointError: as :meth:`play`.
             SimulatorError: as :meth:`play`.
         """
-        assert isinstance(self.collector, RolloutCollector)  # The settings see to it.
-        first_frame, batches = self.frames, self._batches()
+        assert isinstance(self.collector, RolloutCollector)
+        first_frame, rollout = self.frames, self._simulate(self.collector.rollout)
+        for frames in rollout:
+            self._check_and_count(frames)
         ended = self.collector.ended
         episodes = [
             self.measured(e.transitions, first_frame + e.frame, ends_round=e is ended[-1])
             for e in ended
         ]
-        return batches, episodes
+        return rollout, episodes
 
     def step(self) -> Frame:
-        """The next frame of the one episode that is being played.
+        """Plays the next frame of an episode.
 
         Raises:
             FloatingPointError: as :meth:`play`.
             SimulatorError: as :meth:`play`.
         """
-        assert isinstance(self.collector, EpisodeCollector)  # The settings see to it.
+        assert isinstance(self.collector, EpisodeCollector)
         frame = self._simulate(self.collector.step)
         if not frame.is_finite():
             check_finite(stack_frames([frame]), self.frames)
@@ -111,23 +132,17 @@ class Player:
         return frame
 
     def drop_episode(self) -> None:
-        """What :meth:`step` has played of an episode is of none; the next frame begins another."""
+        """Discards the episode that :meth:`step` has begun; the next frame starts another one."""
         assert isinstance(self.collector, EpisodeCollector)
         self.collector.reset()
-
-    def _batches(self) -> list[TensorDictBase]:
-        """What the collector plays at once, checked and counted."""
-        played = self._simulate(self.collector.rollout)
-        batches, last_frame = played if isinstance(played, list) else [played], self.frames
-        for batch in batches:
-            check_finite(batch, last_frame)
-            last_frame += batch.numel()
-        self._count(last_frame - self.frames)
-        return batches
 
     def _simulate(self, play: Callable[[], Played]) -> Played:
         with simulating(f"{self._env_id} failed beyond frame {self.frames}"):
             return play()
+
+    def _check_and_count(self, frames: TensorDictBase) -> None:
+        check_finite(frames, self.frames)
+        self._count(frames.numel())
 
     def _count(self, frames: int) -> None:
         self.frames += frames
@@ -138,10 +153,10 @@ class Player:
     def measured(
         self, transitions: TensorDictBase, last_frame: int, *, ends_round: bool = True
     ) -> Episode:
-        """An episode with its return and, at its states, the smoothness of the policy's mean.
+        """Measures an episode: its return and the smoothness of the policy's mean at its states.
 
-        With the mean scale of a stochastic policy: the Hellinger distance is relative to it, so a
-        policy can satisfy L2C2 by becoming wider.
+        The mean scale of a stochastic policy is logged too: the Hellinger distance is relative to
+        it, so a policy can reduce the penalty by becoming wider.
         """
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             written = self._agent.policy(transitions.select("observation"))

@@ -18,7 +18,6 @@ from torchrl.envs import EnvBase, GymWrapper, TransformedEnv
 from torchrl_l2c2.experiment.envs.pictures import Drawing, PictureRecorder
 from torchrl_l2c2.experiment.envs.spaces import (
     Env,
-    observing_image,
     observing_vector,
     taking_vector,
     unknown_task,
@@ -68,20 +67,16 @@ def make_env(task: TaskConfig, seed: int, *, render: Drawing | None = None) -> E
             around the Gymnasium environment. Default: none.
 
     Returns:
-        EnvBase: a ``GymWrapper`` that observes one vector, or image, of float32, transformed by
-            :class:`ObservationNoise` where there is noise.
+        EnvBase: a ``GymWrapper`` that observes one vector of float32, with noise transformed by
+            :class:`ObservationNoise`.
 
     Raises:
         ValueError: an id that Gymnasium does not know, a task without a time limit, or one whose
-            observations or actions are not vectors of numbers, nor images where they are to be;
-            or one that draws no pictures, with ``render``.
+            observations or actions are not vectors of numbers; or one that draws no pictures, with
+            ``render``.
         SimulatorError: the environment itself raises an error when it is made or reset.
     """
-    simulator = taking_vector(_make(task, render))
-    if task.images:
-        simulator = observing_image(simulator)
-    else:
-        simulator = observing_vector(simulator, flatten=task.flatten)
+    simulator = observing_vector(taking_vector(_make(task, render)), flatten=task.flatten)
     if task.action_rate:
         simulator = ActionRatePenalty(simulator, task.action_rate)
     if render is not None:

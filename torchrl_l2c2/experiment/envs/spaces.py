@@ -1,4 +1,4 @@
-"""What a Gymnasium task observes and takes, as one vector or image of float32 each."""
+"""Conversion of Gymnasium spaces to one vector of float32 each."""
 
 from __future__ import annotations
 
@@ -61,46 +61,6 @@ def observing_vector(env: Env, *, flatten: bool) -> Env:
     return TransformObservation(env, lambda seen: np.asarray(seen, np.float32), _float32(vector))
 
 
-def observing_image(env: Env) -> Env:
-    """The same task, observing one image of float32, ``[channels, height, width]`` from 0 to 1.
-
-    Channels are looked for where there are at most four of them, last or first.
-
-    Raises:
-        ValueError: an observation that is no image, or whose values have no bounds.
-
-    Examples:
-        >>> import gymnasium, numpy as np
-        >>> class Camera(gymnasium.Env):
-        ...     observation_space = gymnasium.spaces.Box(0, 255, (48, 64, 3), np.uint8)
-        >>> observing_image(Camera()).observation_space.shape
-        (3, 48, 64)
-    """
-    space: Any = env.observation_space
-    if not isinstance(space, spaces.Box) or len(space.shape) not in (2, 3):
-        raise UserError(
-            f"task.images=true: the task observes a {_kind(space)}, not an image of shape "
-            "[height, width, channels], [channels, height, width] or [height, width]: leave "
-            "task.images at false for numbers."
-        )
-    low, high = float(space.low.min()), float(space.high.max())
-    if not (np.isfinite(low) and np.isfinite(high) and low < high):
-        raise UserError(
-            f"task.images=true: the image's values lie from {low:g} to {high:g}; they need bounds: "
-            "give its space some, in a gymnasium.ObservationWrapper."
-        )
-    channels_last = len(space.shape) == 3 and space.shape[-1] <= 4 < space.shape[0]
-
-    def seen(image: np.ndarray) -> np.ndarray:
-        scaled = (np.asarray(image, np.float32) - np.float32(low)) / np.float32(high - low)
-        if image.ndim == 2:
-            return scaled[None]
-        return np.ascontiguousarray(np.moveaxis(scaled, -1, 0)) if channels_last else scaled
-
-    shape = seen(np.broadcast_to(space.low, space.shape)).shape
-    return TransformObservation(env, seen, spaces.Box(0.0, 1.0, shape, np.float32))
-
-
 def taking_vector(env: Env) -> Env:
     """The same task, taking a vector of float32 or a number from 0 up; itself where it does so.
 
@@ -149,12 +109,7 @@ def _check_entry(space: Any, *, flatten: bool) -> None:
     labels = isinstance(space, spaces.Discrete | spaces.MultiDiscrete)
     if (numbers and (flatten or len(space.shape) <= 1)) or (labels and flatten):
         return
-    if numbers and len(space.shape) > 2:
-        todo = (
-            "task.images=true has convolutional layers see it, where it is all there is; "
-            "task.flatten=true makes a vector of its pixels."
-        )
-    elif numbers or labels or isinstance(space, spaces.Dict):
+    if numbers or labels or isinstance(space, spaces.Dict):
         todo = "task.flatten=true makes one of it."
     else:
         todo = "make one of it in a gymnasium.ObservationWrapper, and register that."

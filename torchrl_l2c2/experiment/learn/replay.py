@@ -32,8 +32,8 @@ def make_replay(config: ExperimentConfig) -> TensorDictReplayBuffer:
         SettingError: prioritized replay needs TorchRL's compiled trees, which are not loaded with
             this version of torch.
     """
-    # The last episodes may exceed the rollout's frames.
-    longest = config.algorithm.frames + config.num_workers * time_limit(config.task)
+    # The last episode may exceed the rollout's frames.
+    longest = config.algorithm.frames + time_limit(config.task)
     buffer = make_buffer(config.replay, config.seed, longest, config.device)
     # Another seed than the sampler's: with one number for a neighbor both draw as many at a
     # time, and where a transition lies would say which neighbor it gets.

@@ -12,8 +12,7 @@ from typing import Any
 from torchrl_l2c2.experiment.agents._torchrl_internals import load_replay_state, replay_state
 from torchrl_l2c2.experiment.agents.build import make_agent
 from torchrl_l2c2.experiment.agents.optimizers import anneal
-from torchrl_l2c2.experiment.collect.player import Episode, Player
-from torchrl_l2c2.experiment.collect.workers import make_collector
+from torchrl_l2c2.experiment.collect.player import Episode, Player, make_collector
 from torchrl_l2c2.experiment.envs.environments import TEST_SEED, make_env
 from torchrl_l2c2.experiment.learn.compilation import compiler_available
 from torchrl_l2c2.experiment.learn.learner import Learner, untrained
@@ -280,7 +279,7 @@ class Experiment:
         return write_evaluation(self.folder, self.config, written)
 
     def close(self) -> None:
-        """Ends the processes of ``num_workers``; the experiment cannot train any further."""
+        """Closes the environments; the experiment cannot train any further."""
         self.player.collector.shutdown()
         self._late_tests.close()
         self._log.close()

@@ -1,9 +1,8 @@
-"""State of the whole process: random generators, threads and memory, for one run at a time."""
+"""State of the process that a run replaces: random generators, threads and memory."""
 
 from __future__ import annotations
 
 import ctypes
-import json
 import random
 from collections.abc import Mapping
 from types import TracebackType
@@ -11,25 +10,25 @@ from typing import Any
 
 import numpy as np
 import torch
+from torchrl.checkpoint import GlobalRNGState
 
-# glibc's mallopt, in bytes up to the largest int: blocks above the one threshold are mapped anew at
-# every allocation; free memory above the other is given back to the system.
+# Options of glibc's mallopt, in bytes, at most the largest int: blocks above MMAP_THRESHOLD are
+# mapped anew at every allocation, and free memory above TRIM_THRESHOLD is returned to the system.
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 _LARGEST = 2**31 - 1
 
-_States = tuple[Any, Any, torch.Tensor, list[torch.Tensor]]
-"""States of the generators of Python, NumPy, PyTorch and its CUDA devices."""
+_GENERATORS = GlobalRNGState()
 
 
 class ProcessState:
-    """The global random generators and the number of threads, as a run of its own has them.
+    """A run's own state of the global random generators, and its own number of threads.
 
-    Within the context they belong to the run; after it the process has its own again. Networks are
-    initialized from the generators, and policies sample from them.
+    Inside the context the process has the run's state, and outside its own state again. Networks
+    are initialized with the global generators, and policies sample from them.
 
     Args:
         seed (int): seed of the generators of Python, NumPy and PyTorch.
-        threads (int): number of threads of PyTorch. Default 1.
+        threads (int): number of PyTorch's threads. Default 1.
 
     Examples:
         >>> import torch
@@ -47,17 +46,17 @@ class ProcessState:
 
     def __init__(self, seed: int, threads: int = 1) -> None:
         self._threads = threads
-        outside = _states()
+        outside = _GENERATORS.state_dict()
         random.seed(seed)
         np.random.seed(seed)
         torch.manual_seed(seed)
-        self._inside = _states()
-        self._outside: _States | None = None  # While the context is not entered.
-        _set_states(outside)
+        self._inside = _GENERATORS.state_dict()
+        self._outside: dict[str, Any] | None = None  # Set while the context is entered.
+        _restore(outside)
 
     def __enter__(self) -> None:
-        self._outside, self._outside_threads = _states(), torch.get_num_threads()
-        _set_states(self._inside)
+        self._outside, self._outside_threads = _GENERATORS.state_dict(), torch.get_num_threads()
+        _restore(self._inside)
         torch.set_num_threads(self._threads)
 
     def __exit__(
@@ -67,42 +66,31 @@ class ProcessState:
         traceback: TracebackType | None,
     ) -> None:
         assert self._outside is not None
-        self._inside = _states()
-        _set_states(self._outside)
+        self._inside = _GENERATORS.state_dict()
+        _restore(self._outside)
         torch.set_num_threads(self._outside_threads)
         self._outside = None
 
     def state_dict(self) -> dict[str, Any]:
-        """The generators' states, as tensors and text."""
-        now = self._inside if self._outside is None else _states()
-        python, (name, keys, *rest), state, devices = now
-        return {
-            "python": json.dumps(python),
-            "numpy": json.dumps([name, keys.tolist(), *rest]),
-            "torch": state,
-            "cuda": devices,
-        }
+        """Returns the states of the run's generators, as TorchRL's ``GlobalRNGState`` does."""
+        return self._inside if self._outside is None else _GENERATORS.state_dict()
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restores what :meth:`state_dict` gave."""
-        version, internal, gauss = json.loads(state["python"])
-        name, keys, *rest = json.loads(state["numpy"])
-        numpy = (name, np.array(keys, dtype=np.uint32), *rest)
-        python = (version, tuple(internal), gauss)
-        self._inside = (python, numpy, state["torch"], state.get("cuda", []))
+        """Restores what :meth:`state_dict` returned."""
+        self._inside = dict(state)
         if self._outside is not None:
-            _set_states(self._inside)
+            _restore(self._inside)
 
 
 def keep_freed_memory() -> bool:
-    """Lets the process keep the memory that it frees, for the next update, which needs as much.
+    """Lets the process keep freed memory for the next update, which needs the same amount.
 
-    Otherwise the tensors of larger batches are handed out anew by the system at every update, page
-    by page, which takes long. The process then holds the most that it ever
-    needed, to its end. For processes that train and do little else: ``train.py`` calls it.
+    Otherwise the system hands out the memory of larger batches page by page at every update, which
+    is slow. The process then keeps the largest amount it has needed until it ends. ``train.py``
+    calls this, because its process trains and does little else.
 
     Returns:
-        bool: whether the C library took it; others than glibc have settings of their own.
+        bool: whether the C library has the setting; only glibc does.
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt
@@ -112,14 +100,9 @@ def keep_freed_memory() -> bool:
     return bool(kept)
 
 
-def _states() -> _States:
-    devices = torch.cuda.get_rng_state_all() if torch.cuda.is_available() else []
-    return random.getstate(), np.random.get_state(), torch.get_rng_state(), devices
-
-
-def _set_states(states: _States) -> None:
-    random.setstate(states[0])
-    np.random.set_state(states[1])
-    torch.set_rng_state(states[2])
-    if torch.cuda.is_available():  # A machine with more devices has more states.
-        torch.cuda.set_rng_state_all(states[3][: torch.cuda.device_count()])
+def _restore(state: Mapping[str, Any]) -> None:
+    """Sets the generators; those of GPUs only if there are as many as before."""
+    gpus = len(state.get("torch_cuda", ()))
+    if gpus and gpus != torch.cuda.device_count():
+        state = {name: each for name, each in state.items() if name != "torch_cuda"}
+    _GENERATORS.load_state_dict(state)

@@ -34,12 +34,10 @@ def by_step(player: Player, learner: Learner, algorithm: OffPolicyConfig) -> Ite
 def by_episode(player: Player, learner: Learner, algorithm: OffPolicyConfig) -> Iterator[Episode]:
     """Updates after every episode: the schedule inferred for the paper."""
     while True:
-        episodes = player.play()
-        for episode in episodes:
-            learner.remember(episode.transitions)
-        for episode in episodes:
-            _learn(learner, algorithm, episode.transitions.numel(), episode.last_frame)
-            yield episode
+        episode = player.play()
+        learner.remember(episode.transitions)
+        _learn(learner, algorithm, episode.transitions.numel(), episode.last_frame)
+        yield episode
 
 
 def by_rollout(player: Player, learner: Learner, algorithm: PPOConfig) -> Iterator[Episode | None]:
@@ -54,13 +52,11 @@ def by_rollout_of_episodes(
 ) -> Iterator[Episode]:
     """Updates after so many frames at least, of whole episodes."""
     while True:
-        episodes = player.play()
-        for episode in episodes:
-            learner.remember(episode.transitions)
-        for episode in episodes:
-            if len(learner.replay) >= algorithm.frames:
-                learner.learn_rollout(algorithm.epochs)
-            yield episode
+        episode = player.play()
+        learner.remember(episode.transitions)
+        if len(learner.replay) >= algorithm.frames:
+            learner.learn_rollout(algorithm.epochs)
+        yield episode
 
 
 def by_cut_rollout(

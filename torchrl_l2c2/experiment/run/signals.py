@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NoReturn
 
-from torchrl_l2c2.experiment.errors import ChildFailedError, SimulatorError
+from torchrl_l2c2.experiment.errors import CompilerError
 
 # Terminals and launchers send one signal to a process several times: to it, and to its group.
 SAME_SIGNAL_SECONDS = 1.0
@@ -46,11 +46,10 @@ def terminate(number: int, frame: Any) -> NoReturn:
 def stop_on_signals() -> Iterator[list[int]]:
     """Collects SIGTERM and SIGINT in a list instead of dying; a second one acts as usual.
 
-    A signal to all processes of a job also ends compilers and workers. What fails because of that
-    was ended by the signal.
+    A signal to all processes of a job also ends compilers.
 
     Raises:
-        KeyboardInterrupt: a compiler or a worker failed after a signal.
+        KeyboardInterrupt: a compiler failed after a signal.
     """
     received = list(_heard)
     if threading.current_thread() is not threading.main_thread():
@@ -78,9 +77,8 @@ def stop_on_signals() -> Iterator[list[int]]:
         signal.signal(number, receive)
     try:
         yield received
-    except (ChildFailedError, SimulatorError) as error:
-        child_failed = isinstance(error, ChildFailedError)
-        if not received or not (child_failed or isinstance(error.__cause__, ChildFailedError)):
+    except CompilerError as error:
+        if not received:
             raise
         raise Terminated if received[0] == signal.SIGTERM else KeyboardInterrupt from error
     finally:

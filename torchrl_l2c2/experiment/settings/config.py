@@ -114,14 +114,6 @@ class ExperimentConfig:
         description="threads of PyTorch; more do not speed up networks of this size",
         json_schema_extra=CHANGES_NO_NUMBERS,
     )
-    num_workers: int = Field(
-        default=1,
-        ge=1,
-        le=1024,
-        description="processes that play episodes, one episode each per round; the last round "
-        "is played whole: 4 processes play 352 episodes instead of 350. More than 1"
-        " needs algorithm.schedule other than step",
-    )
     compile: bool = Field(
         default=True,
         description="compilation of updates and policies, where a C++ compiler is found; false:"
@@ -183,7 +175,6 @@ class ExperimentConfig:
         self._check_names()
         self._check_device()
         self._check_replay()
-        self._check_rounds()
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> ExperimentConfig:
@@ -232,23 +223,6 @@ class ExperimentConfig:
                 "replay",
                 f"{self.replay.name!r} is nothing that algorithm {self.algorithm.name!r} can learn "
                 "from: ppo needs rollout, the others prioritized or uniform.",
-            )
-
-    def _check_rounds(self) -> None:
-        """Several workers play whole episodes, and all of them as many."""
-        workers = self.num_workers
-        if workers > 1 and self.algorithm.num_envs is not None:
-            raise SettingError(
-                "num_workers",
-                f"must be 1 with algorithm.num_envs, whose simulators one process plays, got "
-                f"{workers}: leave one of the two.",
-            )
-        if workers > 1 and self.algorithm.schedule == "step":
-            raise SettingError(
-                "num_workers",
-                f"must be 1 with algorithm.schedule=step, which updates after every frame, got "
-                f"{workers}: use one worker, or algorithm.schedule=episode algorithm.updates=null "
-                f"algorithm.replay_ratio={self.replay.batch_size}, one update a frame on average.",
             )
 
 

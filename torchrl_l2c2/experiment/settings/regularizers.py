@@ -169,18 +169,6 @@ class L2C2Config(GainConfig):
         json_schema_extra=neutral("hellinger"),
     )
 
-    tchebycheff_mu: float | None = Field(
-        default=None,
-        gt=0,
-        description="temperature of the smooth maximum of the policy's loss and its penalty, which "
-        "the policy minimizes; larger values are smoother; null: their sum [paper]",
-    )
-    tchebycheff_ideal: float | None = Field(
-        default=None,
-        description="smallest expected policy loss, with tchebycheff_mu; for example minus the "
-        "largest value; null: 0",
-    )
-
     def __post_init__(self) -> None:
         GainConfig.__post_init__(self)
         if self.lambda_max <= (least := max(1.0, self.sigma) * self.lambda_min):
@@ -191,11 +179,6 @@ class L2C2Config(GainConfig):
             )
         if self.over_neighbors == "max" and self.num_samples == 1:
             raise SettingError("num_samples", "must be above 1 with over_neighbors=max, got 1.")
-        if self.tchebycheff_ideal is not None and self.tchebycheff_mu is None:
-            raise SettingError(
-                "tchebycheff_ideal",
-                f"works only with tchebycheff_mu, got {self.tchebycheff_ideal}: set both.",
-            )
 
 
 @settings

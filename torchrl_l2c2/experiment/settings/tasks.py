@@ -90,12 +90,6 @@ class TaskConfig:
         description="one vector of matrices, nested entries and labels (as one-hot vectors). "
         "Without it, several vectors are joined in the order of their names",
     )
-    images: bool = Field(
-        default=False,
-        description="images as observations, with values from 0 to 1, for convolutional "
-        "networks; the replay buffer keeps two images of floats per transition",
-    )
-
     action_rate: float = Field(
         default=0.0,
         ge=0,
@@ -122,8 +116,6 @@ class TaskConfig:
                 f"must be {own} with name={self.name!r}, got {self.env_id}: give another name (in "
                 f"a shell, task=gymnasium task.env_id={self.env_id}).",
             )
-        if self.images and self.flatten:
-            raise SettingError("images", "and flatten exclude each other: leave one at false.")
         if self.noise_scale is None:
             # Frozen: this is how a default that depends on another field is set.
             object.__setattr__(self, "noise_scale", 0.01 if self.env_id == SWINGUP else 0.0)
