@@ -54,7 +54,7 @@ def measure(number: int, gains: dict[str, Any], episodes: int) -> list[float]:
         # A run that was interrupted continues from its checkpoint.
         experiment = Experiment(config, FOLDER / f"trial_{number:04d}" / f"seed_{seed}")
         experiment.train()
-        found.append(experiment.test(episodes=10).summary())
+        found.append(experiment.test(episodes=min(10, episodes)).summary())
         experiment.close()
     keys = ("return_mean", "action_variation_mean")
     return [statistics.fmean(float(test[key]) for test in found) for key in keys]

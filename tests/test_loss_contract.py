@@ -466,9 +466,9 @@ def test_regularizers_can_be_combined(case):
     assert list(both.state_dict()) == list(loss.state_dict())
 
 
-# With and without a policy; compiling all of them takes over a minute.
+# Compiling all of them takes over a minute.
 COMPILED = [
-    pytest.param(case, marks=() if case.name in ("PPORPE", "DQN") else pytest.mark.slow)
+    pytest.param(case, marks=() if case.name == "PPORPE" else pytest.mark.slow)
     for case in CASES
     if case.fullgraph
 ]

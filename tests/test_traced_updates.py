@@ -52,7 +52,12 @@ METHODS = {
     "the worst of four": L2C2Config(num_samples=4, over_neighbors="max"),
 }
 PAIRS = [(name, "l2c2") for name in ALGORITHMS]
-PAIRS += [("PPO", method) for method in METHODS if method != "l2c2"]
+SIMILAR = ("l2c2_mean", "l2c2_ramp", "cats", "half of the batch")
+PAIRS += [
+    pytest.param("PPO", method, marks=[pytest.mark.slow] if method in SIMILAR else [])
+    for method in METHODS
+    if method != "l2c2"
+]
 
 
 def train(algorithm, regularizer, compile):
