@@ -116,6 +116,13 @@ def test_settings_and_components_have_the_same_defaults(settings, component):
     }
 
 
+def test_a_comparison_chooses_the_folder_of_its_runs():
+    """A command chooses another one."""
+    chosen = ("experiment=filters", "task=pendulum")
+    assert composed(*chosen)["outputs"] == "outputs_filters"
+    assert composed(*chosen, "outputs=mine")["outputs"] == "mine"
+
+
 @pytest.mark.parametrize("name", sorted(p.stem for p in (CONF / "experiment").glob("*.yaml")))
 @pytest.mark.parametrize("regularizer", ["none", "l2c2"])
 def test_every_comparison_is_made_of_valid_runs(name, regularizer):
