@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -15,7 +14,12 @@ from typing import Any
 
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException, OverrideParseException
+from hydra.errors import (
+    ConfigCompositionException,
+    HydraException,
+    MissingConfigException,
+    OverrideParseException,
+)
 from hydra.types import RunMode
 from omegaconf.errors import OmegaConfBaseException
 
@@ -176,26 +180,40 @@ def composing() -> Iterator[None]:
 
 
 def refusal(error: Exception) -> str:
-    """Text of an error of Hydra or OmegaConf in one line, with the name that was probably meant."""
-    if found := re.match("Could not override '([^']+)'", str(error)):
-        return unknown_setting(found[1])
-    if "group override must be" in str(error) or "${regularizer}_${algorithm}" in str(error):
-        return f"{', '.join(GROUPS)} are each chosen by name; regularizer=none has none ({error})."
-    said = " ".join(str(error).partition("\nConfig search path:")[0].split())
-    if found := re.search(r"Could not find '(\w+)/([^']+)'", said):
-        return f"{said}{_choice_meant(*found.groups())}"
-    if "=~" in said:
-        return f"{said}. No shell expands this ~: write $HOME."
+    """Returns the text of an error of Hydra or OmegaConf in one line, with what to write instead.
+
+    Reads the attributes of the errors, not their texts.
+    """
+    setting = getattr(error.__cause__, "full_key", None)
+    if isinstance(error, ConfigCompositionException) and setting:
+        return unknown_setting(setting)
+    if isinstance(error, MissingConfigException) and error.options and error.missing_cfg_file:
+        group, _, name = error.missing_cfg_file.rpartition("/")
+        return _unknown_choice(group, name, error.options)
     if isinstance(error, OverrideParseException):
-        return f"{said}. A value with other signs stands in quotes within quotes: 'name=\"a b\"'."
+        home = " No shell expands this ~: write $HOME." if "=~" in error.override else ""
+        return (
+            f"cannot read {error.override!r}. Put a value with special characters in quotes within "
+            f"quotes: 'name=\"a b\"'.{home}"
+        )
+    said = " ".join(str(error).split())
+    if isinstance(error, (ValueError, ConfigCompositionException)):
+        said += (
+            f". Each of {', '.join(GROUPS)} takes one name (regularizer=none for none); -m runs "
+            "several."
+        )
     return said
 
 
-def _choice_meant(group: str, name: str) -> str:
-    near = get_close_matches(name, GROUPS.get(group, ()), 1)
-    meant = f"; did you mean {group}={near[0]}?" if near else "."
-    ids = f" An id of Gymnasium's: task=gymnasium task.env_id={name}." if group == "task" else ""
-    return meant + ids
+def _unknown_choice(group: str, name: str, choices: Sequence[str]) -> str:
+    """Returns the text about a choice that a group does not have."""
+    near = get_close_matches(name, choices, 1)
+    meant = f" Did you mean {group}={near[0]}?" if near else ""
+    gymnasium = f" For an id of Gymnasium: task=gymnasium task.env_id={name}."
+    return (
+        f"Expected {group} to be one of {', '.join(choices)}, got {name!r}.{meant}"
+        f"{gymnasium if group == 'task' else ''}"
+    )
 
 
 def unknown_setting(name: str) -> str:
