@@ -57,6 +57,16 @@ def test_the_command_writes_rows_as_json_and_as_a_table(tmp_path):
     assert f"commit {written['machine']['commit']}" in table.read_text()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("compiler", ["own", "torch.compile"])
+def test_both_compilers_are_timed(compiler):
+    """Later updates take a small part of the first one, which compiles."""
+    command = [sys.executable, "-m", "benchmarks.compilers", "sac", compiler]
+    done = subprocess.run(command, check=True, cwd=REPOSITORY, capture_output=True, text=True)
+    times = json.loads(done.stdout.splitlines()[-1])
+    assert times["first_s"] > 10 * 1e-6 * times["update_us"] > 0
+
+
 def test_alternate_takes_turns_and_gives_the_median_per_unit():
     """Of rounds of 1, 2 and 9 times 10 ms for two units, the median is 10 ms a unit."""
     turns, factors = [], iter([0, 1, 2, 9])
