@@ -1,8 +1,8 @@
-"""Whether a change costs time: ``python -m benchmarks.against REVISION``.
+"""Speed of this checkout and of another revision: ``python -m benchmarks.against REVISION``.
 
 A process with this checkout and one with another revision take turns at the compiled update and at
-collecting, so that a machine's other work falls on both alike. Prints how fast each was at its
-fastest, and the median and quartiles of the turns' ratios.
+collecting: other work of the machine slows both. Prints the fastest time of each, and the median
+and quartiles of the turns' ratios.
 """
 
 from __future__ import annotations

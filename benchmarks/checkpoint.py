@@ -1,7 +1,7 @@
-"""What a checkpoint costs: ``python -m benchmarks.checkpoint``.
+"""Time of a checkpoint: ``python -m benchmarks.checkpoint``.
 
 Fills the replay buffer on Swingup, as a real run does, and times whole checkpoints: gathering the
-state, writing, flushing to the disk and reading back.
+state, writing, flushing to the disk and checking the file.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""How long the paper's table takes on so many cores: ``python -m benchmarks.cores``.
+"""Time of the paper's table by the number of cores: ``python -m benchmarks.cores``.
 
-On paper, from the times of its runs: those of ``results/runs.csv``, and where a task and a method
-are not among them yet, a short run whose pace the whole one would keep. Runs share nothing but the
-file system, so that a sweep is a list of them of which every core that is free takes the next.
+An estimate from the times of runs in ``results/runs.csv``. If a task and a method have no run yet,
+a short run gives the pace. Runs share nothing but the file system, and every free core takes the
+next run of the sweep.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ WARM_UPDATES, PACE_SECONDS = 500, 20.0
 
 
 def makespan(seconds: Sequence[float], cores: int) -> float:
-    """When the last of these runs ends, if every core that is free takes the next one.
+    """Time until the last of these runs ends, if every free core takes the next one.
 
     Examples:
         >>> makespan([3.0, 3.0, 2.0, 4.0], 2)
@@ -98,7 +98,7 @@ def paced(task: str, method: str) -> float:
 
 
 def main() -> None:
-    """Prints the table, and what it was made from."""
+    """Prints the table and its sources."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.cores", description=__doc__)
     parser.add_argument("--records", default=RECORDS, help="default: results/runs.csv")
     chosen = parser.parse_args()

@@ -1,6 +1,6 @@
 """A process that trains and says how long it took: ``python benchmarks/peer.py NAME SETTINGS``.
 
-Imports nothing but what the named library needs, so that it runs in an environment of that
+Imports only the modules that the named library needs, and therefore runs in an environment of that
 library's own. It trains once unmeasured, says ``ready``, and then trains for every line it is sent.
 """
 

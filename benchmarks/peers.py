@@ -54,7 +54,7 @@ class Peer:
     Args:
         name (str): what trains.
         settings (dict): as the process takes them.
-        python (str): the interpreter that has what is to train.
+        python (str): the interpreter that can import the named library.
 
     Attributes:
         note: why it does not train; empty if it does.
@@ -71,7 +71,7 @@ class Peer:
             cwd=HERE.parent,
         )
         answer = self._answer()
-        failed = f"not measured: benchmarks/peer.py {name!r} ended; it says why when run alone"
+        failed = f"not measured: benchmarks/peer.py {name!r} ended; run it by itself to see why"
         self.note = "" if answer == "ready" else answer or failed
 
     def turn(self) -> list[float]:
@@ -105,7 +105,7 @@ def against(
         what (str): name of the rows.
         ours (str): what trains here.
         peer (str): what trains there.
-        settings (dict): of both.
+        settings (dict): Settings of both.
 
     Keyword Args:
         rounds (int): turns of each.

@@ -22,7 +22,7 @@ ROOT = Path(__file__).parent.parent
 
 
 def run_rows(effort: Effort) -> Iterable[Row]:
-    """A whole run of the paper's experiment, in frames, against what it is made of."""
+    """A whole run of the paper's experiment, in frames, against the sum of its parts."""
     with tempfile.TemporaryDirectory() as folder:
         config = paper_config(effort)
         run, parts = Experiment(config, folder), Experiment(config, Path(folder) / "parts")
@@ -41,7 +41,7 @@ def run_rows(effort: Effort) -> Iterable[Row]:
             "log": partial(_of_episode, lambda: log.write(row), frames),
             "checkpoint": partial(_of_episode, parts.save, frames),
         }
-        # What learning is made of: shown, but a loop of one of them alone flatters it.
+        # Parts of learning, only shown: a loop of a single part is faster than in a run.
         detail: dict[str, Callable[[], object]] = {
             "draw": partial(_repeat, learner.draw, frames),
             "update": partial(_repeat, lambda: learner.update(True, *draw), frames),
@@ -67,7 +67,7 @@ def run_rows(effort: Effort) -> Iterable[Row]:
 
 
 def start_rows(effort: Effort) -> Iterable[Row]:
-    """How long a run waits for its first update, where one like it was compiled before."""
+    """Time until the first update of a run with a filled compiler cache."""
     command = [sys.executable, "-c", START, "" if effort.compile else "--quick"]
 
     def seconds() -> float:
@@ -81,7 +81,7 @@ def start_rows(effort: Effort) -> Iterable[Row]:
         later,
         unit="s",
         at_most=8.0,
-        # What was compiled on this machine before helps it, too.
+        # Earlier compilations on this machine speed it up, too.
         parts={"first run s": first, "second run s": later},
     )
 
@@ -100,7 +100,7 @@ print(time.perf_counter() - start)
 
 
 def process_rows(effort: Effort) -> Iterable[Row]:
-    """What the second core gives to a second run."""
+    """Frames per second of two runs at once, by frames per second of one."""
     command = [sys.executable, "-m", "benchmarks.speed", "--worker"]
     command += [] if effort.compile else ["--quick"]
     pipe = subprocess.PIPE
@@ -135,7 +135,7 @@ def process_rows(effort: Effort) -> Iterable[Row]:
 
 
 def work(effort: Effort) -> None:
-    """What a process of ``process_rows`` does: an episode for every line that it is sent."""
+    """Plays an episode for every line of the standard input, in a process of ``process_rows``."""
     play = play_episode(Experiment(paper_config(effort)))
     play()
     print("ready", flush=True)
@@ -144,8 +144,8 @@ def work(effort: Effort) -> None:
 
 
 def import_rows(effort: Effort) -> Iterable[Row]:
-    """What importing this package adds to importing TorchRL."""
-    # The parts of TorchRL that the package builds on; `import torchrl` alone loads them late.
+    """Time that importing this package adds to importing TorchRL."""
+    # The parts of TorchRL that the package builds on; `import torchrl` loads them late.
     parts_of_torchrl = "torchrl.data, torchrl.envs, torchrl.modules, torchrl.objectives"
     statements = {
         "import torchrl_l2c2 s": ("import torchrl", "import torchrl_l2c2"),

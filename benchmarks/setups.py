@@ -1,4 +1,4 @@
-"""What the rows measure: runs, episodes and updates of the paper's agent."""
+"""Setups that the rows measure: runs, episodes and updates of the paper's agent."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ REGULARIZERS = {
 
 @dataclass(frozen=True)
 class Effort:
-    """How long to measure, whether anything is compiled, and the interpreter of the peers."""
+    """Length of the measurement, compilation, and the interpreter of the peers."""
 
     rounds: int = 15
     steps: int = 1000

@@ -1,4 +1,4 @@
-"""How fast the experiment is, as ratios: ``python -m benchmarks.speed``.
+"""Speed of the experiment, as ratios: ``python -m benchmarks.speed``.
 
 Every row compares things that are measured alternately in one process (where the row is about
 processes, by one process that starts them), and is made of medians. ``docs/speed.md`` explains
@@ -75,7 +75,7 @@ def main(arguments: list[str] | None = None) -> None:
         return
     where, rows, started = machine(), [], time.monotonic()
     for group in tqdm(options.rows, disable=None):
-        # Functions of one source share what was compiled for them: begin anew.
+        # Functions of one source share their compiled code: start without any.
         torch.compiler.reset()
         module, _, function = ROWS[group].partition(".")
         for row in getattr(import_module(f"benchmarks.{module}"), function)(effort):

@@ -35,7 +35,7 @@ class Row:
 
     Attributes:
         group: the name that ``--rows`` knows it by.
-        name: what was compared.
+        name: the compared things.
         value: the ratio, or the seconds; ``None`` where it was not measured.
         unit: ``"ratio"`` or ``"s"``.
         at_least: the smallest value that is fast enough, if that is the direction.
@@ -55,7 +55,7 @@ class Row:
 
     @property
     def met(self) -> bool | None:
-        """Whether the value is fast enough; ``None`` without a value or a limit."""
+        """Checks whether the value is fast enough; ``None`` without a value or a limit."""
         if self.value is None:
             return None
         if self.at_least is not None:
@@ -70,10 +70,10 @@ class Row:
 def alternate(
     actions: Mapping[str, Callable[[], object]], *, repeats: int, calls: int = 1, warm_up: int = 1
 ) -> dict[str, float]:
-    """Times actions in turns, so that a machine's other work falls on all of them alike.
+    """Times actions in turns, so other work of the machine slows all of them.
 
     Args:
-        actions (Mapping): what is timed, by name. An action that returns a number has done so
+        actions (Mapping): The timed actions, by name. An action that returns a number has done so
             many units of work, such as frames; any other has done one.
 
     Keyword Args:
@@ -113,7 +113,7 @@ def take_turns(
 
 
 def machine() -> dict[str, Any]:
-    """What the numbers were measured on and with."""
+    """The machine and the versions of a measurement."""
     return {
         "name": platform.node(),
         "cpu": _cpu_model(),

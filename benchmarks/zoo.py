@@ -31,11 +31,11 @@ PEER = Path(__file__).with_name("zoo_peer.py")
 
 
 def arguments(task: str, preset: str = "rl_zoo") -> dict[str, Any]:
-    """What Stable-Baselines3's PPO is made with, from the preset's own settings.
+    """Arguments of Stable-Baselines3's PPO, from the preset's own settings.
 
     Args:
         task (str): one of the preset's.
-        preset (str): of ``conf/preset``.
+        preset (str): A folder of ``conf/preset``.
 
     Returns:
         dict: for ``benchmarks/zoo_peer.py``, without the seed.
@@ -88,7 +88,7 @@ def tested(given: dict[str, Any], python: str) -> tuple[float, float, float]:
 
 
 def main() -> None:
-    """Prints a row for every seed as it ends; what it learns goes to standard error."""
+    """Prints a row for every seed as it ends; the training's returns go to standard error."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.zoo", description=__doc__)
     parser.add_argument("task", choices=list(FIELD_TASKS))
     parser.add_argument("--preset", choices=["rl_zoo", "baselines"], default="rl_zoo")

@@ -1,6 +1,6 @@
 """A process that trains Stable-Baselines3's PPO and plays test episodes: for ``benchmarks/zoo.py``.
 
-Imports nothing but what that library needs, so that it runs in an environment of its own. It prints
+Imports only that library's own needs, and therefore runs in an environment of its own. It prints
 the episodes' returns and clipped mean actions as JSON, and while it learns, the training's returns
 to standard error.
 """
@@ -43,7 +43,7 @@ def train(given: dict[str, Any]) -> Any:
             told, returns = done, [episode["r"] for episode in model.ep_info_buffer]
             mean = sum(returns) / len(returns)
             print(f"frame {frames}: return {mean:.1f}", file=sys.stderr, flush=True)
-        return True  # go on
+        return True  # the training continues
 
     model.learn(given["frames"], callback=tell)
     return model

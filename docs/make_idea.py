@@ -1,7 +1,7 @@
-"""Makes ``docs/idea.md`` of ``notebooks/idea.ipynb``: ``python docs/make_idea.py``.
+"""Makes ``docs/idea.md`` from ``notebooks/idea.ipynb``: ``python docs/make_idea.py``.
 
-Its text, and the pictures that its code draws (extra ``notebooks``); what needs a live kernel is
-left out.
+The page has the notebook's text and the pictures that its code draws (extra ``notebooks``). Cells
+that are marked ``live`` need a kernel and are left out.
 """
 
 from __future__ import annotations
@@ -18,26 +18,28 @@ import nbformat
 
 DOCS = Path(__file__).parent
 NOTEBOOK = DOCS.parent / "notebooks" / "idea.ipynb"
-NOTE = (
-    "*Made by `python docs/make_idea.py` of `notebooks/idea.ipynb`, which has the code of every "
-    "picture, and sliders.*"
-)
+NOTE = "*The code of every picture, and sliders, are in `notebooks/idea.ipynb`.*"
 
 
 def cells(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
-    """What the page has of the notebook, in order."""
+    """The notebook's cells that the page shows, in order."""
     return [cell for cell in notebook.cells if not cell.metadata.get("live")]
 
 
 def page(notebook: nbformat.NotebookNode, pictures: dict[str, int]) -> str:
-    """The page's text, with so many pictures behind a cell of code, by its id."""
+    """The page's text.
+
+    Args:
+        notebook (NotebookNode): The notebook; a cell's ``alt`` describes its pictures.
+        pictures (dict): Number of pictures that each cell draws, by the cell's id.
+    """
     parts, number = [], 0
     for cell in cells(notebook):
         if cell.cell_type == "markdown":
-            parts.append(cell.source)
+            parts.append(cell.source.replace("](../docs/", "]("))
         for _ in range(pictures.get(cell.id, 0)):
             number += 1
-            parts.append(f"![What is said above, drawn](idea_{number}.png)")
+            parts.append(f"![{cell.metadata['alt']}](idea_{number}.png)")
     title, *rest = parts
     heading, _, introduction = title.partition("\n\n")
     return "\n\n".join([heading, NOTE, introduction, *rest]) + "\n"

@@ -1,4 +1,4 @@
-"""The notebooks run from top to bottom, and show something."""
+"""The notebooks are stored with their outputs, and run from top to bottom."""
 
 from __future__ import annotations
 
@@ -9,28 +9,50 @@ from pathlib import Path
 from typing import Any
 
 import nbformat
+import pandas as pd
 import pytest
 from jupyter_client import KernelManager
 from nbclient import NotebookClient
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
-NOTEBOOKS = sorted(path.name for path in FOLDER.glob("*.ipynb"))
+NAMES = ["idea.ipynb", "quickstart.ipynb", "results.ipynb", "shaking.ipynb"]
+INSTALL = 'if find_spec("torchrl_l2c2") is None:\n    %pip install -q {SOURCE}'
 
 
-@pytest.fixture(params=NOTEBOOKS)
+@pytest.fixture(params=NAMES)
 def notebook(request: pytest.FixtureRequest) -> nbformat.NotebookNode:
     """A notebook as it is stored."""
-    return nbformat.read(FOLDER / request.param, as_version=4)
+    return stored(request.param)
+
+
+def stored(name: str) -> nbformat.NotebookNode:
+    """The notebook of this name."""
+    return nbformat.read(FOLDER / name, as_version=4)
+
+
+def code(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
+    """The cells of code, in order."""
+    return [cell for cell in notebook.cells if cell.cell_type == "code"]
 
 
 def outputs(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
-    """What the cells have put out, in order."""
-    return [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    """The outputs of the cells, in order."""
+    return [output for cell in code(notebook) for output in cell.outputs]
+
+
+def printed(notebook: nbformat.NotebookNode) -> str:
+    """The text that the cells have printed."""
+    return "".join(output.get("text", "") for output in outputs(notebook))
+
+
+def pictures(cell: nbformat.NotebookNode) -> int:
+    """The number of pictures that a cell shows without a live kernel."""
+    return sum("image/png" in output.get("data", {}) for output in cell.get("outputs", []))
 
 
 @pytest.fixture(scope="module")
 def kernel() -> Iterator[KernelManager]:
-    """One for all, as most of what each would do is to import PyTorch."""
+    """One kernel for all tests: to import PyTorch takes most of the time."""
     manager = KernelManager(kernel_name="python3")
     yield manager
     if manager.has_kernel:
@@ -42,11 +64,13 @@ def run(
     monkeypatch: pytest.MonkeyPatch,
     timeout: float,
     kernel: KernelManager | None = None,
-    sliders: bool = True,
 ) -> None:
-    """So many seconds a cell at most; an error of a cell is one here.
+    """Runs a notebook; an error of a cell is an error here.
 
-    Without a kernel in a new one.
+    Args:
+        notebook: The notebook, which gets the outputs.
+        timeout: The largest time of a cell in seconds.
+        kernel: The kernel; a new one by default.
     """
     # A backend chosen outside would keep the pictures out of the notebook.
     monkeypatch.delenv("MPLBACKEND", raising=False)
@@ -55,98 +79,125 @@ def run(
     client = NotebookClient(
         notebook, timeout=timeout, kernel_name="python3", resources=folder, **shared
     )
-    if sliders:
-        # Nobody looks at the widgets, and answering them now and then leaves the client waiting for
-        # a kernel that has long finished.
-        client.comm_open_handlers = {}
     # No notebook has the names of another.
     notebook.cells.insert(0, nbformat.v4.new_code_cell("%reset -f"))
     client.execute()
     del notebook.cells[0]
 
 
-def pictures(cell: nbformat.NotebookNode) -> int:
-    """How many a cell shows without a live kernel."""
-    return sum("image/png" in output.get("data", {}) for output in cell.get("outputs", []))
-
-
 def test_all_four_are_there() -> None:
-    """Without them the tests below would have nothing to run."""
-    assert NOTEBOOKS == ["experiment.ipynb", "idea.ipynb", "quickstart.ipynb", "results.ipynb"]
+    """A notebook that is missing in the list would not be tested."""
+    assert sorted(path.name for path in FOLDER.glob("*.ipynb")) == NAMES
 
 
-def test_the_first_is_stored_with_its_outputs(notebook: nbformat.NotebookNode) -> None:
-    """Complete and from one run, without warnings; of the others they would change at every run."""
+@pytest.mark.parametrize("name", NAMES)
+def test_stored_with_outputs(name: str) -> None:
+    """Complete, from one run, without errors and warnings, and small."""
+    notebook = stored(name)
     nbformat.validate(notebook)
-    counts = [cell.execution_count for cell in notebook.cells if cell.cell_type == "code"]
-    if notebook.cells[0].source.startswith("# Quickstart"):
-        assert counts == list(range(1, len(counts) + 1))
-        assert sum(map(pictures, notebook.cells)) >= 3
-        assert {output.get("name", "stdout") for output in outputs(notebook)} == {"stdout"}
-        assert (FOLDER / "quickstart.ipynb").stat().st_size < 1_000_000
-    else:
-        assert outputs(notebook) == [] and set(counts) == {None}
+    counts = [cell.execution_count for cell in code(notebook)]
+    assert counts == list(range(1, len(counts) + 1))
+    kinds = {output.output_type for output in outputs(notebook)}
+    assert kinds <= {"stream", "display_data", "execute_result"}
+    streams = {output.name for output in outputs(notebook) if output.output_type == "stream"}
+    assert streams <= {"stdout"}
+    assert sum(map(pictures, notebook.cells)) == sum(
+        cell.source.count("subplots(") for cell in code(notebook)
+    )
+    assert (FOLDER / name).stat().st_size < 400_000
+
+
+def test_the_first_cell_installs_only_what_is_missing(notebook: nbformat.NotebookNode) -> None:
+    """For Colab; and no output shows that the package was there."""
+    assert INSTALL in code(notebook)[0].source and not code(notebook)[0].outputs
+
+
+def test_runs_shortened(
+    notebook: nbformat.NotebookNode, monkeypatch: pytest.MonkeyPatch, kernel: KernelManager
+) -> None:
+    """With the parameters of the short form, and with as many pictures as stored."""
+    before = [pictures(cell) for cell in code(notebook)]
+    for cell in notebook.cells:
+        # Sliders need a live front end.
+        cell.source = cell.metadata.get("short", cell.source).replace("= 20, True", "= 20, False")
+        cell.outputs = []
+    run(notebook, monkeypatch, 120, kernel)
+    assert [pictures(cell) for cell in code(notebook)] == before
+
+
+def test_sliders_follow_a_picture(monkeypatch: pytest.MonkeyPatch, kernel: KernelManager) -> None:
+    """Readers without a live kernel see the picture."""
+    notebook = stored("idea.ipynb")
+    cells = code(notebook)
+    (place,) = (n for n, cell in enumerate(cells) if "interact(" in cell.source)
+    assert pictures(cells[place - 1]) == 1
+    notebook.cells = [cell.copy() for cell in cells[: place + 1] if "find_spec" not in cell.source]
+    for cell in notebook.cells:
+        cell.source = cell.metadata.get("short", cell.source)
+    client = NotebookClient(notebook, timeout=120, kernel_name="python3", km=kernel)
+    # Nobody looks at the widgets, and the client would wait for them after the last cell.
+    client.comm_open_handlers = {}
+    monkeypatch.delenv("MPLBACKEND", raising=False)
+    client.execute()
+    assert not any(output.output_type == "error" for output in outputs(notebook))
 
 
 def test_the_two_numbers_show_less_shaking() -> None:
-    """The stored quickstart ends with them, and with the actions as a picture."""
-    notebook = nbformat.read(FOLDER / "quickstart.ipynb", as_version=4)
-    last = [cell for cell in notebook.cells if cell.cell_type == "code"][-1]
-    text = "".join(output.get("text", "") for output in last.outputs)
-    found = re.findall(r"^(\w+) +action variation ([0-9.]+), return ([0-9.]+) of 100$", text, re.M)
-    assert [name for name, *_ in found] == ["baseline", "smooth"] and pictures(last) == 1
+    """The stored quickstart ends with two numbers, one trace and three closing lines."""
+    notebook = stored("quickstart.ipynb")
+    found = re.findall(
+        r"^(\w+) +action variation ([0-9.]+), return ([0-9.]+) of 100$", printed(notebook), re.M
+    )
+    assert [name for name, *_ in found] == ["baseline", "smooth"]
+    assert pictures(code(notebook)[-1]) == 1
     (before, total), (after, other) = ([float(n) for n in numbers] for _, *numbers in found)
     assert after < 0.5 * before and other > 0.97 * total
+    assert len(re.findall(r"^\* ", notebook.cells[-1].source, re.M)) == 3
 
 
-def test_a_notebook_runs_headless(monkeypatch: pytest.MonkeyPatch, kernel: KernelManager) -> None:
-    """With nbclient as it is, which hangs on sliders that nobody moves: they are off."""
-    notebook = nbformat.read(FOLDER / "idea.ipynb", as_version=4)
-    for cell in notebook.cells:
-        if "short" in cell.metadata:
-            cell.source = cell.metadata["short"] + "\nSLIDERS = False"
-    run(notebook, monkeypatch, 120, kernel, sliders=False)
-    assert sum(map(pictures, notebook.cells)) >= 3
+def test_noise_is_the_cause_of_the_shaking() -> None:
+    """The stored outputs show what the closing lines of the notebook say."""
+    found = {
+        name: [float(number) for number in numbers.split()]
+        for name, numbers in re.findall(
+            r"^(\w+) +action variation (.+)$", printed(stored("shaking.ipynb")), re.M
+        )
+    }
+    assert list(found) == ["before", "after"]
+    for variations in found.values():
+        assert variations == sorted(variations) and variations[0] < 0.1 * variations[3]
+    assert all(b > a for b, a in zip(*found.values(), strict=True))
+    assert "It is sensitive to noise" in printed(stored("shaking.ipynb"))
 
 
-def test_what_has_sliders_is_a_picture_first(
-    notebook: nbformat.NotebookNode, monkeypatch: pytest.MonkeyPatch, kernel: KernelManager
-) -> None:
-    """In the short form: of cells that say so, the source in their metadata."""
-    for cell in notebook.cells:
-        cell.source = cell.metadata.get("short", cell.source)
-    run(notebook, monkeypatch, 120, kernel)
-    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
-    with_sliders = [n for n, cell in enumerate(code) if "interact(" in cell.source]
-    assert with_sliders and all(pictures(code[n - 1]) for n in with_sliders)
-
-
-def test_the_pages_of_results_are_shown_with_their_pictures(
-    monkeypatch: pytest.MonkeyPatch, kernel: KernelManager
-) -> None:
-    """As many as the pages name; the other cells are left out."""
-    notebook = nbformat.read(FOLDER / "results.ipynb", as_version=4)
-    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
-    notebook.cells = [code[0], code[-1]]
-    run(notebook, monkeypatch, 120, kernel)
-    pages = "".join(page.read_text() for page in (FOLDER.parent / "results").glob("*.md"))
-    shown = ["image/svg+xml" in output.get("data", {}) for output in outputs(notebook)]
-    assert sum(shown) == pages.count("![") > 0
+def test_the_stored_table_has_the_means_of_the_records() -> None:
+    """The notebook about results is stored with the numbers of its file."""
+    runs = pd.read_csv(FOLDER.parent / "results" / "hopper.csv")
+    tables = "".join(
+        output.data["text/html"]
+        for output in outputs(stored("results.ipynb"))
+        if "text/html" in output.get("data", {})
+    )
+    for method in ("none", "l2c2_ramp", "cats"):
+        own = runs[runs["method"] == method]
+        assert f"<td>{own['last_mean_action_variation'].mean():.3f}</td>" in tables
+        assert f"<td>{own['last_mean_return'].mean():.0f}</td>" in tables
 
 
 @pytest.mark.slow
 def test_runs_and_draws(notebook: nbformat.NotebookNode, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every cell as it stands, without an error, and pictures come out."""
-    run(notebook, monkeypatch, timeout=900, sliders=False)
-    assert sum(map(pictures, notebook.cells)) >= 3
+    """Every cell as it stands, without an error, and with as many pictures as stored."""
+    before = [pictures(cell) for cell in code(notebook)]
+    run(notebook, monkeypatch, timeout=900)
+    assert [pictures(cell) for cell in code(notebook)] == before
 
 
-def test_the_page_of_the_idea_is_that_of_its_notebook() -> None:
-    """Its text, and a picture behind every cell that draws one; what is live is left out."""
+def test_the_page_of_the_idea_is_its_notebook() -> None:
+    """Its text, and a described picture after every cell that draws one."""
     docs = FOLDER.parent / "docs"
     made: dict[str, Any] = runpy.run_path(str(docs / "make_idea.py"))
-    notebook = nbformat.read(FOLDER / "idea.ipynb", as_version=4)
-    drawing = {cell.id: 1 for cell in notebook.cells if "subplots(" in cell.source}
+    notebook = stored("idea.ipynb")
+    drawing = {cell.id: 1 for cell in code(notebook) if "subplots(" in cell.source}
     written = (docs / "idea.md").read_text()
-    assert written == made["page"](notebook, drawing) and "live kernel" not in written
+    assert written == made["page"](notebook, drawing) and "SLIDERS" not in written
     assert all((docs / f"idea_{number + 1}.png").exists() for number in range(len(drawing)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import statistics
 from collections import Counter
 from dataclasses import replace
@@ -11,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from studies import pages
+from studies import forest, pages
 from studies.field import BETTER, field_groups, field_table
 from studies.methods import against_table, choice_table, pairwise_tables
 from studies.pages import (
@@ -585,3 +586,60 @@ class TestProse:
             cell = f"{record.last_mean_return:.0f} / {record.last_mean_sm_asap:.3f}"
             assert f"| {cell.replace('/ 0.', '/ .')} |" in page
         assert len(shown) >= 24
+
+
+class TestForest:
+    @pytest.fixture
+    def shown(self, tmp_path):
+        """Two tasks with two runs of each side: returns and action variations by task."""
+        results = {
+            "swingup": ([(1.0, 0.2), (3.0, 0.2)], [(2.0, 0.3), (2.0, 0.4)]),
+            "reacher": ([(1.0, 0.1), (1.0, 0.3)], [(2.0, 0.2), (2.0, 0.2)]),
+        }
+        for task, sides in results.items():
+            for method, runs in zip(("l2c2", "none"), sides, strict=True):
+                for seed, result in enumerate(runs):
+                    config = make_config(task=task, regularizer=method, seed=seed)
+                    make_run(tmp_path / task / method / str(seed), config, *result)
+        groups = {(g.first.task, g.first.method): g for g in group_records(read(tmp_path))}
+        # The smoother baseline first, to see that rows are sorted.
+        return forest.rows(
+            {task: (groups[task, "l2c2"], groups[task, "none"]) for task in ("reacher", "swingup")}
+        )
+
+    def test_by_hand(self, shown):
+        """Swingup: all four pairs are smoother; one of two returns is above 2, and a resample has
+        none, one or both with 1/4, 1/2 and 1/4, so the interval is [0, 1]. Reacher: as many pairs
+        are smoother as not, with the same interval, and no return is larger."""
+        assert forest.table(shown).splitlines()[2:] == [
+            "| swingup (2 seeds) | 1.00 [1.00, 1.00] | 0.50 [0.00, 1.00] |",
+            "| reacher (2 seeds) | 0.50 [0.00, 1.00] | 0.00 [0.00, 0.00] |",
+            "| Mean of the 2 rows | 0.75 [0.50, 1.00] | 0.25 [0.00, 0.50] |",
+        ]
+
+    def test_the_picture_needs_no_font_and_is_the_same_every_time(self, shown, tmp_path):
+        """Letters are outlines; the description has the numbers."""
+        first, second = tmp_path / "first.svg", tmp_path / "second.svg"
+        for path in (first, second):
+            forest.draw(shown, path)
+        text = first.read_text()
+        assert text == second.read_text() and "<text" not in text
+        assert forest.table(shown) in text
+
+    def test_page_and_picture_are_of_the_records(self):
+        """The same rows as the README's table, and what the page says of them."""
+        shown = forest.published()
+        page, picture = forest.PAGE.read_text(), forest.PICTURE.read_text()
+        assert forest.table(shown) in page and forest.table(shown) in picture
+        *rows, overall = shown
+        assert len(rows) == 6 and overall.label == "Mean of the 6 rows"
+        smoother, returns = zip(*(row.better for row in rows), strict=True)
+        assert all(each.value > 0.5 for each in smoother)
+        assert sum(each.interval[0] > 0.5 for each in smoother) == 5
+        assert all(each.interval[1] > 0.5 for each in returns)
+        lines = (ROOT / "README.md").read_text().splitlines()
+        kinds = [re.split(r", | \(", row.label)[:2] for row in rows]
+        starts = [f"| {task} | {algorithm} (" for task, algorithm in kinds]
+        assert [line for line in lines if line.startswith(tuple(starts))] == [
+            next(line for line in lines if line.startswith(start)) for start in starts
+        ]
