@@ -61,7 +61,7 @@ def test_the_command_writes_rows_as_json_and_as_a_table(tmp_path):
 @pytest.mark.parametrize("compiler", ["own", "torch.compile"])
 def test_both_compilers_are_timed(compiler):
     """Later updates take a small part of the first one, which compiles."""
-    command = [sys.executable, "-m", "benchmarks.compilers", "sac", compiler]
+    command = [sys.executable, "-m", "benchmarks.compilers", "ppo_rpe", compiler]
     done = subprocess.run(command, check=True, cwd=REPOSITORY, capture_output=True, text=True)
     times = json.loads(done.stdout.splitlines()[-1])
     assert times["first_s"] > 10 * 1e-6 * times["update_us"] > 0
