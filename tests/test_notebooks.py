@@ -16,7 +16,7 @@ from nbclient import NotebookClient
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
 NAMES = ["idea.ipynb", "quickstart.ipynb", "results.ipynb", "shaking.ipynb"]
-INSTALL = 'if find_spec("torchrl_l2c2") is None:\n    %pip install -q {SOURCE}'
+INSTALL = 'if find_spec("torchrl_l2c2") is None:\n    %pip install -q "{SOURCE}"'
 
 
 @pytest.fixture(params=NAMES)
