@@ -14,7 +14,7 @@ from torchrl_l2c2.experiment.errors import (
     MissingPackageError,
     SimulatorError,
     UserError,
-    told_in_a_line,
+    one_line_errors,
 )
 from torchrl_l2c2.experiment.run.checkpoints import CheckpointError
 from torchrl_l2c2.experiment.run.lock import FolderInUseError
@@ -45,7 +45,7 @@ def test_what_a_user_can_mend_is_one_line(error, capsys):
     """In the command that trains, and in all others."""
     assert str(error) in _tell(error)
     assert capsys.readouterr().err.startswith(f"error: {error}")
-    with pytest.raises(SystemExit) as ended, told_in_a_line():
+    with pytest.raises(SystemExit) as ended, one_line_errors():
         raise error
     assert ended.value.code == f"error: {error}"
 
@@ -53,7 +53,7 @@ def test_what_a_user_can_mend_is_one_line(error, capsys):
 @pytest.mark.parametrize("error", BUGS, ids=lambda error: type(error).__name__)
 def test_a_bug_is_a_traceback(error, capsys):
     """Only its first line is kept for a sweep's end."""
-    with pytest.raises(type(error)), told_in_a_line():
+    with pytest.raises(type(error)), one_line_errors():
         raise error
     assert _tell(error) == f"{type(error).__name__}: {error}"
     told = capsys.readouterr().err

@@ -420,7 +420,7 @@ def test_settings_survive_a_round_trip():
     [
         (
             {"task": {"episode": 3}},
-            "task.episode is not a setting; here there are action_rate, env_id",
+            "task.episode is not a setting; choose from action_rate, env_id",
         ),
         ({"task": {"episodes": 0}}, "task.episodes must be greater than or equal to 1, got 0"),
         ({"task": {"noise_scale": -1.0}}, "task.noise_scale must be greater than or equal to 0"),
@@ -439,10 +439,10 @@ def test_settings_survive_a_round_trip():
         ({"seed": -1}, "seed must be greater than or equal to 0, got -1"),
         ({"compile": 1}, "compile must be a valid boolean, got 1"),
         ({"test_episodes": True}, "test_episodes must be a valid integer, got True"),
-        ({"sed": 1}, "sed is not a setting; here there are algorithm"),
+        ({"sed": 1}, "sed is not a setting; choose from algorithm"),
         (
             {"regularizer": {"name": "l2c2", "lambda_min": 2.0}},
-            r"regularizer\.lambda_max must be above lambda_min .*, here above 2, got 1: raise it",
+            r"regularizer\.lambda_max must be above lambda_min .*, here above 2, got 1: increase",
         ),
         (
             {"regularizer": {"name": "l2c2", "sigma": 4.0, "lambda_min": 0.5}},
@@ -475,10 +475,13 @@ def test_wrong_settings_are_refused_with_what_is_allowed(settings, message):
             {"num_workers": 2, "algorithm": PPOConfig(num_envs=2)},
             "num_workers must be 1 with algorithm.num_envs",
         ),
-        ({"replay": GROUPS["replay"]["rollout"]}, "'rollout' is nothing that algorithm 'ppo_rpe'"),
+        (
+            {"replay": GROUPS["replay"]["rollout"]},
+            "'rollout' does not work with algorithm 'ppo_rpe'",
+        ),
         (
             {"algorithm": PPOConfig(), "replay": GROUPS["replay"]["uniform"]},
-            "'uniform' is nothing that algorithm 'ppo' can learn from",
+            "'uniform' does not work with algorithm 'ppo'",
         ),
     ],
 )

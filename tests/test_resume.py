@@ -33,7 +33,7 @@ from torchrl_l2c2.experiment import (
 )
 from torchrl_l2c2.experiment.analysis.reports import find_runs, finished_run, read_runs
 from torchrl_l2c2.experiment.cli.train import _end_logged, run
-from torchrl_l2c2.experiment.errors import OtherRunError, warnings_told
+from torchrl_l2c2.experiment.errors import OtherRunError, warnings_as_lines
 from torchrl_l2c2.experiment.run.checkpoints import (
     CheckpointError,
     list_checkpoints,
@@ -493,9 +493,7 @@ def test_a_setting_that_changes_nothing_may_be_new():
     saved = small().to_dict()
     del saved["regularizer"]["policy_distance"]
     check_same_settings(saved, small().to_dict())
-    with pytest.raises(
-        OtherRunError, match=r"policy_distance=none, as it is a setting since, not mean"
-    ):
+    with pytest.raises(OtherRunError, match=r"policy_distance=none \(a newer setting\), not mean"):
         now = small(regularizer=L2C2Config(policy_distance="mean"))
         check_same_settings(saved, now.to_dict())
 
@@ -546,7 +544,7 @@ def test_a_full_disk_names_the_file_and_the_last_good_checkpoint(tmp_path, monke
 
 def test_a_warning_is_a_line_in_the_log_too(tmp_path, capsys):
     """And not Python's, with a line of its source."""
-    with warnings_told(partial(say, tmp_path)):
+    with warnings_as_lines(partial(say, tmp_path)):
         warnings.warn("hardly regularized", stacklevel=1)
     assert capsys.readouterr().err == "warning: hardly regularized\n"
     assert (tmp_path / "train.log").read_text().endswith(" warning: hardly regularized\n")

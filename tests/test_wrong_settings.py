@@ -41,7 +41,7 @@ def settings_of():
         ("seed=-1", "seed must be greater than or equal to 0, got -1."),
         ("seed=4294967000", "seed must be less than 2147483648, got 4294967000."),
         ("seed=zero", "seed must be a valid integer, got 'zero'."),
-        ("device=mps", "device must be cpu, cuda or cuda:N, a number from 0 up, got 'mps'."),
+        ("device=mps", "device must be cpu, cuda or cuda:N with N >= 0, got 'mps'."),
         ("seed=1.5", "seed must be a valid integer, got 1.5."),
         ("threads=1e11", "threads must be less than or equal to 1024, got 100000000000."),
         (
@@ -78,13 +78,13 @@ def settings_of():
         ("algorithm.gamma=1", "algorithm.gamma must be less than 1, got 1."),
         ("algorithm.hidden=100", "algorithm.hidden must be a list, got 100."),
         ("algorithm.hidden=[0]", "algorithm.hidden must be greater than or equal to 1, got 0."),
-        ("algorithm.replay_ratio=1 algorithm.updates=1", "replay_ratio and updates both say"),
+        ("algorithm.replay_ratio=1 algorithm.updates=1", "replay_ratio and updates both set"),
         ("optimizer=adam optimizer.betas=[0.9,1]", "betas must each be in [0, 1), got [0.9, 1.0]."),
         ("replay.batch_size=0", "replay.batch_size must be greater than or equal to 1, got 0."),
         ("replay.capacity=8", "replay.capacity must be at least the batch_size (32), got 8."),
         ("optimizer.lr=-1", "optimizer.lr must be greater than or equal to 0, got -1."),
-        ("algorithm=ppo replay=uniform", "'uniform' is nothing that algorithm 'ppo' can learn"),
-        ("replay=rollout", "'rollout' is nothing that algorithm 'ppo_rpe' can learn from"),
+        ("algorithm=ppo replay=uniform", "'uniform' does not work with algorithm 'ppo'"),
+        ("replay=rollout", "'rollout' does not work with algorithm 'ppo_rpe'"),
     ],
 )
 def test_a_wrong_setting_gives_its_line(settings_of, line, message):

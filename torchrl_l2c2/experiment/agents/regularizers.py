@@ -8,7 +8,7 @@ import torch
 from torchrl.objectives import LossModule
 
 from torchrl_l2c2.experiment.envs.frames import PREVIOUS
-from torchrl_l2c2.experiment.errors import raised_by_component
+from torchrl_l2c2.experiment.errors import is_raised_by_component
 from torchrl_l2c2.experiment.settings.fields import SettingError
 from torchrl_l2c2.experiment.settings.regularizers import (
     ASAPConfig,
@@ -45,7 +45,7 @@ def add_regularizer(loss: LossModule, config: RegularizerConfig) -> LossModule:
     try:
         loss = wrap(config, loss)
     except TypeError as error:
-        if not raised_by_component(error):
+        if not is_raised_by_component(error):
             raise
         raise SettingError("", f"regularizer={config.name}: {error}") from error
     if isinstance(config, GainConfig):

@@ -19,7 +19,7 @@ from hydra.errors import HydraException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf.errors import OmegaConfBaseException
 
-from torchrl_l2c2.experiment.settings.config import GROUPS, STEERING, ExperimentConfig
+from torchrl_l2c2.experiment.settings.config import COMMAND_SETTINGS, GROUPS, ExperimentConfig
 from torchrl_l2c2.experiment.settings.fields import SettingError, describe
 from torchrl_l2c2.experiment.settings.naming import run_name
 from torchrl_l2c2.experiment.settings.regularizers import BEGIN_WITH_PRESET, preset_settings
@@ -56,11 +56,11 @@ def register() -> None:
 
 def _node(chosen: Any) -> dict[str, Any]:
     values = {k: list(v) if isinstance(v, tuple) else v for k, v in vars(chosen).items()}
-    if not hasattr(chosen, "usual_replay"):
+    if not hasattr(chosen, "default_replay"):
         return values
     usual = [
-        {"override /replay@_global_.replay": chosen.usual_replay},
-        {"override /optimizer@_global_.optimizer": chosen.usual_optimizer},
+        {"override /replay@_global_.replay": chosen.default_replay},
+        {"override /optimizer@_global_.optimizer": chosen.default_optimizer},
     ]
     return {"defaults": [*usual, "_self_"], **values}
 
@@ -220,7 +220,7 @@ def unknown_setting(name: str) -> str:
     if having := [of[1] for of, names in settings.items() if of[0] == group and setting in names]:
         chosen = f"{group}={' or '.join(having)}"
         return f"{name} is only a setting of {chosen}.{_two_commands(group, having)}"
-    known = {*STEERING, *(field.name for field in dataclasses.fields(ExperimentConfig))}
+    known = {*COMMAND_SETTINGS, *(field.name for field in dataclasses.fields(ExperimentConfig))}
     known |= {f"{of[0]}.{each}" for of, names in settings.items() for each in names}
     near = sorted(each for each in known if each.endswith(f".{name}"))
     near = near or ALSO_CALLED.get(name) or get_close_matches(name, sorted(known), 1)

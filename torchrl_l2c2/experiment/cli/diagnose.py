@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from torchrl_l2c2.experiment.errors import told_in_a_line
+from torchrl_l2c2.experiment.errors import one_line_errors
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -19,7 +19,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         parser.error(f"--names: each run needs one of its own, got {chosen.names}")
     if chosen.actions and not chosen.actions.endswith(".svg"):
         parser.error(f"--actions must be an SVG file, named FILE.svg, got {chosen.actions}")
-    with told_in_a_line():
+    with one_line_errors():
         from torchrl_l2c2.experiment.analysis import diagnosis
         from torchrl_l2c2.experiment.envs.environments import TEST_SEED
         from torchrl_l2c2.experiment.run.files import make_folder_of, write_atomically

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torchrl_l2c2.experiment.errors import told_in_a_line
+from torchrl_l2c2.experiment.errors import one_line_errors
 
 if TYPE_CHECKING:
     from torchrl_l2c2.experiment.run.evaluation import Evaluation
@@ -22,7 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if chosen.record and chosen.sampled:
         parser.error("--record shows mean actions; leave it or --sampled out")
     levels = chosen.noise or [None]
-    with told_in_a_line():
+    with one_line_errors():
         from torchrl_l2c2.experiment.analysis.video import check_video, record_video
         from torchrl_l2c2.experiment.run.files import make_folder_of, to_json, write_json
 

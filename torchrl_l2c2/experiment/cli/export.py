@@ -7,7 +7,7 @@ import json
 import sys
 from collections.abc import Sequence
 
-from torchrl_l2c2.experiment.errors import told_in_a_line
+from torchrl_l2c2.experiment.errors import one_line_errors
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -29,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     chosen = parser.parse_args(arguments)
     if chosen.episodes < 1:
         parser.error(f"--episodes must be at least 1, got {chosen.episodes}")
-    with told_in_a_line():
+    with one_line_errors():
         from torchrl_l2c2.experiment.analysis.export import export_policy
 
         exported = export_policy(

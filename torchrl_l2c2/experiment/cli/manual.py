@@ -7,7 +7,7 @@ import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from torchrl_l2c2.experiment.settings.config import GROUPS, STEERING, ExperimentConfig
+from torchrl_l2c2.experiment.settings.config import COMMAND_SETTINGS, GROUPS, ExperimentConfig
 from torchrl_l2c2.experiment.settings.fields import describe
 from torchrl_l2c2.experiment.settings.regularizers import BEGIN_WITH_PRESET, preset_settings
 from torchrl_l2c2.presets import KINDS
@@ -26,7 +26,7 @@ WIDTH, COLUMN = 100, 38
 
 def manual() -> str:
     """The help of the command: every choice, and every setting in one line."""
-    lines = [f"{f'  {n}={v[0]}':{COLUMN}}{v[1]}" for n, v in STEERING.items()]
+    lines = [f"{f'  {n}={v[0]}':{COLUMN}}{v[1]}" for n, v in COMMAND_SETTINGS.items()]
     for name, (_, meaning) in describe(ExperimentConfig).items():
         lines.append(_line(name, getattr(ExperimentConfig(), name), meaning))
     for group, choices in GROUPS.items():
@@ -63,7 +63,7 @@ def page() -> str:
     """Every setting as a page of the docs."""
     lines = ["# Settings", "", "Made by `python -m torchrl_l2c2 settings`.", ""]
     lines += ["## The command", "", "| setting | default | meaning |", "| --- | --- | --- |"]
-    lines += [f"| `{n}` | `{v[0]}` | {v[1]} |" for n, v in STEERING.items()]
+    lines += [f"| `{n}` | `{v[0]}` | {v[1]} |" for n, v in COMMAND_SETTINGS.items()]
     lines += ["", "## The run as a whole", "", *_table(ExperimentConfig(), ""), ""]
     for group, choices in GROUPS.items():
         for name, chosen, first in _by_kind(choices):

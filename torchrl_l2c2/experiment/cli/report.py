@@ -8,7 +8,7 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torchrl_l2c2.experiment.errors import UserError, told_in_a_line
+from torchrl_l2c2.experiment.errors import UserError, one_line_errors
 
 if TYPE_CHECKING:
     from torchrl_l2c2.experiment.run.finished import FinishedRun, Record
@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         parser.error("name folders of runs, or files of records with --from")
     if chosen.records and chosen.csv:
         parser.error("--csv writes records of folders; --from has them already")
-    with told_in_a_line():
+    with one_line_errors():
         _report(chosen)
 
 

@@ -33,7 +33,7 @@ from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
-from torchrl_l2c2.experiment.errors import UserError, told_in_a_line
+from torchrl_l2c2.experiment.errors import UserError, one_line_errors
 from torchrl_l2c2.experiment.run.files import make_folder
 from torchrl_l2c2.experiment.run.signals import FINISHING, SAME_SIGNAL_SECONDS, terminate
 from torchrl_l2c2.experiment.settings.fields import SettingError
@@ -264,7 +264,7 @@ class ShareSweep(Callback):
             SystemExit: the folder cannot be written to; Hydra swallows other errors.
         """
         if Sweep.begun_here is not None:
-            with told_in_a_line():
+            with one_line_errors():
                 Sweep.begun_here.share(Path(config.hydra.sweep.dir).absolute())
 
 

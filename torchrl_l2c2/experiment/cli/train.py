@@ -38,9 +38,9 @@ from torchrl_l2c2.experiment.cli.sweep import Sweep, begin_sweep, list_jobs
 from torchrl_l2c2.experiment.errors import (
     UserError,
     is_lack_of_memory,
-    is_told_in_a_line,
+    is_one_line_error,
     show_cause,
-    warnings_told,
+    warnings_as_lines,
 )
 from torchrl_l2c2.experiment.run.files import make_folder
 from torchrl_l2c2.experiment.run.metrics_log import check_installed
@@ -217,7 +217,7 @@ def _standing(sweep: Sweep) -> str:
 
 def _tell(error: Exception) -> str:
     """Prints an error: one line, with the lines of a simulator that failed; a bug's traceback."""
-    if not is_told_in_a_line(error):
+    if not is_one_line_error(error):
         traceback.print_exception(error)
         return "".join(traceback.format_exception_only(error)).strip()
     show_cause(error)
@@ -279,7 +279,7 @@ def run(
             finished = _train(config, folder, values, standing)
         else:
             print("finished before: its results follow; another seed= or outputs= begins anew.")
-            with warnings_told(partial(say, folder)):
+            with warnings_as_lines(partial(say, folder)):
                 tell_past(finished.config, config.to_dict())
         if records:
             record_video(folder, video)
@@ -309,7 +309,7 @@ def _train(
     keep_freed_memory()
     going_on = {name: values[name] for name in ("resume", "allow_other_versions")}
     with (
-        warnings_told(partial(say, folder)),
+        warnings_as_lines(partial(say, folder)),
         closing(Experiment(config, folder, **going_on)) as experiment,
     ):
         if (told := preset_used(config)) is not None:
@@ -353,7 +353,7 @@ def _end_logged(folder: Path) -> Iterator[None]:
         stopped = isinstance(error, KeyboardInterrupt | Interrupted)
         told = [str(error) or "interrupted"] if stopped else traceback.format_exception(error)
         with suppress(OSError):  # The error itself may be that there is no room.
-            if not stopped and not is_told_in_a_line(error):
+            if not stopped and not is_one_line_error(error):
                 make_folder(folder)
             log(folder, "".join(told))
         raise

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
-from torchrl_l2c2.experiment.errors import told_in_a_line
+from torchrl_l2c2.experiment.errors import one_line_errors
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -22,7 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("--noise", type=float, help="standard deviation of the noise (default: the task's)")
     add("--best", action="store_true", help="policy_best.pt instead of policy.pt")
     chosen = parser.parse_args(arguments)
-    with told_in_a_line():
+    with one_line_errors():
         from torchrl_l2c2.experiment.analysis.video import record_video
 
         path = record_video(

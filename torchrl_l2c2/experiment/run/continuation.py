@@ -13,7 +13,7 @@ from torchrl_l2c2.experiment.errors import OtherRunError, SimulatorError
 from torchrl_l2c2.experiment.run.checkpoints import CheckpointError, list_checkpoints, load_newest
 from torchrl_l2c2.experiment.run.folder import versions
 from torchrl_l2c2.experiment.settings.config import ExperimentConfig
-from torchrl_l2c2.experiment.settings.identity import differing, of_length
+from torchrl_l2c2.experiment.settings.identity import changed_settings, length_dependent_settings
 from torchrl_l2c2.experiment.settings.tasks import Budget, TaskConfig
 
 # Free settings that only episodes of training read.
@@ -26,7 +26,7 @@ def check_same_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> Non
     Raises:
         OtherRunError: names the first setting that differs, with both values.
     """
-    for name, (was, is_now) in differing(saved, now).items():
+    for name, (was, is_now) in changed_settings(saved, now).items():
         raise OtherRunError(
             f"the checkpoint was made with {name.removesuffix('.name')}={was}, not {is_now}: "
             "give the same settings, or begin in another folder (in a shell, outputs=FOLDER). "
@@ -172,7 +172,7 @@ def check_continuable(
     check_length(asked, before, played)
     if played >= asked.total:
         tell_past(saved, config.to_dict())
-    for setting in of_length(config):
+    for setting in length_dependent_settings(config):
         if asked != before:
             warnings.warn(
                 f"{setting} has been till now as in a training of {before.total} {before.unit}s; "

@@ -23,10 +23,10 @@ from torchrl_l2c2.experiment.run.files import (
 from torchrl_l2c2.experiment.settings.config import ExperimentConfig
 from torchrl_l2c2.experiment.settings.identity import (
     BUDGETS,
-    by_name,
+    changed_settings,
     differences,
-    differing,
     fingerprint,
+    flatten_settings,
     read_differences,
     write_differences,
 )
@@ -279,8 +279,10 @@ def is_tested(run: str | Path, settings: Mapping[str, Any]) -> bool:
         return False
     with read_back(run):
         saved = read_config(run)
-        before, after = ([by_name(s).get(name) for name in BUDGETS] for s in (saved, settings))
-        return before == after and not differing(saved, settings)
+        before, after = (
+            [flatten_settings(s).get(name) for name in BUDGETS] for s in (saved, settings)
+        )
+        return before == after and not changed_settings(saved, settings)
 
 
 def write_evaluation(
