@@ -19,7 +19,7 @@ from torchrl_l2c2.experiment import (
     evaluate_policy,
     load_policy,
 )
-from torchrl_l2c2.experiment.agents.agent import exploring_in
+from torchrl_l2c2.experiment.agents.agent import exploration_module
 from torchrl_l2c2.experiment.cli import diagnose, export, video
 from torchrl_l2c2.experiment.cli.evaluate import main
 from torchrl_l2c2.experiment.run.evaluation import Evaluation
@@ -250,8 +250,8 @@ def test_a_policy_of_a_checkpoint_explores_as_the_run_does(tmp_path):
     }
     experiment = Experiment(ExperimentConfig(task=task, compile=False, **settings), tmp_path)
     experiment.train()
-    rate = exploring_in(load_policy(tmp_path)[0]).eps.item()
-    assert rate == exploring_in(experiment.agent.policy).eps.item() == 0.25
+    rate = exploration_module(load_policy(tmp_path)[0]).eps.item()
+    assert rate == exploration_module(experiment.agent.policy).eps.item() == 0.25
     experiment.close()
 
 

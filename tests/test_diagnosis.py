@@ -472,8 +472,8 @@ class TestRun:
         "error",
         [
             gymnasium.error.DependencyNotInstalled("pygame is not installed"),
-            ValueError("Still-v0 draws no pictures"),
-            SimulatorError("Still-v0 could not begin: no graphics library"),
+            ValueError("Still-v0 cannot render pictures"),
+            SimulatorError("Still-v0 could not start: no graphics library"),
         ],
     )
     def test_pictures_are_left_out_where_they_cannot_be_drawn(self, run, monkeypatch, error):

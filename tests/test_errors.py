@@ -28,7 +28,7 @@ TOLD = [
     MissingPackageError("onnx is missing"),
     OSError("no space left"),
     FloatingPointError("reward is not finite"),
-    SimulatorError("failed beyond frame 3"),
+    SimulatorError("failed after frame 3"),
 ]
 BUGS = [
     ValueError("unknown mode"),
@@ -96,7 +96,7 @@ def test_help_may_have_no_reader():
 @pytest.mark.parametrize(
     ("setting", "told"),
     [
-        ("task.env_id=Nowhere-v0", "'Nowhere-v0' is not a task that Gymnasium can make here"),
+        ("task.env_id=Nowhere-v0", "'Nowhere-v0' is not a task that Gymnasium can create here"),
         ("task.env_id=my_robot:Robot-v0", "No module named 'my_robot'"),
         ("resume=nowhere", "resume='nowhere' holds no checkpoint"),
     ],

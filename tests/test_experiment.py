@@ -209,7 +209,7 @@ def test_the_replay_ratio_is_how_often_a_transition_is_drawn():
     ratio = Experiment(small(algorithm=PPORPEConfig(replay_ratio=2.0)))
     # 40 frames an episode, batches of 32: 2.5 updates each.
     assert [row["updates"] for row in ratio.train()] == [2, 5]
-    with pytest.raises(ValueError, match="replay_ratio and updates both say"):
+    with pytest.raises(ValueError, match="replay_ratio and updates both set"):
         PPORPEConfig(replay_ratio=2.0, updates=3)
     # The default ratio gives way to a number.
     assert PPORPEConfig(updates=3).updates_after(40, 80, 80, 32) == 3
@@ -320,9 +320,9 @@ def broken_after(experiment, frames, outcome):
         (
             RuntimeError("physics gone"),
             SimulatorError,
-            "failed beyond frame 40: .* physics gone",
+            "failed after frame 40: .* physics gone",
         ),
-        (SystemExit(4), SimulatorError, r"failed beyond frame 40: SystemExit: 4\."),
+        (SystemExit(4), SimulatorError, r"failed after frame 40: SystemExit: 4\."),
     ],
 )
 def test_a_broken_simulator_stops_the_run_and_leaves_a_checkpoint(
@@ -374,7 +374,7 @@ def test_workers_play_rounds_that_are_learned_from_as_episodes(tmp_path):
         assert len({row["return"] for row in rows}) == 4
         experiment.player.collector.procs[0].kill()
         experiment.player.collector.procs[0].join()
-        message = r"Pendulum-v1 failed beyond frame 160.*Last good checkpoint: .*_0+4.pt"
+        message = r"Pendulum-v1 failed after frame 160.*Last good checkpoint: .*_0+4.pt"
         with pytest.raises(SimulatorError, match=message):
             experiment.train(6)
         assert len(experiment.metrics) == 4
@@ -632,7 +632,7 @@ def test_a_wrong_setting_ends_with_one_clear_line(tmp_path):
     [
         (
             {"task": TaskConfig("cartpole", "CartPole-v1")},
-            "ppo_rpe needs continuous actions, this task's are OneHot",
+            "ppo_rpe needs continuous actions, got OneHot",
         ),
         (
             {"algorithm": TD3Config(), "regularizer": LCPConfig()},

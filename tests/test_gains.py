@@ -253,7 +253,7 @@ class TestInARun:
     @pytest.fixture
     def measured_soon(self, monkeypatch):
         """After 20 updates, not 100, it is told which regularizer is faint."""
-        monkeypatch.setattr("torchrl_l2c2.experiment.learn.learner.MEASURED_AFTER", 20)
+        monkeypatch.setattr("torchrl_l2c2.experiment.learn.learner.MEASURE_AFTER", 20)
 
     @pytest.mark.parametrize("kind", ["constant", "ramp", "target"])
     def test_a_gain_that_does_not_rise_by_itself_is_told_to_be_faint(self, kind, measured_soon):

@@ -16,7 +16,7 @@ def test_what_fails_after_a_signal_to_all_processes_was_ended_by_it(number, ende
     """A compiler, or a worker, that heard it as well: the run can go on, and a sweep ends."""
     before = signal.getsignal(number)
     killed = ChildFailedError("g++ was killed")
-    played = SimulatorError("beyond frame 3")
+    played = SimulatorError("after frame 3")
     played.__cause__ = killed  # a worker, while episodes were played
     for error in (killed, played):
         with pytest.raises(KeyboardInterrupt) as told, stop_on_signals() as received:

@@ -16,7 +16,7 @@ from torchrl_l2c2.experiment.agents.networks import (
     normal_actor,
     orthogonal,
     perceptron,
-    sharing,
+    shared_copy,
 )
 from torchrl_l2c2.experiment.agents.normalization import ActingPolicy, Normalization
 from torchrl_l2c2.experiment.agents.optimizers import make_optimizer
@@ -54,12 +54,12 @@ def make_ppo(
     advantage = GAE(
         gamma=config.gamma,
         lmbda=config.gae_lambda,
-        value_network=sharing(critic, loss.critic_network_params),
+        value_network=shared_copy(critic, loss.critic_network_params),
     )
     normalization = _normalization(config, env)
     return Agent(
         loss,
-        policy=_acting(config, sharing(actor, loss.actor_network_params), normalization, env),
+        policy=_acting(config, shared_copy(actor, loss.actor_network_params), normalization, env),
         optimizer=make_optimizer(optimizer, loss.parameters()),
         advantage=advantage,
         max_grad_norm=config.max_grad_norm,
@@ -74,8 +74,8 @@ def _normalization(config: PPOConfig, env: EnvBase) -> Normalization | None:
     shape = env.observation_spec["observation"].shape
     if len(shape) != 1:
         raise UserError(
-            "algorithm.normalize_observations and normalize_rewards are of tasks that show one "
-            f"vector, this one shows an image of shape {tuple(shape)}: set both to false."
+            "algorithm.normalize_observations and normalize_rewards need a task that observes one "
+            f"vector, got an image of shape {tuple(shape)}: set both to false."
         )
     return Normalization(
         shape[0],
@@ -89,7 +89,7 @@ def _normalization(config: PPOConfig, env: EnvBase) -> Normalization | None:
 def _acting(
     config: PPOConfig, policy: TensorDictModule, normalization: Normalization | None, env: EnvBase
 ) -> TensorDictModule:
-    """The policy for the task, with normalization and clipping inside."""
+    """Returns the acting policy, with normalization and clipping as in the settings."""
     if normalization is None and not config.clip_actions:
         return policy
     bounds = clip_bounds(env) if config.clip_actions else ()

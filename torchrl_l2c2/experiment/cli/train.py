@@ -247,7 +247,7 @@ def run(
         patience (float): seconds to wait for a process that has its folder.
     """
     # Imported here: settings are checked, and the run is named, before torch is imported.
-    from torchrl_l2c2.experiment.envs.spaces import check_known
+    from torchrl_l2c2.experiment.envs.spaces import check_env_id
     from torchrl_l2c2.experiment.run.continuation import check_elsewhere, tell_past
     from torchrl_l2c2.experiment.run.finished import finished_run
     from torchrl_l2c2.experiment.run.lock import wait_for_folder
@@ -255,7 +255,7 @@ def run(
     check_elsewhere(values["resume"])
     if not (folder / "evaluation.json").exists():
         check_installed(config.logger.name)
-        check_known(config.task.env_id)
+        check_env_id(config.task.env_id)
     chosen = (config.task, config.algorithm, config.regularizer)
     named = f"{', '.join(group.name for group in chosen)}, seed {config.seed}: {folder}"
     print(f"{standing}: {named}" if standing else named, flush=True)

@@ -1,4 +1,4 @@
-"""Collecting at nearly the speed of the simulator: TorchRL's collector with a plain inner loop."""
+"""Fast collection of episodes from one Gymnasium simulator."""
 
 from __future__ import annotations
 
@@ -23,45 +23,46 @@ from torchrl.envs import (
 )
 
 from torchrl_l2c2.experiment.agents._torchrl_internals import (
+    add_noise,
     first_observation,
-    noisy,
     simulator_of,
 )
-from torchrl_l2c2.experiment.collect.acting import on_tensors
-from torchrl_l2c2.experiment.envs.environments import NOISE_SEED, simulating
-from torchrl_l2c2.experiment.envs.frames import PREVIOUS, Frame, as_reward, stack_frames
+from torchrl_l2c2.experiment.collect.acting import policy_function
+from torchrl_l2c2.experiment.envs.environments import NOISE_SEED, simulator_errors
+from torchrl_l2c2.experiment.envs.frames import PREVIOUS, Frame, reward_to_float, stack_frames
 from torchrl_l2c2.experiment.envs.spaces import Env
 from torchrl_l2c2.transforms import ObservationNoise
 
 
 class EpisodeCollector(Collector):
-    """A TorchRL :class:`~torchrl.collectors.Collector`, fast with one Gymnasium simulator.
+    """A fast TorchRL :class:`~torchrl.collectors.Collector` for one Gymnasium simulator.
 
-    It gives the collector's batches, bit for bit, without the ``collector`` entry. It leaves
-    out the work around every step: specs, nested TensorDicts and their copies. An episode's
-    frames are stacked once.
+    It returns the same batches as TorchRL's collector, bit for bit, without the ``collector``
+    entry. Steps need no specs, nested TensorDicts or copies, and the frames of an episode are
+    stacked once.
 
     Args:
-        env (EnvBase): a ``GymEnv`` or ``GymWrapper``, also one transformed by
-            :class:`ObservationNoise`, with one tensor of observations under ``"observation"``.
-        policy (TensorDictModule): reads ``"observation"``.
+        env (EnvBase): A ``GymEnv`` or ``GymWrapper`` with one tensor under ``"observation"``,
+            optionally transformed by :class:`ObservationNoise`.
+        policy (TensorDictModule): Policy that reads ``"observation"``.
 
     Keyword Args:
-        frames_per_batch (int): frames of a batch.
-        stop_at_done (bool): whether a batch ends with the episode, even if it is shorter.
-            Learning at the end of every episode needs this. Default ``True``.
-        compile_policy (bool): whether to compile the policy. Random numbers are drawn as without.
-            What is written into its parameters is followed; a parameter or a setting that is
-            replaced after the first frame is overlooked. Default ``False``.
-        random_frames (int): first frames whose actions are drawn from the action's bounds
-            instead; their log-likelihood stays that of the policy's own. Default 0.
-        exploration_type (ExplorationType): default ``RANDOM``.
-        keep_previous (bool): whether frames have the observation before theirs as well, as
-            ``"previous_observation"``; in an episode's first it is their own. Default ``False``.
+        frames_per_batch (int): Number of frames in a batch.
+        stop_at_done (bool): Whether a batch ends with the episode, even with fewer frames. Updates
+            after every episode need this. Default ``True``.
+        compile_policy (bool): Whether to compile the policy. Random numbers stay the same. Later
+            in-place changes of parameters take effect, but parameters or settings must not be
+            replaced after the first frame. Default ``False``.
+        random_frames (int): Number of first frames with actions sampled uniformly from their
+            bounds. The stored log-likelihood remains the policy's. Default 0.
+        exploration_type (ExplorationType): Exploration type of the policy. Default ``RANDOM``.
+        keep_previous (bool): Whether frames contain the previous observation as
+            ``"previous_observation"``; the first frame of an episode repeats its own observation.
+            Default ``False``.
 
     Raises:
-        ValueError: several environments at once, or one with other transforms. TorchRL's
-            ``Collector`` plays these.
+        ValueError: If the environment is batched or has other transforms. Use TorchRL's
+            ``Collector`` instead.
 
     Examples:
         >>> from torchrl.envs import GymEnv
@@ -102,20 +103,20 @@ class EpisodeCollector(Collector):
         self._keep_previous = keep_previous
         self._previous: Tensor | None = None
         self._random_frames_left = random_frames
-        # The collector has reset the environment when it was made.
+        # TorchRL's constructor has reset the environment.
         self._observation: Tensor | None = first_observation(self)
         self._policy_keys = [key for key in policy.out_keys if not key.startswith("_")]
-        self._act = on_tensors(policy, self._policy_keys, compile_policy)
-        # Of a policy whose samples go beyond the bounds: frames have these, the task what it takes.
-        self._taken: Callable[[Tensor], Tensor] | None = getattr(policy, "taken", None)
+        self._act = policy_function(policy, self._policy_keys, compile_policy)
+        # Samples may exceed the bounds: frames contain the samples, the task gets clipped actions.
+        self._clip_action: Callable[[Tensor], Tensor] | None = getattr(policy, "clip_action", None)
         self._gymnasium = simulator_of(self._simulator)
         self._dtype = self._simulator.observation_spec["observation"].dtype
         continuous = self._simulator.action_spec.dtype.is_floating_point
-        self._to_action = as_array if continuous else self._simulator.read_action
+        self._to_action = copy_to_numpy if continuous else self._simulator.read_action
 
     @torch.no_grad()
     def rollout(self) -> TensorDictBase:
-        """Plays up to ``frames_per_batch`` frames; what iterating over the collector calls."""
+        """Plays up to ``frames_per_batch`` frames. Iterating over the collector calls this."""
         frames: list[Frame] = []
         try:
             with set_exploration_type(self.exploration_type):
@@ -124,19 +125,18 @@ class EpisodeCollector(Collector):
                     if frames[-1].done and self.stop_at_done:
                         break
         except BaseException:
-            self._observation = None  # What was played of the episode is lost.
+            self._observation = None  # The unfinished episode is lost.
             raise
         return stack_frames(frames)
 
     @torch.no_grad()
     def step(self) -> Frame:
-        """Plays one frame; an episode's frames, stacked, are its :meth:`rollout`."""
+        """Plays one frame. The stacked frames of an episode equal its :meth:`rollout`."""
         with set_exploration_type(self.exploration_type):
             return self._play()
 
     def _play(self) -> Frame:
-        # Late, so that between episodes nothing of the next one has happened yet: the
-        # generators' states are then all there is to save.
+        # A late reset: between episodes, the states of the random generators are the whole state.
         observation = self._observation
         if observation is None:
             observation = self._observe(self._gymnasium.reset()[0])
@@ -149,62 +149,63 @@ class EpisodeCollector(Collector):
         if self._random_frames_left > 0:
             self._random_frames_left -= 1
             action.copy_(self._simulator.action_spec.rand())
-        taken = action if self._taken is None else self._taken(action)
+        taken = action if self._clip_action is None else self._clip_action(action)
         seen, reward, terminated, truncated, _ = self._gymnasium.step(self._to_action(taken))
-        following = self._observe(seen)
-        self._observation = None if terminated or truncated else following
-        return Frame(observation, outputs, following, as_reward(reward), terminated, truncated)
+        next_observation = self._observe(seen)
+        self._observation = None if terminated or truncated else next_observation
+        reward = reward_to_float(reward)
+        return Frame(observation, outputs, next_observation, reward, terminated, truncated)
 
     def reset(self, index: Any = None, **kwargs: Any) -> None:
-        """The next frame begins an episode, wherever the present one is."""
+        """Ends the current episode. The next frame starts a new one."""
         self._observation = None
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
-        """Seeds the simulator and, with another seed, its noise; the next episode starts anew.
+        """Seeds the simulator and its noise, and ends the current episode.
 
         Args:
-            seed (int): at least 0.
-            static_seed (bool): whether to return the seed as it is.
+            seed (int): Seed of the simulator, at least 0. The noise's seed is derived from it.
+            static_seed (bool): Whether to return the same seed.
 
         Returns:
-            int: a seed for another environment.
+            int: Seed for another environment.
         """
-        following = super().set_seed(seed, static_seed=static_seed)
+        next_seed = super().set_seed(seed, static_seed=static_seed)
         if self._noise is not None and self._noise.generator is not None:
             self._noise.generator.manual_seed(seed + NOISE_SEED)
         self._observation = None
-        return following
+        return next_seed
 
     def generator_state(self) -> dict[str, Any]:
-        """The states of the simulator's and the noise's random generators, between episodes.
+        """Returns the states of the simulator's and the noise's random generators.
 
         Raises:
-            RuntimeError: in the middle of an episode, whose simulator's state cannot be saved.
+            RuntimeError: If an episode is in progress: the simulator's state cannot be saved.
         """
         if self._observation is not None:
-            raise RuntimeError("an episode is being played; a run can be saved between episodes.")
+            raise RuntimeError("cannot save during an episode: save between episodes.")
         states = generator_states(self._gymnasium, self._noise)
         return {**states, "random_frames_left": self._random_frames_left}
 
     def set_generator_state(self, state: dict[str, Any]) -> None:
-        """Restores what :meth:`generator_state` gave; the next episode starts with a reset."""
+        """Restores a state of :meth:`generator_state`. The next frame starts a new episode."""
         set_generator_states(self._gymnasium, self._noise, state)
         self._random_frames_left = state["random_frames_left"]
         self._observation = None
 
     def _observe(self, seen: np.ndarray) -> Tensor:
-        return observed(seen, self._dtype, self._noise)
+        return to_observation(seen, self._dtype, self._noise)
 
 
-def observed(seen: np.ndarray, dtype: torch.dtype, noise: ObservationNoise | None) -> Tensor:
-    """What the policy gets of an observation: a copy, as a simulator may write into its own."""
+def to_observation(seen: np.ndarray, dtype: torch.dtype, noise: ObservationNoise | None) -> Tensor:
+    """Converts an observation to a tensor with noise, a copy: simulators may reuse their array."""
     if noise is None:
         return torch.tensor(seen, dtype=dtype)
-    return noisy(noise, torch.as_tensor(seen, dtype=dtype))
+    return add_noise(noise, torch.as_tensor(seen, dtype=dtype))
 
 
 def generator_states(gymnasium: Env, noise: ObservationNoise | None) -> dict[str, Any]:
-    """The states of a simulator's random generator and of its noise's, where there is noise."""
+    """Returns the states of the random generators of a simulator and its noise."""
     return {
         "simulator": json.dumps(gymnasium.unwrapped.np_random.bit_generator.state),
         "noise": None if noise is None else noise.get_extra_state(),
@@ -214,14 +215,14 @@ def generator_states(gymnasium: Env, noise: ObservationNoise | None) -> dict[str
 def set_generator_states(
     gymnasium: Env, noise: ObservationNoise | None, states: Mapping[str, Any]
 ) -> None:
-    """Restores what :func:`generator_states` gave."""
+    """Restores states of :func:`generator_states`."""
     gymnasium.unwrapped.np_random.bit_generator.state = json.loads(states["simulator"])
     if noise is not None:
         noise.set_extra_state(states["noise"])
 
 
-def as_array(action: Tensor) -> np.ndarray:
-    """What the simulator gets of an action: a copy, as it may change it."""
+def copy_to_numpy(action: Tensor) -> np.ndarray:
+    """Converts an action to a NumPy array, a copy: simulators may change it."""
     return action.numpy().copy()
 
 
@@ -234,14 +235,23 @@ def play_episodes(
     sampled: bool = False,
     compile_policy: bool = False,
 ) -> Iterator[TensorDictBase]:
-    """Episodes ``[T]`` of a policy, by its mean or by samples; the environment stays open.
+    """Yields episodes ``[T]`` of a policy. The environment stays open.
 
-    The arguments are those of :func:`~torchrl_l2c2.experiment.evaluate_policy`. An environment
-    that :class:`EpisodeCollector` refuses is played by its own ``rollout``, with the policy as it
-    is.
+    Environments that :class:`EpisodeCollector` does not support are played by their own
+    ``rollout``, without compilation.
+
+    Args:
+        policy (TensorDictModule): Policy that reads ``"observation"``.
+        env (EnvBase): Environment.
+        episodes (int): Number of episodes.
+
+    Keyword Args:
+        max_steps (int): Maximum frames per episode.
+        sampled (bool): Whether actions are sampled. Default ``False``: mean actions.
+        compile_policy (bool): Whether to compile the policy. Default ``False``.
 
     Raises:
-        SimulatorError: the environment or the policy failed; names the episode.
+        SimulatorError: If the environment or the policy fails; states the episode.
     """
     exploration = ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC
     collector: EpisodeCollector | None = None
@@ -255,13 +265,13 @@ def play_episodes(
         )
     try:
         for number in range(1, episodes + 1):
-            with simulating(f"the task failed in test episode {number}"):
+            with simulator_errors(f"the task failed in test episode {number}"):
                 if collector is None:
                     with torch.no_grad(), set_exploration_type(exploration):
                         episode = env.rollout(max_steps, policy)
                 else:
                     episode = collector.rollout()
-                    if not episode["next", "done"][-1].any():  # No end of the environment's own.
+                    if not episode["next", "done"][-1].any():  # Ended by max_steps only.
                         collector.reset()
             yield episode
     finally:
@@ -270,16 +280,16 @@ def play_episodes(
 
 
 def simulator_and_noise(env: EnvBase) -> tuple[GymWrapper, ObservationNoise | None]:
-    """The two parts of an environment.
+    """Returns the simulator and the noise of an environment; ``None`` without noise.
 
     Raises:
-        ValueError: there are other parts.
+        ValueError: If the environment is batched or has other transforms.
     """
     parts = _parts(env)
     if parts is None:
         raise ValueError(
-            "Expected one Gymnasium environment with no transform but ObservationNoise, got "
-            f"{env}. Use TorchRL's Collector for others."
+            "Expected one Gymnasium environment with no transform except ObservationNoise, got "
+            f"{env}. Use TorchRL's Collector for other environments."
         )
     return parts
 

@@ -1,4 +1,4 @@
-"""What is played: episodes, checked and measured."""
+"""Playing and measuring an agent's training episodes."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from torchrl_l2c2.experiment.agents.agent import Agent
 from torchrl_l2c2.experiment.collect.episodes import EpisodeCollector
 from torchrl_l2c2.experiment.collect.rollouts import RolloutCollector
 from torchrl_l2c2.experiment.collect.workers import MultiEpisodeCollector
-from torchrl_l2c2.experiment.envs.environments import simulating
+from torchrl_l2c2.experiment.envs.environments import simulator_errors
 from torchrl_l2c2.experiment.envs.frames import Frame, check_finite, stack_frames
 from torchrl_l2c2.metrics import action_variation
 
 Played = TypeVar("Played")
 
-# Of every episode, by their names in metrics.csv.
+# Metrics of an episode, by their names in metrics.csv.
 EPISODE_COLUMNS = ("return", "action_variation", "policy_scale", "length")
 
 
 @dataclass
 class Episode:
-    """An episode and what was measured of it.
+    """An episode and its metrics.
 
     Attributes:
-        transitions: of the whole episode, ``[T]``.
-        last_frame: frames of the run up to and with its last.
-        measures: return, smoothness of the policy's mean, length.
-        ends_round: whether no other episode was played with the same policy after it.
+        transitions: Transitions ``[T]`` of the whole episode.
+        last_frame: Number of frames of the run at the end of the episode.
+        measures: Metrics by name: return, smoothness of the mean actions, length.
+        ends_round: Whether it is the last episode of this policy.
     """
 
     transitions: TensorDictBase
@@ -44,15 +44,15 @@ class Episode:
 
 
 class Player:
-    """Plays an agent's episodes, and measures and counts what is played.
+    """Plays an agent's episodes, measures them, and counts the frames.
 
     Args:
-        collector: plays, as :func:`~.workers.make_collector` makes it.
-        agent (Agent): whose policy it plays.
-        env_id (str): for errors.
+        collector: Collector of :func:`~.workers.make_collector`.
+        agent (Agent): Agent whose policy the collector plays.
+        env_id (str): Name of the task, for errors.
 
     Attributes:
-        frames: played so far.
+        frames: Number of frames so far.
     """
 
     def __init__(
@@ -67,56 +67,56 @@ class Player:
         self._env_id = env_id
 
     def play(self) -> list[Episode]:
-        """One episode of every process, all by the policy as it is now.
+        """Plays one episode in every process with the current policy.
 
         Raises:
-            FloatingPointError: NaN or infinity in what the environment or the policy gave.
-            SimulatorError: the environment failed.
+            FloatingPointError: If the environment or the policy returns NaN or infinity.
+            SimulatorError: If the environment fails.
         """
         last_frame, batches = self.frames, self._batches()
         episodes = []
         for batch in batches:
             last_frame += batch.numel()
-            episodes.append(self.measured(batch, last_frame, ends_round=batch is batches[-1]))
+            episodes.append(self.measure(batch, last_frame, ends_round=batch is batches[-1]))
         return episodes
 
     def play_rollout(self) -> tuple[list[TensorDictBase], list[Episode]]:
-        """The next frames ``[T]`` of every simulator, and the episodes that ended in them.
+        """Plays a rollout: the next frames ``[T]`` of every simulator, and the finished episodes.
 
         Raises:
-            FloatingPointError: as :meth:`play`.
-            SimulatorError: as :meth:`play`.
+            FloatingPointError: As :meth:`play`.
+            SimulatorError: As :meth:`play`.
         """
-        assert isinstance(self.collector, RolloutCollector)  # The settings see to it.
+        assert isinstance(self.collector, RolloutCollector)  # Ensured by the settings.
         first_frame, batches = self.frames, self._batches()
-        ended = self.collector.ended
+        finished = self.collector.finished_episodes
         episodes = [
-            self.measured(e.transitions, first_frame + e.frame, ends_round=e is ended[-1])
-            for e in ended
+            self.measure(e.transitions, first_frame + e.frame, ends_round=e is finished[-1])
+            for e in finished
         ]
         return batches, episodes
 
     def step(self) -> Frame:
-        """The next frame of the one episode that is being played.
+        """Plays the next frame of the current episode.
 
         Raises:
-            FloatingPointError: as :meth:`play`.
-            SimulatorError: as :meth:`play`.
+            FloatingPointError: As :meth:`play`.
+            SimulatorError: As :meth:`play`.
         """
-        assert isinstance(self.collector, EpisodeCollector)  # The settings see to it.
+        assert isinstance(self.collector, EpisodeCollector)  # Ensured by the settings.
         frame = self._simulate(self.collector.step)
         if not frame.is_finite():
             check_finite(stack_frames([frame]), self.frames)
         self._count(1)
         return frame
 
-    def drop_episode(self) -> None:
-        """What :meth:`step` has played of an episode is of none; the next frame begins another."""
+    def discard_episode(self) -> None:
+        """Discards the unfinished episode of :meth:`step`. The next frame starts a new one."""
         assert isinstance(self.collector, EpisodeCollector)
         self.collector.reset()
 
     def _batches(self) -> list[TensorDictBase]:
-        """What the collector plays at once, checked and counted."""
+        """Plays, checks and counts the collector's next batches."""
         played = self._simulate(self.collector.rollout)
         batches, last_frame = played if isinstance(played, list) else [played], self.frames
         for batch in batches:
@@ -126,7 +126,7 @@ class Player:
         return batches
 
     def _simulate(self, play: Callable[[], Played]) -> Played:
-        with simulating(f"{self._env_id} failed beyond frame {self.frames}"):
+        with simulator_errors(f"{self._env_id} failed after frame {self.frames}"):
             return play()
 
     def _count(self, frames: int) -> None:
@@ -135,13 +135,20 @@ class Player:
             self._agent.exploration.step(frames)
 
     @torch.no_grad()
-    def measured(
+    def measure(
         self, transitions: TensorDictBase, last_frame: int, *, ends_round: bool = True
     ) -> Episode:
-        """An episode with its return and, at its states, the smoothness of the policy's mean.
+        """Measures the return of an episode and the smoothness of the mean actions at its states.
 
-        With the mean scale of a stochastic policy: the Hellinger distance is relative to it, so a
-        policy can satisfy L2C2 by becoming wider.
+        Also measures the mean scale of a stochastic policy: the Hellinger distance is relative to
+        it, so a larger scale also lowers the penalty of L2C2.
+
+        Args:
+            transitions (TensorDictBase): Transitions ``[T]`` of the whole episode.
+            last_frame (int): Number of frames of the run at the end of the episode.
+
+        Keyword Args:
+            ends_round (bool): Whether it is the last episode of this policy. Default ``True``.
         """
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             written = self._agent.policy(transitions.select("observation"))

@@ -1,4 +1,4 @@
-"""Rollouts of a fixed length from several simulators, which episodes may outlast."""
+"""Rollouts of a fixed length from several simulators."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
 from torchrl_l2c2.experiment.agents._torchrl_internals import simulator_of
-from torchrl_l2c2.experiment.collect.acting import on_tensors
+from torchrl_l2c2.experiment.collect.acting import policy_function
 from torchrl_l2c2.experiment.collect.episodes import (
     generator_states,
-    observed,
     set_generator_states,
     simulator_and_noise,
+    to_observation,
 )
-from torchrl_l2c2.experiment.envs.frames import PREVIOUS, Frame, as_reward, stack_frames
+from torchrl_l2c2.experiment.envs.frames import PREVIOUS, Frame, reward_to_float, stack_frames
 
 
-class Ended(NamedTuple):
+class FinishedEpisode(NamedTuple):
     """An episode that ended in a rollout.
 
     Attributes:
-        frame: of the rollout, counted over all simulators, after which it had ended.
-        transitions: of the whole episode, ``[T]``.
+        frame: Number of frames of the rollout, over all simulators, at the end of the episode.
+        transitions: Transitions ``[T]`` of the whole episode.
     """
 
     frame: int
@@ -37,33 +37,35 @@ class Ended(NamedTuple):
 
 
 class RolloutCollector:
-    """Plays several Gymnasium simulators in this process with one policy, a frame of each in turn.
+    """Steps several Gymnasium simulators in one process with one policy, in turn.
 
-    The policy is called once for all of them. A rollout is cut where it is full: the next
-    one continues the episode, and the last ``("next", "observation")`` of a simulator is
-    what to bootstrap from. After an end it is the last observation of the episode, too, and not the
-    first one of the next.
+    The policy is called once per step for all simulators. Episodes may extend over several
+    rollouts. ``("next", "observation")`` of a simulator's last frame is the observation for
+    bootstrapping. At the end of an episode it is the episode's last observation, not the first of
+    the next.
 
-    An episode in the middle can be saved, though its simulator cannot: it is played again from the
-    state of the random generators that it began with, by the actions that were taken.
+    Unfinished episodes can be saved: on loading, the simulator repeats the actions from the initial
+    states of the random generators.
 
     Args:
-        envs (sequence of EnvBase): one for each simulator, as
-            :class:`~torchrl_l2c2.experiment.EpisodeCollector` takes them, each seeded by itself.
-        policy (TensorDictModule): reads ``"observation"`` ``[N, F]``. Its actions are clipped into
-            their bounds for the simulators, and kept as they are.
+        envs (sequence of EnvBase): One environment per simulator, each with its own seed, as for
+            :class:`~torchrl_l2c2.experiment.EpisodeCollector`.
+        policy (TensorDictModule): Policy that reads ``"observation"`` ``[N, F]``. Simulators get
+            actions clipped to their bounds; frames contain the unclipped actions.
 
     Keyword Args:
-        frames_per_batch (int): of a rollout, a multiple of the number of environments.
-        compile_policy (bool): whether to compile the policy. Default ``False``.
-        exploration_type (ExplorationType): default ``RANDOM``.
-        keep_previous (bool): as for :class:`~torchrl_l2c2.experiment.EpisodeCollector`.
+        frames_per_batch (int): Frames per rollout over all simulators, a multiple of the number of
+            environments.
+        compile_policy (bool): Whether to compile the policy. Default ``False``.
+        exploration_type (ExplorationType): Exploration type of the policy. Default ``RANDOM``.
+        keep_previous (bool): Whether frames contain the previous observation, as for
+            :class:`~torchrl_l2c2.experiment.EpisodeCollector`. Default ``False``.
 
     Attributes:
-        ended: the episodes that ended in the last rollout, in the order of their ends.
+        finished_episodes: Episodes that ended in the last rollout, in the order of their ends.
 
     Raises:
-        ValueError: an environment with transforms other than
+        ValueError: If an environment is batched or has other transforms than
             :class:`~torchrl_l2c2.ObservationNoise`.
 
     Examples:
@@ -74,7 +76,7 @@ class RolloutCollector:
         >>> collector = RolloutCollector(envs, actor, frames_per_batch=20)
         >>> [frames.shape for frames in collector.rollout()]
         [torch.Size([10]), torch.Size([10])]
-        >>> [(episode.frame, len(episode.transitions)) for episode in collector.ended]
+        >>> [(episode.frame, len(episode.transitions)) for episode in collector.finished_episodes]
         [(13, 7), (14, 7)]
         >>> collector.shutdown()
     """
@@ -97,14 +99,14 @@ class RolloutCollector:
         self._policy_keys = [key for key in policy.out_keys if not key.startswith("_")]
         self._streams = [_Stream(env, keep_previous) for env in envs]
         self._steps = frames_per_batch // len(envs)
-        self._act = on_tensors(policy, self._policy_keys, compile_policy)
+        self._act = policy_function(policy, self._policy_keys, compile_policy)
         self._exploration_type = exploration_type
-        self.ended: list[Ended] = []
+        self.finished_episodes: list[FinishedEpisode] = []
 
     @torch.no_grad()
     def rollout(self) -> list[TensorDictBase]:
-        """The next frames ``[T]`` of every simulator."""
-        self.ended = []
+        """Plays the next frames ``[T]`` of every simulator."""
+        self.finished_episodes = []
         played: list[list[Frame]] = [[] for _ in self._streams]
         with set_exploration_type(self._exploration_type):
             for step in range(self._steps):
@@ -117,18 +119,18 @@ class RolloutCollector:
                     )
                     if played[place][-1].done:
                         frame = step * len(self._streams) + place + 1
-                        self.ended.append(Ended(frame, stream.finish()))
+                        self.finished_episodes.append(FinishedEpisode(frame, stream.finish()))
         return [stack_frames(frames) for frames in played]
 
     def generator_state(self) -> dict[str, Any]:
-        """The random generators' states and the episodes that are being played."""
+        """Returns the states of the random generators, and the unfinished episodes."""
         return {"streams": {str(i): s.state_dict() for i, s in enumerate(self._streams)}}
 
     def set_generator_state(self, state: dict[str, Any]) -> None:
-        """Restores what :meth:`generator_state` gave, by playing the begun episodes again.
+        """Restores a state of :meth:`generator_state` by repeating the unfinished episodes.
 
         Warns:
-            UserWarning: a simulator came to another observation than it did; a new episode begins.
+            UserWarning: If a simulator reaches another observation. A new episode then starts.
         """
         for i, stream in enumerate(self._streams):
             stream.load_state_dict(state["streams"][str(i)])
@@ -140,7 +142,7 @@ class RolloutCollector:
 
 
 class _Stream:
-    """A simulator and the episode that it is in."""
+    """A simulator and its current episode."""
 
     def __init__(self, env: EnvBase, keep_previous: bool) -> None:
         simulator, self._noise = simulator_and_noise(env)
@@ -151,56 +153,56 @@ class _Stream:
         self._low, self._high = space.low, space.high
         self._observation: Tensor | None = None
         self._frames: list[Frame] = []
-        self._begun_with = self._generators()
+        self._initial_generators = self._generators()
 
     def observation(self) -> Tensor:
-        """The present one; an episode begins where there is none."""
+        """Returns the current observation, after a reset if no episode is in progress."""
         if self._observation is None:
-            self._begun_with = self._generators()
+            self._initial_generators = self._generators()
             self._observation = self._observe(self._gymnasium.reset()[0])
         return self._observation
 
     def step(self, outputs: dict[str, Tensor]) -> Frame:
-        """Takes the action in what the policy wrote; gives the frame."""
+        """Takes the policy's action, clipped to its bounds, and returns the frame."""
         before = self.observation()
-        taken = np.clip(outputs["action"].numpy(), self._low, self._high)
-        seen, reward, terminated, truncated, _ = self._gymnasium.step(taken)
+        action = np.clip(outputs["action"].numpy(), self._low, self._high)
+        seen, reward, terminated, truncated, _ = self._gymnasium.step(action)
         self._observation = self._observe(seen)
         if self._keep_previous:
             outputs[PREVIOUS] = self._frames[-1].observation if self._frames else before
-        earned = as_reward(reward)
-        frame = Frame(before, outputs, self._observation, earned, terminated, truncated)
+        reward = reward_to_float(reward)
+        frame = Frame(before, outputs, self._observation, reward, terminated, truncated)
         self._frames.append(frame)
         return frame
 
     def finish(self) -> TensorDictBase:
-        """The episode that has ended."""
+        """Returns the finished episode and prepares the next one."""
         episode = stack_frames(self._frames)
         self._observation, self._frames = None, []
         return episode
 
     def state_dict(self) -> dict[str, Any]:
-        """The generators' states at the episode's beginning, and what the policy wrote in it."""
+        """Returns the generators' states at the start of the episode, and the policy's outputs."""
         if not self._frames:
             return {"generators": self._generators(), "following": None, "outputs": {}}
         written = {key: [f.outputs[key] for f in self._frames] for key in self._frames[0].outputs}
         return {
-            "generators": self._begun_with,
-            "following": self._frames[-1].following,
+            "generators": self._initial_generators,
+            "following": self._frames[-1].next_observation,
             "outputs": {key: torch.stack(values) for key, values in written.items()},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores it: the simulator plays the same actions again."""
+        """Restores a state of :meth:`state_dict` by repeating the actions."""
         set_generator_states(self._gymnasium, self._noise, state["generators"])
         self._observation, self._frames = None, []
         outputs = state["outputs"]
         for row in zip(*(values.unbind(0) for values in outputs.values()), strict=True):
             self.step(dict(zip(outputs, row, strict=True)))
-        if self._frames and not self._frames[-1].following.equal(state["following"]):
+        if self._frames and not self._frames[-1].next_observation.equal(state["following"]):
             warnings.warn(
-                f"{self._env} plays an episode differently when it is played again: another one "
-                "begins instead, and the run is not the one that it would have been in one go.",
+                f"{self._env} is not reproducible: repeating an episode's actions led to another "
+                "observation. A new episode starts, and the run differs from an uninterrupted run.",
                 stacklevel=4,
             )
             self._observation, self._frames = None, []
@@ -211,7 +213,7 @@ class _Stream:
             self._env.close()
 
     def _observe(self, seen: np.ndarray) -> Tensor:
-        return observed(seen, self._dtype, self._noise)
+        return to_observation(seen, self._dtype, self._noise)
 
     def _generators(self) -> dict[str, Any]:
         return generator_states(self._gymnasium, self._noise)

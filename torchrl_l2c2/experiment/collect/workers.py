@@ -1,4 +1,4 @@
-"""Several processes that play episodes at once, with one policy."""
+"""Collectors for one simulator, several simulators, or several processes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,10 @@ from tensordict.nn import TensorDictModule
 from torchrl.collectors import MultiSyncCollector
 from torchrl.envs import EnvBase, ExplorationType
 
-from torchrl_l2c2.experiment.agents._torchrl_internals import end_weight_senders, keep_no_buffers
+from torchrl_l2c2.experiment.agents._torchrl_internals import (
+    disable_buffers,
+    shut_down_weight_senders,
+)
 from torchrl_l2c2.experiment.agents.agent import Agent
 from torchrl_l2c2.experiment.collect.episodes import EpisodeCollector
 from torchrl_l2c2.experiment.collect.rollouts import RolloutCollector
@@ -29,21 +32,30 @@ from torchrl_l2c2.experiment.envs.environments import make_env, time_limit
 from torchrl_l2c2.experiment.errors import ChildFailedError
 from torchrl_l2c2.experiment.settings.config import ExperimentConfig
 
-# Between the seeds of a run's simulators: far enough for no run to have another's.
-SEEDS_APART = 15_485_863
+# Distance of the seeds of a run's simulators: large enough to differ from other runs' seeds.
+SEED_STRIDE = 15_485_863
 
 
 def make_collector(
     config: ExperimentConfig, env: EnvBase, agent: Agent, *, compile: bool
 ) -> EpisodeCollector | MultiEpisodeCollector | RolloutCollector:
-    """What plays a run's episodes: this process, or as many others as the settings say."""
+    """Creates the collector of a run.
+
+    Args:
+        config (ExperimentConfig): Settings of the run.
+        env (EnvBase): Environment of the task, which several processes do not use.
+        agent (Agent): Agent whose policy acts.
+
+    Keyword Args:
+        compile (bool): Whether to compile the policy.
+    """
     options: dict[str, Any] = {
         "compile_policy": compile,
         "keep_previous": config.regularizer.reads_previous,
     }
     algorithm = config.algorithm
     if algorithm.num_envs is not None:
-        seeds = (config.seed + SEEDS_APART * i for i in range(1, algorithm.num_envs))
+        seeds = (config.seed + SEED_STRIDE * i for i in range(1, algorithm.num_envs))
         envs = [env, *(make_env(config.task, seed) for seed in seeds)]
         return RolloutCollector(envs, agent.policy, frames_per_batch=algorithm.frames, **options)
     options["random_frames"] = algorithm.random_frames
@@ -61,33 +73,36 @@ def make_collector(
 
 
 class MultiEpisodeCollector(MultiSyncCollector):
-    """An :class:`EpisodeCollector` in each of several processes, which play an episode at a time.
+    """Several processes with an :class:`EpisodeCollector` each, which play one episode per round.
 
-    Episodes depend on the seed, the number of rounds played before and their place in the round,
-    not on how fast a process is: after :meth:`set_generator_state` they are the same again.
+    Episodes depend on the seed, the round and the process's index, not on timing. They are
+    reproducible after :meth:`set_generator_state`.
 
-    .. note:: The processes import the script that made them: as everywhere in multiprocessing, it
-        needs ``if __name__ == "__main__":`` around what it does. Notebooks do not.
+    .. note:: The processes import the script that created them. As always with multiprocessing,
+        scripts need ``if __name__ == "__main__":``. Notebooks do not.
 
     Args:
-        create_env (callable): makes an environment as :class:`EpisodeCollector` takes it; pickled.
-        policy (TensorDictModule): reads ``"observation"``; its current parameters are sent to the
-            processes before every round.
+        create_env (callable): Function without arguments that returns an environment for
+            :class:`EpisodeCollector`. It must be picklable.
+        policy (TensorDictModule): Policy that reads ``"observation"``. Its current parameters are
+            sent to the processes before every round.
 
     Keyword Args:
-        num_workers (int): processes. More give more frames a second, up to the number of cores,
-            and play more episodes with one policy.
-        max_steps (int): frames of the longest episode.
-        seed (int): of all randomness in the processes, the policy's included. Default 0.
-        compile_policy (bool): as for :class:`EpisodeCollector`, in every process.
-        random_frames (int): rounds that begin before so many frames draw their actions from the
-            action's bounds. Default 0.
-        exploration_type (ExplorationType): default ``RANDOM``.
-        keep_previous (bool): as for :class:`EpisodeCollector`. Default ``False``.
+        num_workers (int): Number of processes. More processes play more frames per second, up to
+            the number of cores, and more episodes with the same policy.
+        max_steps (int): Maximum frames per episode.
+        seed (int): Seed of all random numbers in the processes, including the policy's. Default 0.
+        compile_policy (bool): Whether to compile the policy in every process, as for
+            :class:`EpisodeCollector`. Default ``False``.
+        random_frames (int): Number of first frames with actions sampled uniformly from their
+            bounds. A round that starts before this number is entirely random. Default 0.
+        exploration_type (ExplorationType): Exploration type of the policy. Default ``RANDOM``.
+        keep_previous (bool): Whether frames contain the previous observation, as for
+            :class:`EpisodeCollector`. Default ``False``.
 
     Raises:
-        RuntimeError: an environment or a policy failed in a process.
-        ChildFailedError: a process died.
+        RuntimeError: If an environment or a policy fails in a process.
+        ChildFailedError: If a process dies.
 
     Examples:
         >>> from functools import partial
@@ -117,11 +132,11 @@ class MultiEpisodeCollector(MultiSyncCollector):
         exploration_type: ExplorationType = ExplorationType.RANDOM,
         keep_previous: bool = False,
     ) -> None:
-        # Python would wait for the processes to end before it ends itself.
+        # Otherwise Python would wait for the processes at exit.
         self._at_exit = partial(_shut_down, weakref.ref(self))
         atexit.register(self._at_exit)
         self._seed = seed
-        # A worker that fails leaves its error here: TorchRL says only that one has failed.
+        # Failing workers store their errors here; TorchRL reports only that a worker failed.
         self._failures = tempfile.TemporaryDirectory()
         super().__init__(
             [create_env] * num_workers,
@@ -146,33 +161,33 @@ class MultiEpisodeCollector(MultiSyncCollector):
         self._rounds_played = 0
 
     def generator_state(self) -> dict[str, Any]:
-        """The state that the following episodes depend on, without the policy."""
+        """Returns the state that determines the next episodes, except for the policy."""
         return {"rounds_played": self._rounds_played, "frames": self._frames}
 
     def set_generator_state(self, state: dict[str, Any]) -> None:
-        """Restores what :meth:`generator_state` gave."""
+        """Restores a state of :meth:`generator_state`."""
         self._rounds_played, self._frames = state["rounds_played"], state["frames"]
 
     def shutdown(self, *args: Any, **kwargs: Any) -> None:
-        """Ends the processes; nothing can be collected any more."""
+        """Ends the processes. The collector cannot be used afterwards."""
         atexit.unregister(self._at_exit)
         super().shutdown(*args, **kwargs)
-        end_weight_senders(self)
+        shut_down_weight_senders(self)
 
     def rollout(self) -> list[TensorDictBase]:
-        """One episode of every process, as :meth:`EpisodeCollector.rollout` gives them."""
+        """Plays one episode in every process, as :meth:`EpisodeCollector.rollout`."""
         self._rounds = self._rounds or iter(self)
         try:
             self.set_seed(self._round_seed())
             episodes = next(self._rounds).unbind(0)
         except (OSError, EOFError, ValueError, RuntimeError) as error:
-            # Pipes and process handles of one that died fail in their own ways.
+            # Pipes and handles of a dead process raise different errors.
             for path in Path(self._failures.name).iterdir():
-                told, lines = json.loads(path.read_text())
+                message, lines = json.loads(path.read_text())
                 cause = RuntimeError(f"in the worker:\n{lines}")
-                raise RuntimeError(f"a worker process died ({told}).") from cause
-            told = f"{type(error).__name__}: {error}"
-            raise ChildFailedError(f"a worker process died ({told}).") from error
+                raise RuntimeError(f"a worker process died ({message}).") from cause
+            message = f"{type(error).__name__}: {error}"
+            raise ChildFailedError(f"a worker process died ({message}).") from error
         self._rounds_played += 1
         return [episode.exclude("collector") for episode in episodes]
 
@@ -182,7 +197,7 @@ class MultiEpisodeCollector(MultiSyncCollector):
 
 
 class _EpisodeWorker(EpisodeCollector):
-    """What a process of :class:`MultiEpisodeCollector` runs."""
+    """Collector in a process of :class:`MultiEpisodeCollector`."""
 
     def __init__(
         self,
@@ -191,7 +206,7 @@ class _EpisodeWorker(EpisodeCollector):
         policy_factory: Callable[[], TensorDictModule],
         frames_per_batch: int,
         exploration_type: ExplorationType,
-        compiled_policy: bool,  # TorchRL has a compile_policy of its own, by torch.compile.
+        compiled_policy: bool,  # TorchRL's compile_policy means torch.compile.
         keep_previous: bool,
         failures: str | None = None,
         **_: Any,
@@ -206,20 +221,20 @@ class _EpisodeWorker(EpisodeCollector):
             exploration_type=exploration_type,
             keep_previous=keep_previous,
         )
-        keep_no_buffers(self)
+        disable_buffers(self)
 
     def rollout(self) -> TensorDictBase:
-        # The parent sets it for a round that is to be random, all of it or nothing.
+        # The parent sets init_random_frames for a random round; a round is random as a whole.
         self._random_frames_left = self.frames_per_batch if self.init_random_frames > 0 else 0
         try:
             episode = super().rollout()
         except Exception as error:
             if self._failures is not None:
-                left = Path(self._failures, str(os.getpid()))
-                told = f"{type(error).__name__}: {error}"
-                left.write_text(json.dumps([told, traceback.format_exc()]))
+                file = Path(self._failures, str(os.getpid()))
+                message = f"{type(error).__name__}: {error}"
+                file.write_text(json.dumps([message, traceback.format_exc()]))
             raise
-        # The parent counts frames by this entry.
+        # The parent counts frames with this entry.
         return episode.set(("collector", "traj_ids"), torch.zeros(len(episode), dtype=torch.int64))
 
 
@@ -229,5 +244,5 @@ def _shut_down(collector: weakref.ref[MultiEpisodeCollector]) -> None:
 
 
 def _leave_signals_to_parent() -> None:
-    """Ctrl-C reaches all processes; the parent lets the episodes end and saves them."""
+    """Ignores Ctrl-C, which reaches all processes: the parent finishes and saves the episodes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -18,7 +18,12 @@ from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 from tqdm import tqdm
 
 from torchrl_l2c2.experiment.collect.episodes import EpisodeCollector, play_episodes
-from torchrl_l2c2.experiment.envs.environments import TEST_SEED, make_env, simulating, time_limit
+from torchrl_l2c2.experiment.envs.environments import (
+    TEST_SEED,
+    make_env,
+    simulator_errors,
+    time_limit,
+)
 from torchrl_l2c2.experiment.envs.frames import check_finite
 from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.run.process import ProcessState
@@ -150,7 +155,7 @@ def evaluate_policy(
         actions = mean_actions(policy, episode) if sampled else episode["action"]
         returns.append(_return(episode))
         variations.append(_variation(actions))
-        taken = getattr(policy, "taken", lambda samples: samples)(episode["action"])
+        taken = getattr(policy, "clip_action", lambda samples: samples)(episode["action"])
         played = {"": actions, "sampled_": taken} if sampled else {"": actions}
         for prefix, kind in played.items():
             for name, value in measure(kind, env.action_spec).items():
@@ -255,7 +260,7 @@ class LateTests:
             if self._collector is None:
                 self._collector = self._make_collector()
             self._collector.set_seed(self._seed + number)
-            with simulating(f"{self._task.env_id} failed in the test after episode {number}"):
+            with simulator_errors(f"{self._task.env_id} failed in the test after episode {number}"):
                 episode = self._collector.rollout()
         check_finite(episode, 0, test=True)
         figures = _return(episode), _variation(episode["action"])

@@ -16,7 +16,7 @@ from torchrl_l2c2.experiment.collect.player import Episode, Player
 from torchrl_l2c2.experiment.collect.workers import make_collector
 from torchrl_l2c2.experiment.envs.environments import TEST_SEED, make_env
 from torchrl_l2c2.experiment.learn.compilation import compiler_available
-from torchrl_l2c2.experiment.learn.learner import Learner, untrained
+from torchrl_l2c2.experiment.learn.learner import Learner, untrained_reason
 from torchrl_l2c2.experiment.learn.replay import make_replay
 from torchrl_l2c2.experiment.run.best_policy import BestPolicy
 from torchrl_l2c2.experiment.run.checkpoints import save_checkpoint
@@ -229,7 +229,7 @@ class Experiment:
         learner.unreported = list(state["unreported"])
         self.metrics = json.loads(state["metrics"])
         # Some of the tensors that a compiled update was made for are others now.
-        learner.renew()
+        learner.rebuild_update()
         self._process.load_state_dict(state["global_rng"])
 
     def test(
@@ -315,7 +315,7 @@ class Experiment:
 
     def _untrained(self) -> str | None:
         random_frames = self.config.algorithm.random_frames
-        return untrained(self.player.frames, self.learner.updates, random_frames)
+        return untrained_reason(self.player.frames, self.learner.updates, random_frames)
 
     def _spent(self, budget: Budget) -> int:
         return budget.spent(len(self.metrics), self.player.frames)

@@ -53,7 +53,7 @@ class GainControl:
                 self._config.gain_target, self._config.gain_rate, self._config.gain_limit
             )
             # This gain rises by itself until it has an effect.
-            learner.tells_faint_regularizer = False
+            learner.warns_weak_regularizer = False
         self._apply()
 
     def after(

@@ -26,9 +26,9 @@ def by_step(player: Player, learner: Learner, algorithm: OffPolicyConfig) -> Ite
                 learner.remember_frame(frames[-1])
                 _learn(learner, algorithm, 1, player.frames)
         except KeyboardInterrupt:
-            player.drop_episode()
+            player.discard_episode()
             raise
-        yield player.measured(stack_frames(frames), player.frames)
+        yield player.measure(stack_frames(frames), player.frames)
 
 
 def by_episode(player: Player, learner: Learner, algorithm: OffPolicyConfig) -> Iterator[Episode]:
@@ -74,7 +74,7 @@ def by_cut_rollout(
             learner.remember(frames)
         learner.learn_rollout(algorithm.epochs)
         if normalization is not None:
-            normalization.follow()
+            normalization.apply_statistics()
             learner.agent.refresh_policy()
         yield from episodes or (None,)
 
