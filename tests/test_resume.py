@@ -32,7 +32,7 @@ from torchrl_l2c2.experiment import (
     UniformReplayConfig,
 )
 from torchrl_l2c2.experiment.analysis.reports import find_runs, finished_run, read_runs
-from torchrl_l2c2.experiment.cli.train import _end_logged, run
+from torchrl_l2c2.experiment.cli.train import _log_errors, run
 from torchrl_l2c2.experiment.errors import OtherRunError, warnings_as_lines
 from torchrl_l2c2.experiment.run.checkpoints import (
     CheckpointError,
@@ -43,7 +43,7 @@ from torchrl_l2c2.experiment.run.checkpoints import (
 from torchrl_l2c2.experiment.run.continuation import check_same_settings
 from torchrl_l2c2.experiment.run.files import write_json
 from torchrl_l2c2.experiment.run.policies import load_policy
-from torchrl_l2c2.experiment.run.progress import say
+from torchrl_l2c2.experiment.run.progress import show_and_log
 from torchrl_l2c2.experiment.settings.config import GROUPS
 from torchrl_l2c2.experiment.settings.identity import fingerprint
 from torchrl_l2c2.experiment.settings.naming import run_name
@@ -484,7 +484,7 @@ def test_a_setting_that_a_checkpoint_does_not_know_is_named(tmp_path):
     """One of an earlier release, before there was such a setting."""
     saved = small().to_dict()
     del saved["num_workers"]
-    with pytest.raises(OtherRunError, match=r"made with num_workers=none, as it is .*, not 1:"):
+    with pytest.raises(OtherRunError, match=r"made with num_workers=none .*, not 1:"):
         check_same_settings(saved, small().to_dict())
 
 
@@ -544,7 +544,7 @@ def test_a_full_disk_names_the_file_and_the_last_good_checkpoint(tmp_path, monke
 
 def test_a_warning_is_a_line_in_the_log_too(tmp_path, capsys):
     """And not Python's, with a line of its source."""
-    with warnings_as_lines(partial(say, tmp_path)):
+    with warnings_as_lines(partial(show_and_log, tmp_path)):
         warnings.warn("hardly regularized", stacklevel=1)
     assert capsys.readouterr().err == "warning: hardly regularized\n"
     assert (tmp_path / "train.log").read_text().endswith(" warning: hardly regularized\n")
@@ -553,7 +553,7 @@ def test_a_warning_is_a_line_in_the_log_too(tmp_path, capsys):
 def test_an_error_that_there_is_no_room_to_log_is_told(tmp_path):
     """And not that of the log in its place."""
     (tmp_path / "train.log").mkdir()
-    with pytest.raises(ValueError, match="its own"), _end_logged(tmp_path):
+    with pytest.raises(ValueError, match="its own"), _log_errors(tmp_path):
         raise ValueError("its own")
 
 
