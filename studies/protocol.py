@@ -94,7 +94,7 @@ def score_table(found: Sequence[Reading]) -> Table:
     rows = []
     for reading in found:
         first = reading.vanilla.first
-        others = [f"{name}={value}" for name, value in first.settings_of_any_length.items()]
+        others = [f"{name}={value}" for name, value in first.settings_without_length.items()]
         start = [first.task, " ".join(others) or "the defaults", first.length]
         seeds = list(dict.fromkeys(number_range(g.seeds) for g in (reading.vanilla, reading.caps)))
         for test in ("late_mean", "late_sampled"):

@@ -49,7 +49,7 @@ from torchrl_l2c2.experiment.cli.diagnose import main
 from torchrl_l2c2.experiment.errors import SimulatorError
 from torchrl_l2c2.experiment.learn.learner import Learner
 from torchrl_l2c2.experiment.learn.replay import make_replay
-from torchrl_l2c2.experiment.run.files import make_folder_of, write_json
+from torchrl_l2c2.experiment.run.files import make_parent_folder, write_json
 from torchrl_l2c2.metrics import action_variation, previous_action_gain
 
 STEPS = torch.arange(100.0)
@@ -574,7 +574,7 @@ class TestCommand:
 
         def folder(name, **settings):
             path = tmp_path / name / "config.json"
-            make_folder_of(path)
+            make_parent_folder(path)
             write_json(path, ExperimentConfig(**settings).to_dict())
             return str(tmp_path / name)
 
@@ -610,7 +610,7 @@ class TestCommand:
             with pytest.raises(SystemExit):
                 main([str(run), str(tmp_path), *wrong])
             assert message in capsys.readouterr().err
-        with pytest.raises(SystemExit, match=r"^error: '.*' is not the folder of a run"):
+        with pytest.raises(SystemExit, match=r"^error: '.*' is not a run folder"):
             main([str(tmp_path)])
         for name in ("a", "b/seed_1", "b/seed_0"):
             (tmp_path / "above" / name).mkdir(parents=True)

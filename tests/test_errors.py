@@ -9,7 +9,7 @@ import torch
 from processes import ROOT, run_train
 
 from torchrl_l2c2.experiment.cli.main import main
-from torchrl_l2c2.experiment.cli.train import _tell
+from torchrl_l2c2.experiment.cli.train import _print_error
 from torchrl_l2c2.experiment.errors import (
     MissingPackageError,
     SimulatorError,
@@ -43,7 +43,7 @@ BUGS = [
 @pytest.mark.parametrize("error", TOLD, ids=lambda error: type(error).__name__)
 def test_what_a_user_can_mend_is_one_line(error, capsys):
     """In the command that trains, and in all others."""
-    assert str(error) in _tell(error)
+    assert str(error) in _print_error(error)
     assert capsys.readouterr().err.startswith(f"error: {error}")
     with pytest.raises(SystemExit) as ended, one_line_errors():
         raise error
@@ -55,14 +55,14 @@ def test_a_bug_is_a_traceback(error, capsys):
     """Only its first line is kept for a sweep's end."""
     with pytest.raises(type(error)), one_line_errors():
         raise error
-    assert _tell(error) == f"{type(error).__name__}: {error}"
+    assert _print_error(error) == f"{type(error).__name__}: {error}"
     told = capsys.readouterr().err
     assert told.startswith("Traceback (most recent call last):") and "error: " not in told
 
 
 def test_an_error_without_a_text_has_its_name():
     """For a sweep's end."""
-    assert _tell(AssertionError()) == "AssertionError"
+    assert _print_error(AssertionError()) == "AssertionError"
 
 
 def too_large(size):
@@ -79,7 +79,7 @@ def too_large(size):
 def test_too_little_memory_is_told_with_the_settings_that_need_it(error):
     """PyTorch's own errors on the CPU are plain RuntimeErrors."""
     error = too_large(error) if isinstance(error, int) else error
-    told = _tell(error)
+    told = _print_error(error)
     assert "There is no memory for it: choose smaller algorithm.hidden, replay.capacity" in told
 
 

@@ -520,7 +520,7 @@ def test_a_run_from_the_command_line_leaves_everything_behind(tmp_path):
     assert "finished before: its results follow" in again.stdout
     assert "finished before" not in finished.stdout
     assert "mean of the last 3 episodes: return " in finished.stderr
-    assert "evaluate_every=1 changes nothing: it is of training, which is over" in again.stderr
+    assert "evaluate_every=1 has no effect: training is over" in again.stderr
     assert (run.folder / "learning_curves.png").exists()
 
 

@@ -31,7 +31,7 @@ from torchrl_l2c2.experiment.cli.composition import (
     check_budget,
     check_folders,
     check_preset,
-    preset_used,
+    describe_preset,
 )
 from torchrl_l2c2.experiment.cli.manual import manual, page
 from torchrl_l2c2.experiment.settings.config import GROUPS
@@ -351,7 +351,7 @@ def test_a_regularizer_begins_with_the_preset_of_the_algorithm(name, algorithm):
         assert getattr(config.regularizer, setting) == value
     ramped = own.get("gain", "constant" if table.ramp is None else "ramp") == "ramp"
     assert config.regularizer.ramped == ramped
-    told = preset_used(config)
+    told = describe_preset(config)
     assert all(f"{setting}={value}" in told for setting, value in table.settings.items())
     assert (table.evidence or "its authors' settings") in told
     stronger = ExperimentConfig.from_dict(composed(*chosen, "regularizer.strength=0.5"))
@@ -362,12 +362,14 @@ def test_l2c2_paper_begins_with_the_papers_settings():
     """With any algorithm."""
     paper = ExperimentConfig.from_dict(composed("algorithm=sac", "regularizer=l2c2_paper"))
     assert dataclasses.replace(paper.regularizer, name="l2c2") == L2C2Config()
-    assert preset_used(paper) is None and preset_settings("l2c2_paper", "sac") == {}
+    assert describe_preset(paper) is None and preset_settings("l2c2_paper", "sac") == {}
 
 
 def test_an_algorithm_without_a_preset_is_reported():
     """Q-learning has none."""
-    told = preset_used(ExperimentConfig.from_dict(composed("algorithm=dqn", "regularizer=l2c2")))
+    told = describe_preset(
+        ExperimentConfig.from_dict(composed("algorithm=dqn", "regularizer=l2c2"))
+    )
     assert "there is no preset for dqn" in told
 
 

@@ -354,7 +354,7 @@ def test_discrete_actions_that_start_elsewhere_are_those_of_the_task(monkeypatch
 def test_actions_that_are_no_vector_are_refused(monkeypatch, action):
     """In one line that says what may be."""
     still(monkeypatch, action=action)
-    with pytest.raises(ValueError, match="actions must be one vector of floats or one Discrete"):
+    with pytest.raises(ValueError, match="must be one vector of floats or Discrete"):
         make_env(task(), 0)
 
 
@@ -379,7 +379,7 @@ def test_an_episode_is_as_long_as_the_task_is_registered():
 
 def test_a_task_without_a_limit_needs_one():
     """In one line with the setting's name."""
-    with pytest.raises(ValueError, match=r"without a limit of its episodes: set task\.max_steps"):
+    with pytest.raises(ValueError, match=r"without a time limit: set task\.max_steps"):
         make_env(task(max_steps=None), 0)
 
 

@@ -156,7 +156,7 @@ def test_actions_of_several_ranges_are_told_of_td3s_noise():
         warnings.simplefilter("error")
         make_td3(env)
     space.high[1], space.low[1] = 0.1, -0.1
-    with pytest.warns(UserWarning, match=r"half their ranges, got \[1.0, 0.1.*RescaleAction"):
+    with pytest.warns(UserWarning, match=r"half ranges \[1.0, 0.1.*RescaleAction"):
         make_td3(env)
 
 

@@ -15,7 +15,12 @@ from pydantic import TypeAdapter
 from small import own_nodes
 
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig
-from torchrl_l2c2.experiment.cli.composition import CONF, composing, folder_named, register
+from torchrl_l2c2.experiment.cli.composition import (
+    CONF,
+    check_folder_name,
+    composition_errors,
+    register,
+)
 from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.settings.config import GROUPS
 from torchrl_l2c2.experiment.settings.fields import SettingError, describe
@@ -116,7 +121,7 @@ def test_a_wrong_setting_gives_its_line(settings_of, line, message):
 def test_what_cannot_be_composed_ends_in_a_line(settings_of, monkeypatch, line, told):
     """Of a name that there is not, it says which was meant; never a traceback."""
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
-    with pytest.raises(SystemExit) as ended, composing():
+    with pytest.raises(SystemExit) as ended, composition_errors():
         settings_of(line)
     said = str(ended.value)
     assert "HYDRA_FULL_ERROR" not in os.environ
@@ -128,7 +133,7 @@ def test_a_folder_that_hydra_cannot_make_ends_in_a_line(tmp_path):
     """Of ``hydra.run.dir``, say."""
     (tmp_path / "file").touch()
     told = r"error: '.*run' cannot be made \(Not a directory\); choose another."
-    with pytest.raises(SystemExit, match=told), composing():
+    with pytest.raises(SystemExit, match=told), composition_errors():
         (tmp_path / "file" / "run").mkdir(parents=True)
 
 
@@ -149,7 +154,7 @@ def test_a_folder_that_hydra_cannot_make_ends_in_a_line(tmp_path):
 )
 def test_what_cannot_be_composed_ends_with_what_was_meant(settings_of, line, meant):
     """Of choices, of settings without their group, and of a path."""
-    with pytest.raises(SystemExit) as ended, composing():
+    with pytest.raises(SystemExit) as ended, composition_errors():
         settings_of(line)
     assert str(ended.value).endswith(meant)
 
@@ -157,7 +162,7 @@ def test_what_cannot_be_composed_ends_with_what_was_meant(settings_of, line, mea
 def test_the_whole_error_is_shown_where_it_is_asked_for(settings_of, monkeypatch):
     """As Hydra has it."""
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
-    with pytest.raises(HydraException, match="Could not override 'sed'"), composing():
+    with pytest.raises(HydraException, match="Could not override 'sed'"), composition_errors():
         settings_of("sed=1")
 
 
@@ -168,8 +173,10 @@ def test_the_whole_error_is_shown_where_it_is_asked_for(settings_of, monkeypatch
 def test_what_is_no_folder_is_refused(setting, given):
     """A number may name one, and nothing need be resumed."""
     with pytest.raises(SettingError, match=rf"{setting} must be a folder, got "):
-        folder_named(setting, given)
-    assert folder_named("outputs", 2026) == "2026" and folder_named("resume", None) is None
+        check_folder_name(setting, given)
+    assert (
+        check_folder_name("outputs", 2026) == "2026" and check_folder_name("resume", None) is None
+    )
 
 
 def kinds_of_settings():

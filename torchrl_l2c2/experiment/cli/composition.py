@@ -30,7 +30,7 @@ PACKAGE = Path(__file__).parents[2]
 CONF = next(folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if folder.is_dir())
 
 # Names that users may type for a setting.
-ALSO_CALLED = {"method": ["regularizer"], "methods": ["regularizer"]}
+ALIASES = {"method": ["regularizer"], "methods": ["regularizer"]}
 
 
 def register() -> None:
@@ -77,7 +77,7 @@ def read(values: dict[str, Any]) -> tuple[ExperimentConfig, Path]:
     chosen = HydraConfig.get()
     check_preset(values, chosen.runtime.choices.get("preset"))
     for name in ("outputs", "resume"):
-        values[name] = folder_named(name, values[name])
+        values[name] = check_folder_name(name, values[name])
     config = ExperimentConfig.from_dict(values)
     check_budget(config, chosen.overrides.task)
     multirun = chosen.mode == RunMode.MULTIRUN
@@ -150,7 +150,7 @@ def check_folders(chosen: Any, outputs: str) -> None:
 
 
 @contextmanager
-def composing() -> Iterator[None]:
+def composition_errors() -> Iterator[None]:
     """Shows an error of Hydra's composition in one line, and exits.
 
     If the user has set ``HYDRA_FULL_ERROR``, Hydra prints its traceback instead.
@@ -165,7 +165,7 @@ def composing() -> Iterator[None]:
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         if shown:
             raise
-        sys.exit(f"error: {refusal(error)}")
+        sys.exit(f"error: {one_line_message(error)}")
     except OSError as error:  # Hydra cannot make the run's folder.
         if shown or error.filename is None:
             raise
@@ -175,7 +175,7 @@ def composing() -> Iterator[None]:
             os.environ.pop("HYDRA_FULL_ERROR", None)
 
 
-def refusal(error: Exception) -> str:
+def one_line_message(error: Exception) -> str:
     """Text of an error of Hydra or OmegaConf in one line, with the name that was probably meant."""
     if found := re.match("Could not override '([^']+)'", str(error)):
         return unknown_setting(found[1])
@@ -183,7 +183,7 @@ def refusal(error: Exception) -> str:
         return f"{', '.join(GROUPS)} are each chosen by name; regularizer=none has none ({error})."
     said = " ".join(str(error).partition("\nConfig search path:")[0].split())
     if found := re.search(r"Could not find '(\w+)/([^']+)'", said):
-        return f"{said}{_choice_meant(*found.groups())}"
+        return f"{said}{_suggest_choice(*found.groups())}"
     if "=~" in said:
         return f"{said}. No shell expands this ~: write $HOME."
     if isinstance(error, OverrideParseException):
@@ -191,7 +191,7 @@ def refusal(error: Exception) -> str:
     return said
 
 
-def _choice_meant(group: str, name: str) -> str:
+def _suggest_choice(group: str, name: str) -> str:
     near = get_close_matches(name, GROUPS.get(group, ()), 1)
     meant = f"; did you mean {group}={near[0]}?" if near else "."
     ids = f" An id of Gymnasium's: task=gymnasium task.env_id={name}." if group == "task" else ""
@@ -219,16 +219,16 @@ def unknown_setting(name: str) -> str:
     }
     if having := [of[1] for of, names in settings.items() if of[0] == group and setting in names]:
         chosen = f"{group}={' or '.join(having)}"
-        return f"{name} is only a setting of {chosen}.{_two_commands(group, having)}"
+        return f"{name} is only a setting of {chosen}.{_suggest_two_commands(group, having)}"
     known = {*COMMAND_SETTINGS, *(field.name for field in dataclasses.fields(ExperimentConfig))}
     known |= {f"{of[0]}.{each}" for of, names in settings.items() for each in names}
     near = sorted(each for each in known if each.endswith(f".{name}"))
-    near = near or ALSO_CALLED.get(name) or get_close_matches(name, sorted(known), 1)
+    near = near or ALIASES.get(name) or get_close_matches(name, sorted(known), 1)
     meant = f"; did you mean {near[0]}?" if near else "."
     return f"{name} is not a setting{meant} --help lists every setting."
 
 
-def _two_commands(group: str, having: Sequence[str]) -> str:
+def _suggest_two_commands(group: str, having: Sequence[str]) -> str:
     """Advice for a sweep over choices if only some of them have the setting."""
     prefix = f"{group}="
     swept = next((each for each in sys.argv if each.startswith(prefix) and "," in each), "")
@@ -243,7 +243,7 @@ def _two_commands(group: str, having: Sequence[str]) -> str:
     )
 
 
-def folder_named(setting: str, given: Any) -> str | None:
+def check_folder_name(setting: str, given: Any) -> str | None:
     """Checks the name of a folder, which may be a number; ``resume`` may be ``None``.
 
     Raises:
@@ -257,7 +257,7 @@ def folder_named(setting: str, given: Any) -> str | None:
     return named
 
 
-def preset_used(config: ExperimentConfig) -> str | None:
+def describe_preset(config: ExperimentConfig) -> str | None:
     """Names the regularizer's preset in a line, or says that there is none."""
     regularizer, algorithm = config.regularizer, config.algorithm.name
     if regularizer.name not in BEGIN_WITH_PRESET:
@@ -275,7 +275,7 @@ def preset_used(config: ExperimentConfig) -> str | None:
     return f"regularizer={regularizer.name}: {chosen} (the preset for {algorithm}: {origin})"
 
 
-def tell_sweep() -> None:
+def show_sweep_hint() -> None:
     """Reports that the configuration describes a comparison if only one run is made."""
     chosen = HydraConfig.get()
     if chosen.sweeper.params:

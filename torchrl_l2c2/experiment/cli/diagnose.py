@@ -22,14 +22,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with one_line_errors():
         from torchrl_l2c2.experiment.analysis import diagnosis
         from torchrl_l2c2.experiment.envs.environments import TEST_SEED
-        from torchrl_l2c2.experiment.run.files import make_folder_of, write_atomically
+        from torchrl_l2c2.experiment.run.files import make_parent_folder, write_atomically
 
         folders = diagnosis.run_folders(chosen.folders)
         if chosen.names and len(chosen.names) != len(folders):
             parser.error(f"--names: one for each of the {len(folders)} runs, got {chosen.names}")
         # Before anything is played that could be lost.
         for given in filter(None, (chosen.output, chosen.actions)):
-            make_folder_of(given)
+            make_parent_folder(given)
         diagnoses = [
             diagnosis.diagnose_run(
                 folder,

@@ -24,13 +24,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     levels = chosen.noise or [None]
     with one_line_errors():
         from torchrl_l2c2.experiment.analysis.video import check_video, record_video
-        from torchrl_l2c2.experiment.run.files import make_folder_of, to_json, write_json
+        from torchrl_l2c2.experiment.run.files import make_parent_folder, to_json, write_json
 
         # Before anything is played that could be lost.
         if chosen.record:
             check_video(chosen.record)
         if chosen.output:
-            make_folder_of(chosen.output)
+            make_parent_folder(chosen.output)
         played = {level: _play(chosen, level) for level in levels}
         if len(played) == 1:
             print(to_json(played[levels[0]].summary()), flush=True)

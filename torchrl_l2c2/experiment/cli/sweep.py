@@ -49,18 +49,18 @@ class Sweep:
     """A sweep, for the process that began it and for its jobs.
 
     Attributes:
-        begun_by: machine and process that began it.
+        started_by: machine and process that began it.
         overrides: overrides of its command.
-        begun_here: the sweep that this process began, or ``None``.
+        started_here: the sweep that this process began, or ``None``.
         job_is_here: whether a job runs in this process.
     """
 
-    begun_here: Sweep | None = None
+    started_here: Sweep | None = None
     job_is_here = False
-    _following = False
+    _watching = False
 
-    def __init__(self, folder: Path, begun_by: tuple[str, int], overrides: Sequence[str]) -> None:
-        self._folder, self.begun_by, self.overrides = folder, begun_by, overrides
+    def __init__(self, folder: Path, started_by: tuple[str, int], overrides: Sequence[str]) -> None:
+        self._folder, self.started_by, self.overrides = folder, started_by, overrides
 
     @classmethod
     def of_this_job(cls) -> Sweep:
@@ -82,7 +82,7 @@ class Sweep:
     @property
     def is_remote(self) -> bool:
         """Checks whether another program, such as a cluster, started this process."""
-        host, process = self.begun_by
+        host, process = self.started_by
         return host != socket.gethostname() or process not in (os.getpid(), os.getppid())
 
     @property
@@ -113,7 +113,7 @@ class Sweep:
 
     def publish(self) -> None:
         """Passes the sweep on to processes that start from now on."""
-        told = [str(self._folder), self.begun_by, [*self.overrides], os.getcwd()]
+        told = [str(self._folder), self.started_by, [*self.overrides], os.getcwd()]
         os.environ[VARIABLE] = json.dumps(told)
 
     def end(self) -> None:
@@ -166,7 +166,7 @@ class Sweep:
         """Folders of the runs that are finished, by this sweep or before."""
         return [Path(folder) for _, (folder, _) in self._all("finished")]
 
-    def standing(self, number: int, params: Mapping[str, str]) -> str:
+    def status(self, number: int, params: Mapping[str, str]) -> str:
         """State of a sweep when a job begins, such as ``"run 3 of 72, about 4.1 h left"``.
 
         Args:
@@ -201,13 +201,13 @@ class Sweep:
         Yields:
             bool: Whether the job was begun before, and lost.
         """
-        begun_before = (self._folder / f"running_{number:06d}").exists()
+        started_before = (self._folder / f"running_{number:06d}").exists()
         self._put(f"running_{number:06d}", json.dumps(job))
-        if self.begun_by != (socket.gethostname(), os.getpid()):
-            self._follow()
+        if self.started_by != (socket.gethostname(), os.getpid()):
+            self._watch()
         Sweep.job_is_here = True
         try:
-            yield begun_before
+            yield started_before
             self._ended(number)
         finally:
             Sweep.job_is_here = False
@@ -230,22 +230,22 @@ class Sweep:
                 told.append((int(path.name.rpartition("_")[2]), json.loads(path.read_text())))
         return told
 
-    def _follow(self) -> None:
+    def _watch(self) -> None:
         """Ends this process with the sweep: a stop arrives as SIGTERM.
 
         A local process also ends with the process that began the sweep.
         """
         signal.signal(signal.SIGTERM, terminate)
-        if Sweep._following:
+        if Sweep._watching:
             return
-        Sweep._following = True
+        Sweep._watching = True
         remote = self.is_remote
 
         def follow() -> None:
             told = False
             while True:
                 time.sleep(REMOTE_POLL_SECONDS if remote else POLL_SECONDS)
-                if not remote and os.getppid() != self.begun_by[1]:
+                if not remote and os.getppid() != self.started_by[1]:
                     os._exit(1)
                 if not told and Sweep.job_is_here and self.stopped_by is not None:
                     told = True
@@ -263,9 +263,9 @@ class ShareSweep(Callback):
         Raises:
             SystemExit: the folder cannot be written to; Hydra swallows other errors.
         """
-        if Sweep.begun_here is not None:
+        if Sweep.started_here is not None:
             with one_line_errors():
-                Sweep.begun_here.share(Path(config.hydra.sweep.dir).absolute())
+                Sweep.started_here.share(Path(config.hydra.sweep.dir).absolute())
 
 
 def enter_folder() -> None:
@@ -322,8 +322,8 @@ def begin_sweep(overrides: Sequence[str] = ()) -> Iterator[Sweep]:
     """
     # Until the runs' folder is known.
     with tempfile.TemporaryDirectory(prefix="torchrl_l2c2_") as folder:
-        begun_by = (socket.gethostname(), os.getpid())
-        sweep, first = Sweep(Path(folder), begun_by, overrides), 0.0
+        started_by = (socket.gethostname(), os.getpid())
+        sweep, first = Sweep(Path(folder), started_by, overrides), 0.0
 
         def receive(number: int, frame: Any) -> None:
             nonlocal first
@@ -338,7 +338,7 @@ def begin_sweep(overrides: Sequence[str] = ()) -> Iterator[Sweep]:
 
         start_guard(Path(folder).name)
         sweep.publish()
-        Sweep.begun_here = sweep
+        Sweep.started_here = sweep
         previous = {n: signal.signal(n, receive) for n in (signal.SIGINT, signal.SIGTERM)}
         try:
             yield sweep
@@ -346,4 +346,4 @@ def begin_sweep(overrides: Sequence[str] = ()) -> Iterator[Sweep]:
             sweep.end()
             for number, handler in previous.items():
                 signal.signal(number, handler)
-            Sweep.begun_here = None
+            Sweep.started_here = None

@@ -27,11 +27,11 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_l2c2.experiment.cli.composition import (
     CONF,
-    composing,
-    preset_used,
+    composition_errors,
+    describe_preset,
     read,
     register,
-    tell_sweep,
+    show_sweep_hint,
 )
 from torchrl_l2c2.experiment.cli.manual import manual
 from torchrl_l2c2.experiment.cli.sweep import Sweep, begin_sweep, list_jobs
@@ -44,7 +44,7 @@ from torchrl_l2c2.experiment.errors import (
 )
 from torchrl_l2c2.experiment.run.files import make_folder
 from torchrl_l2c2.experiment.run.metrics_log import check_installed
-from torchrl_l2c2.experiment.run.progress import log, say
+from torchrl_l2c2.experiment.run.progress import log, show_and_log
 from torchrl_l2c2.experiment.run.signals import (
     Interrupted,
     Terminated,
@@ -65,7 +65,7 @@ LAUNCHERS = {
     "slurm_cluster": ("hydra_plugins.hydra_submitit_launcher", "slurm"),
 }
 
-OF_MEMORY = "algorithm.hidden, replay.capacity, replay.batch_size or threads"
+MEMORY_SETTINGS = "algorithm.hidden, replay.capacity, replay.batch_size or threads"
 
 
 def check_launcher(arguments: Sequence[str]) -> None:
@@ -107,7 +107,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if arguments is not None:
         sys.argv[1:] = arguments  # Hydra reads it there.
     if {"-h", "--help"} & set(sys.argv[1:]):  # Hydra's own help takes seconds to compose.
-        with _reader_may_leave():
+        with _allow_closed_output():
             print(manual(), end="", flush=True)
         return
     check_launcher(sys.argv)
@@ -117,26 +117,26 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if "" not in sys.path:  # As with python -m: modules with tasks may lie here.
         sys.path.append(os.getcwd())
     register()
-    if not any(map(_asks_for_a_sweep, sys.argv[1:])):
-        with composing(), _reader_may_leave():
+    if not any(map(_is_multirun, sys.argv[1:])):
+        with composition_errors(), _allow_closed_output():
             _main()
             sys.stdout.flush()
         return
     check_sweep(sys.argv[1:])
     with begin_sweep(sys.argv[1:]) as sweep:
         try:
-            with composing():
+            with composition_errors():
                 _main()
         except KeyboardInterrupt:
             sweep.stop(signal.SIGINT)
         finally:
-            tell_end(sweep)
+            show_sweep_end(sweep)
         stopped_by, failures = sweep.stopped_by, sweep.failures
     sys.exit(bool(failures) if stopped_by is None else 128 + stopped_by)
 
 
 @contextmanager
-def _reader_may_leave() -> Iterator[None]:
+def _allow_closed_output() -> Iterator[None]:
     """Ends in order where the output's reader has closed it, as in ``--help | head``."""
     try:
         yield
@@ -146,13 +146,13 @@ def _reader_may_leave() -> Iterator[None]:
         sys.exit(1)
 
 
-def _asks_for_a_sweep(argument: str) -> bool:
+def _is_multirun(argument: str) -> bool:
     """Hydra takes the beginning of an option for the whole."""
     begun = argument.startswith("--m") and "--multirun".startswith(argument)
     return begun or argument in ("-m", "hydra.mode=MULTIRUN")
 
 
-def tell_end(sweep: Sweep) -> None:
+def show_sweep_end(sweep: Sweep) -> None:
     """Prints the end of a sweep: a table of its runs, its failures, and how to continue."""
     if sweep.finished:
         from torchrl_l2c2.experiment.analysis.reports import sweep_summary
@@ -172,7 +172,7 @@ def _main(values: DictConfig) -> None:
         _run_job(plain, Sweep.of_this_job())
         return
     try:
-        tell_sweep()
+        show_sweep_hint()
         run(*read(plain), plain)
     except Interrupted as interruption:
         print(interruption, file=sys.stderr)
@@ -181,7 +181,7 @@ def _main(values: DictConfig) -> None:
         print("interrupted; the same command continues.", file=sys.stderr)
         sys.exit(128 + (signal.SIGTERM if isinstance(interruption, Terminated) else signal.SIGINT))
     except Exception as error:
-        _tell(error)
+        _print_error(error)
         sys.exit(1)
 
 
@@ -191,11 +191,11 @@ def _run_job(values: dict[str, Any], sweep: Sweep) -> None:
         return
     number, job = HydraConfig.get().job.num, " ".join(HydraConfig.get().overrides.task)
     try:
-        with sweep.job(number, job) as begun_before:
-            patience = LOST_SECONDS if begun_before else 0.0
+        with sweep.job(number, job) as started_before:
+            patience = LOST_SECONDS if started_before else 0.0
             config, folder = read(values)
             sweep.claim(number, folder)
-            finished = run(config, folder, values, _standing(sweep), patience)
+            finished = run(config, folder, values, _sweep_status(sweep), patience)
             if finished is not None:
                 sweep.add_finished(number, finished.folder, finished.record.seconds)
     except (Interrupted, KeyboardInterrupt) as interruption:
@@ -207,15 +207,15 @@ def _run_job(values: dict[str, Any], sweep: Sweep) -> None:
             sys.exit(128 + stopped_by)
         sweep.stop(stopped_by)
     except Exception as error:
-        sweep.add_failure(number, job, _tell(error).splitlines()[0])
+        sweep.add_failure(number, job, _print_error(error).splitlines()[0])
 
 
-def _standing(sweep: Sweep) -> str:
+def _sweep_status(sweep: Sweep) -> str:
     chosen = HydraConfig.get()
-    return sweep.standing(chosen.job.num + 1, chosen.sweeper.params or {})
+    return sweep.status(chosen.job.num + 1, chosen.sweeper.params or {})
 
 
-def _tell(error: Exception) -> str:
+def _print_error(error: Exception) -> str:
     """Prints an error: one line, with the lines of a simulator that failed; a bug's traceback."""
     if not is_one_line_error(error):
         traceback.print_exception(error)
@@ -225,7 +225,7 @@ def _tell(error: Exception) -> str:
     if isinstance(error, SettingError):
         told += " --help lists every setting."
     elif is_lack_of_memory(error):
-        told = f"{told.rstrip('.')}. There is no memory for it: choose smaller {OF_MEMORY}."
+        told = f"{told.rstrip('.')}. There is no memory for it: choose smaller {MEMORY_SETTINGS}."
     print(f"error: {told}", file=sys.stderr)
     return told
 
@@ -234,7 +234,7 @@ def run(
     config: ExperimentConfig,
     folder: Path,
     values: dict[str, Any],
-    standing: str = "",
+    status: str = "",
     patience: float = 0.0,
 ) -> FinishedRun | None:
     """One run in its folder, its progress and its result, if it tests its policy.
@@ -243,23 +243,23 @@ def run(
         config (ExperimentConfig): its settings.
         folder (Path): The run's folder.
         values (dict): The configuration, which names the run to continue from.
-        standing (str): State of the sweep, shown before the run's name and progress.
+        status (str): State of the sweep, shown before the run's name and progress.
         patience (float): seconds to wait for a process that has its folder.
     """
     # Imported here: settings are checked, and the run is named, before torch is imported.
     from torchrl_l2c2.experiment.envs.spaces import check_env_id
-    from torchrl_l2c2.experiment.run.continuation import check_elsewhere, tell_past
+    from torchrl_l2c2.experiment.run.continuation import check_resume_folder, warn_ignored_settings
     from torchrl_l2c2.experiment.run.finished import finished_run
     from torchrl_l2c2.experiment.run.lock import wait_for_folder
 
-    check_elsewhere(values["resume"])
+    check_resume_folder(values["resume"])
     if not (folder / "evaluation.json").exists():
         check_installed(config.logger.name)
         check_env_id(config.task.env_id)
     chosen = (config.task, config.algorithm, config.regularizer)
     named = f"{', '.join(group.name for group in chosen)}, seed {config.seed}: {folder}"
-    print(f"{standing}: {named}" if standing else named, flush=True)
-    if (told := preset_used(config)) is not None:
+    print(f"{status}: {named}" if status else named, flush=True)
+    if (told := describe_preset(config)) is not None:
         print(told, flush=True)
     from torchrl_l2c2.experiment.agents.build import check_device_found
     from torchrl_l2c2.experiment.analysis.video import check_pictures, check_video, record_video
@@ -271,16 +271,16 @@ def run(
     if records:
         check_video()
         check_pictures(config.task)
-    _quieten()
+    _silence_libraries()
     wait_for_folder(folder, patience)
-    with _end_logged(folder):
+    with _log_errors(folder):
         finished = finished_run(folder, config.to_dict())
         if finished is None:
-            finished = _train(config, folder, values, standing)
+            finished = _train(config, folder, values, status)
         else:
             print("finished before: its results follow; another seed= or outputs= begins anew.")
-            with warnings_as_lines(partial(say, folder)):
-                tell_past(finished.config, config.to_dict())
+            with warnings_as_lines(partial(show_and_log, folder)):
+                warn_ignored_settings(finished.config, config.to_dict())
         if records:
             record_video(folder, video)
         if finished is not None:
@@ -290,7 +290,7 @@ def run(
     return finished
 
 
-def _quieten() -> None:
+def _silence_libraries() -> None:
     """Libraries say nothing that a user of the command could act on."""
     for chatty in ("torchrl", "matplotlib", "torch"):
         logging.getLogger(chatty).setLevel(logging.ERROR)
@@ -299,7 +299,7 @@ def _quieten() -> None:
 
 
 def _train(
-    config: ExperimentConfig, folder: Path, values: dict[str, Any], standing: str
+    config: ExperimentConfig, folder: Path, values: dict[str, Any], status: str
 ) -> FinishedRun | None:
     """Trains and tests a policy, or trains it alone where no test is asked for."""
     from torchrl_l2c2.experiment.run.experiment import Experiment
@@ -307,14 +307,14 @@ def _train(
     from torchrl_l2c2.experiment.run.process import keep_freed_memory
 
     keep_freed_memory()
-    going_on = {name: values[name] for name in ("resume", "allow_other_versions")}
+    options = {name: values[name] for name in ("resume", "allow_other_versions")}
     with (
-        warnings_as_lines(partial(say, folder)),
-        closing(Experiment(config, folder, **going_on)) as experiment,
+        warnings_as_lines(partial(show_and_log, folder)),
+        closing(Experiment(config, folder, **options)) as experiment,
     ):
-        if (told := preset_used(config)) is not None:
+        if (told := describe_preset(config)) is not None:
             log(folder, told)
-        experiment.train(progress=standing or True)
+        experiment.train(progress=status or True)
         if not config.test_episodes:
             save_policy(experiment.agent.policy, folder / "policy.pt")
             return None
@@ -340,7 +340,7 @@ def _show(finished: FinishedRun) -> None:
 
 
 @contextmanager
-def _end_logged(folder: Path) -> Iterator[None]:
+def _log_errors(folder: Path) -> Iterator[None]:
     """Writes the error that ends a run early into its ``train.log``.
 
     A mistake of the user is only shown: it changes nothing in the folder, and makes none.

@@ -1,4 +1,4 @@
-"""State of the whole process: random generators, threads and memory, for one run at a time."""
+"""Global state of the process: random generators, threads and memory."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ from typing import Any
 import numpy as np
 import torch
 
-# glibc's mallopt, in bytes up to the largest int: blocks above the one threshold are mapped anew at
-# every allocation; free memory above the other is given back to the system.
+# Parameters of glibc's mallopt, in bytes: free memory above the first threshold is returned to the
+# system, and blocks above the second are mapped again at every allocation.
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 _LARGEST = 2**31 - 1
 
 _States = tuple[Any, Any, torch.Tensor, list[torch.Tensor]]
-"""States of the generators of Python, NumPy, PyTorch and its CUDA devices."""
+"""States of the random generators of Python, NumPy, PyTorch and CUDA devices."""
 
 
 class ProcessState:
-    """The global random generators and the number of threads, as a run of its own has them.
+    """Context manager with a run's own global random generators and number of threads.
 
-    Within the context they belong to the run; after it the process has its own again. Networks are
-    initialized from the generators, and policies sample from them.
+    The previous state of the process is restored at exit. The generators initialize networks and
+    sample actions.
 
     Args:
-        seed (int): seed of the generators of Python, NumPy and PyTorch.
-        threads (int): number of threads of PyTorch. Default 1.
+        seed (int): Seed of the generators of Python, NumPy and PyTorch.
+        threads (int): Number of PyTorch threads. Default 1.
 
     Examples:
         >>> import torch
-        >>> ours = ProcessState(seed=0)
-        >>> with ours:
+        >>> process = ProcessState(seed=0)
+        >>> with process:
         ...     first = torch.rand(())
         >>> _ = torch.rand(100)
-        >>> with ours:
+        >>> with process:
         ...     second = torch.rand(())
         >>> generator = torch.Generator().manual_seed(0)
         >>> both = [torch.rand((), generator=generator) for _ in range(2)]
@@ -52,7 +52,7 @@ class ProcessState:
         np.random.seed(seed)
         torch.manual_seed(seed)
         self._inside = _states()
-        self._outside: _States | None = None  # While the context is not entered.
+        self._outside: _States | None = None  # None outside of the context.
         _set_states(outside)
 
     def __enter__(self) -> None:
@@ -73,7 +73,7 @@ class ProcessState:
         self._outside = None
 
     def state_dict(self) -> dict[str, Any]:
-        """The generators' states, as tensors and text."""
+        """Returns the states of the generators as tensors and JSON."""
         now = self._inside if self._outside is None else _states()
         python, (name, keys, *rest), state, devices = now
         return {
@@ -84,7 +84,7 @@ class ProcessState:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restores what :meth:`state_dict` gave."""
+        """Restores a state of :meth:`state_dict`."""
         version, internal, gauss = json.loads(state["python"])
         name, keys, *rest = json.loads(state["numpy"])
         numpy = (name, np.array(keys, dtype=np.uint32), *rest)
@@ -95,14 +95,14 @@ class ProcessState:
 
 
 def keep_freed_memory() -> bool:
-    """Lets the process keep the memory that it frees, for the next update, which needs as much.
+    """Lets the process keep freed memory for the next update.
 
-    Otherwise the tensors of larger batches are handed out anew by the system at every update, page
-    by page, which takes long. The process then holds the most that it ever
-    needed, to its end. For processes that train and do little else: ``train.py`` calls it.
+    Otherwise the system maps the tensors of large batches again at every update, which is slow. The
+    process then keeps its peak memory until its end. Intended for processes that mainly train:
+    ``train.py`` calls it.
 
     Returns:
-        bool: whether the C library took it; others than glibc have settings of their own.
+        bool: Whether the C library supports it; only glibc does.
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt
@@ -121,5 +121,5 @@ def _set_states(states: _States) -> None:
     random.setstate(states[0])
     np.random.set_state(states[1])
     torch.set_rng_state(states[2])
-    if torch.cuda.is_available():  # A machine with more devices has more states.
+    if torch.cuda.is_available():  # The states may come from a machine with more devices.
         torch.cuda.set_rng_state_all(states[3][: torch.cuda.device_count()])
