@@ -602,9 +602,9 @@ class TestCommand:
         """A folder that is no run; the same run twice; names that are too few."""
         with pytest.raises(SystemExit):
             main([str(run), str(tmp_path), "--names", "one"])
-        assert "--names: one for each of the 2 runs" in capsys.readouterr().err
+        assert "--names must have 2 names, one per run" in capsys.readouterr().err
         for wrong, message in (
-            (["--names", "a", "a"], "--names: each run needs one of its own"),
+            (["--names", "a", "a"], "--names must differ from each other"),
             (["--actions", "a.png"], "--actions must be an SVG file"),
         ):
             with pytest.raises(SystemExit):
@@ -621,6 +621,6 @@ class TestCommand:
         ]
         with pytest.raises(SystemExit):
             main([str(tmp_path / "above"), "--names", "one"])
-        assert "--names: one for each of the 3 runs" in capsys.readouterr().err
+        assert "--names must have 3 names, one per run" in capsys.readouterr().err
         with pytest.raises(SystemExit, match=r"^error: A run is named twice"):
             main([str(run), str(run)])

@@ -80,7 +80,7 @@ def test_too_little_memory_is_told_with_the_settings_that_need_it(error):
     """PyTorch's own errors on the CPU are plain RuntimeErrors."""
     error = too_large(error) if isinstance(error, int) else error
     told = _print_error(error)
-    assert "There is no memory for it: choose smaller algorithm.hidden, replay.capacity" in told
+    assert "Not enough memory: decrease algorithm.hidden, replay.capacity" in told
 
 
 def test_help_may_have_no_reader():

@@ -517,7 +517,7 @@ def test_a_run_from_the_command_line_leaves_everything_behind(tmp_path):
     (run.folder / "learning_curves.png").unlink()
     again = run_train(*PENDULUM_OVERRIDES, "evaluate_every=1", folder=tmp_path)
     assert again.stdout.count("2 test episodes, seed 0") == 2
-    assert "finished before: its results follow" in again.stdout
+    assert "finished before: these are its results" in again.stdout
     assert "finished before" not in finished.stdout
     assert "mean of the last 3 episodes: return " in finished.stderr
     assert "evaluate_every=1 has no effect: training is over" in again.stderr

@@ -277,7 +277,7 @@ def test_episodes_beside_a_presets_frames_are_refused():
     """They would not be read; frames that are switched off leave them."""
     chosen = ["preset=rl_zoo", "task=pendulum", "algorithm=ppo", "task.episodes=5"]
     config = ExperimentConfig.from_dict(composed(*chosen))
-    with pytest.raises(SettingError, match=r"task\.episodes is not read .* 500000: give task\."):
+    with pytest.raises(SettingError, match=r"task\.episodes has no effect .*500000: set task\."):
         check_budget(config, chosen)
     check_budget(config, chosen[:-1])
     check_budget(ExperimentConfig.from_dict(composed(*chosen, "task.frames=null")), chosen)

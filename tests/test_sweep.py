@@ -185,7 +185,7 @@ def test_a_launcher_says_what_it_needs(name, monkeypatch):
 @pytest.mark.parametrize(
     ("sweep", "told"),
     [
-        ("seed=range(3,0)", "error: a sweep of no job: one of -m seed=range"),
+        ("seed=range(3,0)", "error: the sweep has no jobs: one of -m seed=range"),
         (
             "experiment=cartpole,pendulum",
             "error: experiment=cartpole,pendulum: each ",
@@ -197,7 +197,7 @@ def test_a_launcher_says_what_it_needs(name, monkeypatch):
         ("experiment=[cartpole,pendulum]", "error: experiment=[cartpole,pendulum]: each "),
         (
             "optimizer.lr=interval(0,1)",
-            "error: an interval is nothing to sweep over: examples",
+            "error: sweeps do not support intervals: use examples",
         ),
     ],
 )
@@ -271,7 +271,7 @@ def test_two_jobs_do_not_share_a_folder(tmp_path):
         sweep.claim(1, tmp_path / "seed_1")
         sweep.claim(0, tmp_path / "seed_0")
         with pytest.raises(
-            SettingError, match=r"another for job 2 than for job 0 .*seed_0: they have"
+            SettingError, match=r"differ between jobs 0 and 2 .*seed_0: their settings"
         ):
             sweep.claim(2, tmp_path / "seed_0")
 
@@ -291,7 +291,7 @@ def test_a_machine_without_the_outputs_is_named(tmp_path):
     with begin_sweep() as begun:
         begun.share(tmp_path / "outputs")
         (tmp_path / "outputs").rename(tmp_path / "moved")
-        with pytest.raises(UserError, match=r"outputs' is not on .* all machines share"):
+        with pytest.raises(UserError, match=r"outputs' does not exist on .* all machines share"):
             Sweep.of_this_job()
 
 

@@ -104,16 +104,16 @@ def test_a_wrong_setting_gives_its_line(settings_of, line, message):
     [
         ("task.epsodes=3", "task.epsodes is not a setting; did you mean task.episodes? --help"),
         ("sed=1", "sed is not a setting; did you mean seed? --help lists every setting."),
-        ("algorithm.num_envs=4", "algorithm.num_envs is only a setting of algorithm=ppo."),
+        ("algorithm.num_envs=4", "algorithm.num_envs is a setting of algorithm=ppo only."),
         (
             "regularizer=lipsnet",
             "In 'config': Could not find 'regularizer/lipsnet' Available",
         ),
         (
             "task=5",
-            "task, algorithm, regularizer, replay, optimizer, logger are each chosen by name",
+            "task, algorithm, regularizer, replay, optimizer, logger must each be one name",
         ),
-        ("~regularizer", "task, algorithm, regularizer, replay, optimizer, logger are each chosen"),
+        ("~regularizer", "task, algorithm, regularizer, replay, optimizer, logger must each be"),
         ("seed=${oder}", "Interpolation key 'oder' not found full_key: seed"),
         ("seed=[1", "no viable alternative at input '[1'"),
     ],
@@ -132,7 +132,7 @@ def test_what_cannot_be_composed_ends_in_a_line(settings_of, monkeypatch, line, 
 def test_a_folder_that_hydra_cannot_make_ends_in_a_line(tmp_path):
     """Of ``hydra.run.dir``, say."""
     (tmp_path / "file").touch()
-    told = r"error: '.*run' cannot be made \(Not a directory\); choose another."
+    told = r"error: '.*run' cannot be created \(Not a directory\); choose another."
     with pytest.raises(SystemExit, match=told), composition_errors():
         (tmp_path / "file" / "run").mkdir(parents=True)
 
@@ -143,13 +143,13 @@ def test_a_folder_that_hydra_cannot_make_ends_in_a_line(tmp_path):
         ("regularizer=cap", "; did you mean regularizer=caps?"),
         (
             "task=Pendulum-v1",
-            "task=pendulum? An id of Gymnasium's: task=gymnasium task.env_id=Pendulum-v1.",
+            "task=pendulum? For a Gymnasium id: task=gymnasium task.env_id=Pendulum-v1.",
         ),
         (
             "sigma=2",
             "sigma is not a setting; did you mean regularizer.sigma? --help lists every setting.",
         ),
-        ("outputs=~/runs", "No shell expands this ~: write $HOME."),
+        ("outputs=~/runs", "Shells do not expand ~ here: write $HOME."),
     ],
 )
 def test_what_cannot_be_composed_ends_with_what_was_meant(settings_of, line, meant):

@@ -46,8 +46,8 @@ from torchrl_l2c2.experiment.settings.tasks import Budget
 class Experiment:
     """A run of the paper's experiment.
 
-    Training and tests use their own random numbers and number of threads. Those of the process are
-    restored afterwards.
+    Training and tests use their own random generators and number of threads. The state of the
+    process is restored afterwards.
 
     Args:
         config (ExperimentConfig, optional): Settings of the run. Default: the paper's L2C2 on

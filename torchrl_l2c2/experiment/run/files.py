@@ -1,4 +1,4 @@
-"""Atomic writing of files, and reading with errors that state the file."""
+"""Functions that write files atomically, and read them with errors that state the file."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def _strict(value: Any) -> Any:
 
 @contextlib.contextmanager
 def read_back(run: str | Path) -> Iterator[None]:
-    """Converts errors while reading a run's files to an error that states the folder.
+    """Converts errors about the content of a run's files to an error that states the folder.
 
     Raises:
         ValueError: If the block raises an error because of damaged content.

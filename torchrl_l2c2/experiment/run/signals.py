@@ -91,7 +91,7 @@ def stop_on_signals() -> Iterator[list[int]]:
 
 
 def keep_ctrl_c_from_children() -> None:
-    """Blocks Ctrl-C in all later child processes, so that only this process receives it.
+    """Blocks Ctrl-C in all later child processes: only this process receives it.
 
     Terminals send Ctrl-C to all processes. Compilers, workers and jobs then finish their work, and
     this process ends them. Call it first, before other threads start.

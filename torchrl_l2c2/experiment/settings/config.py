@@ -61,8 +61,7 @@ COMMAND_SETTINGS = {
     "experiment": ("null", "a whole comparison from conf/experiment/, with -m"),
     "resume": (
         "null",
-        "folder of another run to continue from; without it, the same command continues its own "
-        "run",
+        "folder of another run to continue from; null: the run's own folder",
     ),
     "allow_other_versions": (
         "false",
