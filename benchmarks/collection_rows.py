@@ -19,7 +19,7 @@ from torchrl_l2c2.experiment import (
     TaskConfig,
     make_env,
 )
-from torchrl_l2c2.experiment.collect.acting import on_tensors
+from torchrl_l2c2.experiment.collect.acting import policy_function
 from torchrl_l2c2.experiment.envs.environments import quiet_output, time_limit
 from torchrl_l2c2.modules import make_actor
 
@@ -41,7 +41,9 @@ def collection_rows(effort: Effort) -> Iterable[Row]:
             {
                 "collector": partial(_rollout, collector),
                 "simulator": _simulation(
-                    task, on_tensors(actor, ["action"], effort.compile), collector.frames_per_batch
+                    task,
+                    policy_function(actor, ["action"], effort.compile),
+                    collector.frames_per_batch,
                 ),
             },
             repeats=2 * effort.rounds,

@@ -44,7 +44,7 @@ def make_update(algorithm: str, compiler: str) -> Callable[[], object]:
         return lambda: update.update(True, *draw)
     # Traced, TorchRL's losses keep detached parameters, which our own compiler has them forget;
     # torch.compile would replay the forgetting at every call, where there is nothing to forget.
-    vars(update_module)["forget_traced"] = lambda loss: None
+    vars(update_module)["clear_detached_parameters"] = lambda loss: None
     torch._dynamo.config.trace_autograd_ops = True
     compiled = torch.compile(
         update.update,

@@ -27,7 +27,7 @@ from torchrl_l2c2.experiment.analysis.reports.statistics import mean
 from torchrl_l2c2.experiment.analysis.reports.tables import Table, number_range
 from torchrl_l2c2.experiment.collect.episodes import play_episodes
 from torchrl_l2c2.experiment.envs.frames import check_finite
-from torchrl_l2c2.experiment.errors import UserError, told_in_a_line
+from torchrl_l2c2.experiment.errors import UserError, one_line_errors
 from torchrl_l2c2.experiment.run.evaluation import evaluate_policy
 from torchrl_l2c2.experiment.run.files import make_folder, write_atomically, write_json
 from torchrl_l2c2.experiment.run.finished import FinishedRun
@@ -276,7 +276,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
     add("--episodes", type=int, default=10, help="of each run at each level (default: 10)")
     add("--output", metavar="FOLDER", help="of the files (default: noise/ in the first folder)")
     chosen = parser.parse_args(arguments)
-    with told_in_a_line():
+    with one_line_errors():
         found = find_runs(chosen.folders, required=True)
         played = play_with_noise(found.runs, chosen.levels, episodes=chosen.episodes, progress=True)
         written = write_noise(chosen.output or Path(chosen.folders[0]) / "noise", played)

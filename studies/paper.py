@@ -114,7 +114,7 @@ def is_of_own_task(record: Record) -> bool:
 def is_as_usual(record: Record, *but: str) -> bool:
     """Tells if length and settings are the task's defaults, except for the settings ``but``."""
     task = TASKS.get(record.task)
-    others = {k for k in record.settings_of_any_length if not k.startswith("regularizer.")}
+    others = {k for k in record.settings_without_length if not k.startswith("regularizer.")}
     others -= {*but}
     return task is not None and record.length == f"{task.episodes} episodes" and not others
 

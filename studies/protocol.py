@@ -22,10 +22,10 @@ from torchrl_l2c2.experiment.analysis.reports.names import method_name
 from torchrl_l2c2.experiment.analysis.reports.records import merge, read_records, write_records
 from torchrl_l2c2.experiment.analysis.reports.runs import find_runs
 from torchrl_l2c2.experiment.analysis.reports.tables import Table, number_range, or_dash
-from torchrl_l2c2.experiment.errors import UserError, told_in_a_line
+from torchrl_l2c2.experiment.errors import UserError, one_line_errors
 from torchrl_l2c2.experiment.run.finished import QUANTITIES, TESTS, FinishedRun, Record
 from torchrl_l2c2.experiment.settings.config import ExperimentConfig
-from torchrl_l2c2.experiment.settings.identity import of_length
+from torchrl_l2c2.experiment.settings.identity import length_dependent_settings
 
 METHODS = ("none", "caps")  # L2C2 is not looked at until a reading is taken.
 CAP = 5.0
@@ -94,7 +94,7 @@ def score_table(found: Sequence[Reading]) -> Table:
     rows = []
     for reading in found:
         first = reading.vanilla.first
-        others = [f"{name}={value}" for name, value in first.settings_of_any_length.items()]
+        others = [f"{name}={value}" for name, value in first.settings_without_length.items()]
         start = [first.task, " ".join(others) or "the defaults", first.length]
         seeds = list(dict.fromkeys(number_range(g.seeds) for g in (reading.vanilla, reading.caps)))
         for test in ("late_mean", "late_sampled"):
@@ -149,7 +149,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
     add("--length", nargs="+", type=int, metavar="N", help="episodes, or frames, of training")
     add("--csv", metavar="CSV", help="file that gets a line for every run, or its newer line")
     chosen = parser.parse_args(arguments)
-    with told_in_a_line():
+    with one_line_errors():
         records, notes = _read(chosen.paths, chosen.length)
         if chosen.csv:
             write_records(chosen.csv, merge(read_records(chosen.csv), records))
@@ -172,7 +172,9 @@ def _read(paths: Sequence[str], lengths: Sequence[int] | None) -> tuple[list[Rec
     if not cut:
         raise UserError(f"no run is as long as {min(lengths)} episodes or frames.")
     shorter = [ExperimentConfig.from_dict(run.config) for run in cut if not run.evaluation]
-    settings = Counter(setting for config in shorter for setting in of_length(config))
+    settings = Counter(
+        setting for config in shorter for setting in length_dependent_settings(config)
+    )
     notes = [
         f"{many} runs, cut to a length, have {setting} as in their own, longer training: a "
         "training of this length would give other numbers"

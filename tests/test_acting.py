@@ -11,7 +11,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import Actor, AdditiveGaussianModule, EGreedyModule, QValueActor
 
 from tests.losses import OBSERVATION, gaussian_actor, mlp
-from torchrl_l2c2.experiment.collect.acting import on_tensors
+from torchrl_l2c2.experiment.collect.acting import policy_function
 from torchrl_l2c2.experiment.learn.compilation import compiler_available
 
 BOX, CHOICES = Bounded(-1, 1, (2,)), OneHot(4)
@@ -43,7 +43,7 @@ def test_a_compiled_policy_acts_as_it_does(make, how, monkeypatch):
     policy, keys = make()
     observations, actions = torch.randn(20, OBSERVATION), []
     for compile_policy in (False, True):
-        act = on_tensors(policy, keys, compile_policy)
+        act = policy_function(policy, keys, compile_policy)
         torch.manual_seed(1)
         with torch.no_grad(), set_exploration_type(how):
             actions.append([act(observation) for observation in observations])

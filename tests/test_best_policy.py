@@ -19,7 +19,7 @@ from torchrl_l2c2.experiment import (
     evaluate_policy,
     load_policy,
 )
-from torchrl_l2c2.experiment.agents.agent import exploring_in
+from torchrl_l2c2.experiment.agents.agent import exploration_module
 from torchrl_l2c2.experiment.cli import diagnose, export, video
 from torchrl_l2c2.experiment.cli.evaluate import main
 from torchrl_l2c2.experiment.run.evaluation import Evaluation
@@ -138,7 +138,7 @@ def test_evaluate_records_its_first_episode(folder, tmp_path):
     ("option", "told"),
     [
         ("--output=file/x.json", r"the folder '.*file' cannot be written to .*; choose another"),
-        ("--output=.", "is a folder; name a file"),
+        ("--output=.", "expected a file, got the folder"),
         ("--record=file/x.mp4", r"the folder '.*file' cannot be written to"),
         ("--record=x.foo", r"a video's file ends in .*\.mp4, got 'x.foo'"),
     ],
@@ -199,7 +199,7 @@ def test_evaluate_refuses_what_cannot_be(folder, tmp_path):
     """In one line."""
     with pytest.raises(SystemExit, match="noise_scale must be at least 0 and finite, got -1"):
         evaluated(folder, "--noise", "-1")
-    with pytest.raises(SystemExit, match="is not the folder of a run"):
+    with pytest.raises(SystemExit, match="is not a run folder"):
         main([str(tmp_path)])
     for command in (main, diagnose.main):
         with pytest.raises(SystemExit, match="error: seed must be at least 0 and below"):
@@ -250,8 +250,8 @@ def test_a_policy_of_a_checkpoint_explores_as_the_run_does(tmp_path):
     }
     experiment = Experiment(ExperimentConfig(task=task, compile=False, **settings), tmp_path)
     experiment.train()
-    rate = exploring_in(load_policy(tmp_path)[0]).eps.item()
-    assert rate == exploring_in(experiment.agent.policy).eps.item() == 0.25
+    rate = exploration_module(load_policy(tmp_path)[0]).eps.item()
+    assert rate == exploration_module(experiment.agent.policy).eps.item() == 0.25
     experiment.close()
 
 
@@ -268,5 +268,5 @@ def test_the_best_policy_is_loaded_where_there_is_one(folder, tmp_path):
     policy = load_policy(folder, best=True)[0]
     assert all(kept[k].equal(v) for k, v in policy.state_dict().items())
     shutil.copytree(folder, tmp_path / "without", ignore=shutil.ignore_patterns("policy_best.pt"))
-    with pytest.raises(FileNotFoundError, match=r"evaluate_every=N makes it .* in another folder"):
+    with pytest.raises(FileNotFoundError, match="with evaluate_every=N, in another folder"):
         load_policy(tmp_path / "without", best=True)

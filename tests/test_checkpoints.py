@@ -19,7 +19,7 @@ from torchrl_l2c2.experiment.run.checkpoints import (
     save_checkpoint,
 )
 from torchrl_l2c2.experiment.run.files import append_line
-from torchrl_l2c2.experiment.run.folder import begin_folder
+from torchrl_l2c2.experiment.run.folder import prepare_folder
 from torchrl_l2c2.experiment.settings.config import ExperimentConfig
 
 STATE = {"weights": torch.arange(100.0), "episode": 7, "names": ["a", "b"]}
@@ -29,7 +29,7 @@ def test_what_reads_back_otherwise_leaves_the_older_one(tmp_path, monkeypatch):
     """On a disk that loses a byte, the last good checkpoint is not removed for a bad one."""
     older, write = save_checkpoint(tmp_path, 1, {"a": 1}, keep=1), checkpoints.write_atomically
     monkeypatch.setattr(checkpoints, "write_atomically", lambda path, c: write(path, c[:-1]))
-    with pytest.raises(OSError, match="did not survive being written"):
+    with pytest.raises(OSError, match="was damaged while it was written"):
         save_checkpoint(tmp_path, 2, {"a": 2}, keep=1)
     assert list_checkpoints(tmp_path) == [older]
 
@@ -70,8 +70,11 @@ def test_what_is_saved_comes_back(tmp_path):
     [
         (truncated, "damaged, its checksum differs"),
         (bit_flipped, "damaged, its checksum differs"),
-        (emptied, "cut short, 0 bytes are left"),
-        (of_another_version, f"format version {FORMAT_VERSION + 1}, .* reads {FORMAT_VERSION}"),
+        (emptied, "is incomplete, with only 0 bytes"),
+        (
+            of_another_version,
+            f"version {FORMAT_VERSION + 1}, .* only version {FORMAT_VERSION}",
+        ),
         (of_something_else, "not a checkpoint of torchrl_l2c2"),
     ],
 )
@@ -86,7 +89,7 @@ def test_damage_is_told_and_the_one_before_is_used(tmp_path, damage, message):
     assert path == older and state["episode"] == 1
     assert len(damaged) == 1 and newer.name in damaged[0]
     damage(older)
-    with pytest.raises(CheckpointError, match="no checkpoint can be read"):
+    with pytest.raises(CheckpointError, match="all checkpoints are damaged"):
         load_newest(tmp_path)
 
 
@@ -164,7 +167,7 @@ def test_a_line_that_the_disk_has_no_room_for_is_taken_back(tmp_path, monkeypatc
         lambda path, *_, **__: Full(path, "ab"),
         raising=False,
     )
-    with pytest.raises(OSError, match="No space left on device: this could not be written"):
+    with pytest.raises(OSError, match="No space left on device: the file could not be written"):
         append_line(path, "another\n")
     assert path.read_text() == "whole\n"
 
@@ -172,8 +175,8 @@ def test_a_line_that_the_disk_has_no_room_for_is_taken_back(tmp_path, monkeypatc
 def test_a_run_that_begins_anew_keeps_nothing_of_the_one_before(tmp_path):
     """One that goes on from a checkpoint does."""
     of_the_way = [tmp_path / name for name in ("metrics.csv", "policy_best.pt", "evaluations.json")]
-    for begun in (True, False):
+    for resumed in (True, False):
         for path in of_the_way:
             path.touch()
-        begin_folder(tmp_path, ExperimentConfig().to_dict(), begun=begun, ended=False)
-        assert [path.exists() for path in of_the_way] == [begun] * 3
+        prepare_folder(tmp_path, ExperimentConfig().to_dict(), resumed=resumed, ended=False)
+        assert [path.exists() for path in of_the_way] == [resumed] * 3

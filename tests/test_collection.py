@@ -145,11 +145,11 @@ def test_an_episode_is_not_gone_on_with_between_its_updates(monkeypatch):
     assert {row["length"] for row in run.metrics} == {9}
 
 
-@pytest.mark.parametrize("key", ["observation", "following", "action", "reward"])
+@pytest.mark.parametrize("key", ["observation", "next_observation", "action", "reward"])
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 def test_a_frame_knows_what_is_not_finite(key, value):
     """Wherever it is."""
-    zeros = {"observation": torch.zeros(3), "following": torch.zeros(3), "reward": 0.0}
+    zeros = {"observation": torch.zeros(3), "next_observation": torch.zeros(3), "reward": 0.0}
     frame = Frame(outputs={"action": torch.zeros(1)}, terminated=False, truncated=False, **zeros)
     assert frame.is_finite()
     bad = torch.tensor([0.0, value, 0.0])
@@ -191,7 +191,7 @@ def test_other_environments_are_refused(name, make):
     """With what plays them."""
     env = OTHERS[name]()
     actor = make_actor(6, env.action_spec_unbatched)
-    with pytest.raises(ValueError, match=r"no transform but ObservationNoise, got"):
+    with pytest.raises(ValueError, match=r"no transform except ObservationNoise, got"):
         make(env, actor, frames_per_batch=20)
 
 

@@ -49,7 +49,7 @@ from torchrl_l2c2.experiment.cli.diagnose import main
 from torchrl_l2c2.experiment.errors import SimulatorError
 from torchrl_l2c2.experiment.learn.learner import Learner
 from torchrl_l2c2.experiment.learn.replay import make_replay
-from torchrl_l2c2.experiment.run.files import make_folder_of, write_json
+from torchrl_l2c2.experiment.run.files import make_parent_folder, write_json
 from torchrl_l2c2.metrics import action_variation, previous_action_gain
 
 STEPS = torch.arange(100.0)
@@ -472,8 +472,8 @@ class TestRun:
         "error",
         [
             gymnasium.error.DependencyNotInstalled("pygame is not installed"),
-            ValueError("Still-v0 draws no pictures"),
-            SimulatorError("Still-v0 could not begin: no graphics library"),
+            ValueError("Still-v0 cannot render pictures"),
+            SimulatorError("Still-v0 could not start: no graphics library"),
         ],
     )
     def test_pictures_are_left_out_where_they_cannot_be_drawn(self, run, monkeypatch, error):
@@ -574,7 +574,7 @@ class TestCommand:
 
         def folder(name, **settings):
             path = tmp_path / name / "config.json"
-            make_folder_of(path)
+            make_parent_folder(path)
             write_json(path, ExperimentConfig(**settings).to_dict())
             return str(tmp_path / name)
 
@@ -602,15 +602,15 @@ class TestCommand:
         """A folder that is no run; the same run twice; names that are too few."""
         with pytest.raises(SystemExit):
             main([str(run), str(tmp_path), "--names", "one"])
-        assert "--names: one for each of the 2 runs" in capsys.readouterr().err
+        assert "--names must have 2 names, one per run" in capsys.readouterr().err
         for wrong, message in (
-            (["--names", "a", "a"], "--names: each run needs one of its own"),
+            (["--names", "a", "a"], "--names must differ from each other"),
             (["--actions", "a.png"], "--actions must be an SVG file"),
         ):
             with pytest.raises(SystemExit):
                 main([str(run), str(tmp_path), *wrong])
             assert message in capsys.readouterr().err
-        with pytest.raises(SystemExit, match=r"^error: '.*' is not the folder of a run"):
+        with pytest.raises(SystemExit, match=r"^error: '.*' is not a run folder"):
             main([str(tmp_path)])
         for name in ("a", "b/seed_1", "b/seed_0"):
             (tmp_path / "above" / name).mkdir(parents=True)
@@ -621,6 +621,6 @@ class TestCommand:
         ]
         with pytest.raises(SystemExit):
             main([str(tmp_path / "above"), "--names", "one"])
-        assert "--names: one for each of the 3 runs" in capsys.readouterr().err
+        assert "--names must have 3 names, one per run" in capsys.readouterr().err
         with pytest.raises(SystemExit, match=r"^error: A run is named twice"):
             main([str(run), str(run)])

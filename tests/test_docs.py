@@ -18,7 +18,7 @@ from torchrl.objectives import SACLoss
 import torchrl_l2c2
 from torchrl_l2c2 import affinities
 from torchrl_l2c2.experiment.analysis.diagnosis import words
-from torchrl_l2c2.experiment.learn.learner import MEASURED_AFTER, TOLD_BELOW
+from torchrl_l2c2.experiment.learn.learner import MEASURE_AFTER, WARN_BELOW
 from torchrl_l2c2.presets import KINDS, PRESETS, presets_table
 
 ROOT = Path(__file__).parents[1]
@@ -132,8 +132,8 @@ def test_the_pages_have_the_thresholds_of_diagnose() -> None:
         assert {f"{each:g}" for each in thresholds} <= set(re.findall(r"-?[\d.]*\d", rows[finding]))
     assert f"at least {words.CONCENTRATED:g} of a change" in page
     check = (FOLDER / "check.md").read_text()
-    assert f"| below {words.FAINT:g} |" in check and f"| below {TOLD_BELOW:.4f} |" in check
-    assert f"after {MEASURED_AFTER} updates" in check
+    assert f"| below {words.FAINT:g} |" in check and f"| below {WARN_BELOW:.4f} |" in check
+    assert f"after {MEASURE_AFTER} updates" in check
 
 
 def test_a_marked_block_is_left_out_and_the_others_share_a_namespace(tmp_path: Path) -> None:

@@ -9,12 +9,12 @@ import torch
 from processes import ROOT, run_train
 
 from torchrl_l2c2.experiment.cli.main import main
-from torchrl_l2c2.experiment.cli.train import _tell
+from torchrl_l2c2.experiment.cli.train import _print_error
 from torchrl_l2c2.experiment.errors import (
     MissingPackageError,
     SimulatorError,
     UserError,
-    told_in_a_line,
+    one_line_errors,
 )
 from torchrl_l2c2.experiment.run.checkpoints import CheckpointError
 from torchrl_l2c2.experiment.run.lock import FolderInUseError
@@ -28,7 +28,7 @@ TOLD = [
     MissingPackageError("onnx is missing"),
     OSError("no space left"),
     FloatingPointError("reward is not finite"),
-    SimulatorError("failed beyond frame 3"),
+    SimulatorError("failed after frame 3"),
 ]
 BUGS = [
     ValueError("unknown mode"),
@@ -43,9 +43,9 @@ BUGS = [
 @pytest.mark.parametrize("error", TOLD, ids=lambda error: type(error).__name__)
 def test_what_a_user_can_mend_is_one_line(error, capsys):
     """In the command that trains, and in all others."""
-    assert str(error) in _tell(error)
+    assert str(error) in _print_error(error)
     assert capsys.readouterr().err.startswith(f"error: {error}")
-    with pytest.raises(SystemExit) as ended, told_in_a_line():
+    with pytest.raises(SystemExit) as ended, one_line_errors():
         raise error
     assert ended.value.code == f"error: {error}"
 
@@ -53,16 +53,16 @@ def test_what_a_user_can_mend_is_one_line(error, capsys):
 @pytest.mark.parametrize("error", BUGS, ids=lambda error: type(error).__name__)
 def test_a_bug_is_a_traceback(error, capsys):
     """Only its first line is kept for a sweep's end."""
-    with pytest.raises(type(error)), told_in_a_line():
+    with pytest.raises(type(error)), one_line_errors():
         raise error
-    assert _tell(error) == f"{type(error).__name__}: {error}"
+    assert _print_error(error) == f"{type(error).__name__}: {error}"
     told = capsys.readouterr().err
     assert told.startswith("Traceback (most recent call last):") and "error: " not in told
 
 
 def test_an_error_without_a_text_has_its_name():
     """For a sweep's end."""
-    assert _tell(AssertionError()) == "AssertionError"
+    assert _print_error(AssertionError()) == "AssertionError"
 
 
 def too_large(size):
@@ -79,8 +79,8 @@ def too_large(size):
 def test_too_little_memory_is_told_with_the_settings_that_need_it(error):
     """PyTorch's own errors on the CPU are plain RuntimeErrors."""
     error = too_large(error) if isinstance(error, int) else error
-    told = _tell(error)
-    assert "There is no memory for it: choose smaller algorithm.hidden, replay.capacity" in told
+    told = _print_error(error)
+    assert "Not enough memory: decrease algorithm.hidden, replay.capacity" in told
 
 
 def test_help_may_have_no_reader():
@@ -96,7 +96,7 @@ def test_help_may_have_no_reader():
 @pytest.mark.parametrize(
     ("setting", "told"),
     [
-        ("task.env_id=Nowhere-v0", "'Nowhere-v0' is not a task that Gymnasium can make here"),
+        ("task.env_id=Nowhere-v0", "'Nowhere-v0' is not a task that Gymnasium can create here"),
         ("task.env_id=my_robot:Robot-v0", "No module named 'my_robot'"),
         ("resume=nowhere", "resume='nowhere' holds no checkpoint"),
     ],

@@ -208,7 +208,7 @@ def test_the_replay_ratio_is_how_often_a_transition_is_drawn():
     ratio = Experiment(small(algorithm=PPORPEConfig(replay_ratio=2.0)))
     # 40 frames an episode, batches of 32: 2.5 updates each.
     assert [row["updates"] for row in ratio.train()] == [2, 5]
-    with pytest.raises(ValueError, match="replay_ratio and updates both say"):
+    with pytest.raises(ValueError, match="replay_ratio and updates both set"):
         PPORPEConfig(replay_ratio=2.0, updates=3)
     # The default ratio gives way to a number.
     assert PPORPEConfig(updates=3).updates_after(40, 80, 80, 32) == 3
@@ -319,9 +319,9 @@ def broken_after(experiment, frames, outcome):
         (
             RuntimeError("physics gone"),
             SimulatorError,
-            "failed beyond frame 40: .* physics gone",
+            "failed after frame 40: .* physics gone",
         ),
-        (SystemExit(4), SimulatorError, r"failed beyond frame 40: SystemExit: 4\."),
+        (SystemExit(4), SimulatorError, r"failed after frame 40: SystemExit: 4\."),
     ],
 )
 def test_a_broken_simulator_stops_the_run_and_leaves_a_checkpoint(
@@ -493,10 +493,10 @@ def test_a_run_from_the_command_line_leaves_everything_behind(tmp_path):
     (run.folder / "learning_curves.png").unlink()
     again = run_train(*PENDULUM_OVERRIDES, "evaluate_every=1", folder=tmp_path)
     assert again.stdout.count("2 test episodes, seed 0") == 2
-    assert "finished before: its results follow" in again.stdout
+    assert "finished before: these are its results" in again.stdout
     assert "finished before" not in finished.stdout
     assert "mean of the last 3 episodes: return " in finished.stderr
-    assert "evaluate_every=1 changes nothing: it is of training, which is over" in again.stderr
+    assert "evaluate_every=1 has no effect: training is over" in again.stderr
     assert (run.folder / "learning_curves.png").exists()
 
 
@@ -598,7 +598,7 @@ def test_a_wrong_setting_ends_with_one_clear_line(tmp_path):
     [
         (
             {"task": TaskConfig("cartpole", "CartPole-v1")},
-            "ppo_rpe needs continuous actions, this task's are OneHot",
+            "ppo_rpe needs continuous actions, got OneHot",
         ),
         (
             {"algorithm": TD3Config(), "regularizer": LCPConfig()},

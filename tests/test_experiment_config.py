@@ -31,7 +31,7 @@ from torchrl_l2c2.experiment.cli.composition import (
     check_budget,
     check_folders,
     check_preset,
-    preset_used,
+    describe_preset,
 )
 from torchrl_l2c2.experiment.cli.manual import manual, page
 from torchrl_l2c2.experiment.settings.config import GROUPS
@@ -284,7 +284,7 @@ def test_episodes_beside_a_presets_frames_are_refused():
     """They would not be read; frames that are switched off leave them."""
     chosen = ["preset=rl_zoo", "task=pendulum", "algorithm=ppo", "task.episodes=5"]
     config = ExperimentConfig.from_dict(composed(*chosen))
-    with pytest.raises(SettingError, match=r"task\.episodes is not read .* 500000: give task\."):
+    with pytest.raises(SettingError, match=r"task\.episodes has no effect .*500000: set task\."):
         check_budget(config, chosen)
     check_budget(config, chosen[:-1])
     check_budget(ExperimentConfig.from_dict(composed(*chosen, "task.frames=null")), chosen)
@@ -358,7 +358,7 @@ def test_a_regularizer_begins_with_the_preset_of_the_algorithm(name, algorithm):
         assert getattr(config.regularizer, setting) == value
     ramped = own.get("gain", "constant" if table.ramp is None else "ramp") == "ramp"
     assert config.regularizer.ramped == ramped
-    told = preset_used(config)
+    told = describe_preset(config)
     assert all(f"{setting}={value}" in told for setting, value in table.settings.items())
     assert (table.evidence or "its authors' settings") in told
 
@@ -376,12 +376,14 @@ def test_l2c2_paper_begins_with_the_papers_settings():
     """With any algorithm."""
     paper = ExperimentConfig.from_dict(composed("algorithm=sac", "regularizer=l2c2_paper"))
     assert dataclasses.replace(paper.regularizer, name="l2c2") == L2C2Config()
-    assert preset_used(paper) is None and preset_settings("l2c2_paper", "sac") == {}
+    assert describe_preset(paper) is None and preset_settings("l2c2_paper", "sac") == {}
 
 
 def test_an_algorithm_without_a_preset_is_reported():
     """Q-learning has none."""
-    told = preset_used(ExperimentConfig.from_dict(composed("algorithm=dqn", "regularizer=l2c2")))
+    told = describe_preset(
+        ExperimentConfig.from_dict(composed("algorithm=dqn", "regularizer=l2c2"))
+    )
     assert "there is no preset for dqn" in told
 
 
@@ -434,7 +436,7 @@ def test_settings_survive_a_round_trip():
     [
         (
             {"task": {"episode": 3}},
-            "task.episode is not a setting; here there are action_rate, env_id",
+            "task.episode is not a setting; choose from action_rate, env_id",
         ),
         ({"task": {"episodes": 0}}, "task.episodes must be greater than or equal to 1, got 0"),
         ({"task": {"noise_scale": -1.0}}, "task.noise_scale must be greater than or equal to 0"),
@@ -453,10 +455,10 @@ def test_settings_survive_a_round_trip():
         ({"seed": -1}, "seed must be greater than or equal to 0, got -1"),
         ({"compile": 1}, "compile must be a valid boolean, got 1"),
         ({"test_episodes": True}, "test_episodes must be a valid integer, got True"),
-        ({"sed": 1}, "sed is not a setting; here there are algorithm"),
+        ({"sed": 1}, "sed is not a setting; choose from algorithm"),
         (
             {"regularizer": {"name": "l2c2", "lambda_min": 2.0}},
-            r"regularizer\.lambda_max must be above lambda_min .*, here above 2, got 1: raise it",
+            r"regularizer\.lambda_max must be above lambda_min .*, here above 2, got 1: increase",
         ),
         (
             {"regularizer": {"name": "l2c2", "sigma": 4.0, "lambda_min": 0.5}},
@@ -483,7 +485,7 @@ def test_wrong_settings_are_refused_with_what_is_allowed(settings, message):
         ({"replay": GROUPS["replay"]["rollout"]}, "'rollout' is nothing that algorithm 'ppo_rpe'"),
         (
             {"algorithm": PPOConfig(), "replay": GROUPS["replay"]["uniform"]},
-            "'uniform' is nothing that algorithm 'ppo' can learn from",
+            "'uniform' does not work with algorithm 'ppo'",
         ),
     ],
 )

@@ -264,7 +264,7 @@ def test_the_command_prints_the_contract_and_says_what_is_wrong(pendulum, tmp_pa
     main([str(folder), "--output", str(tmp_path / "elsewhere")])
     assert json.loads(capsys.readouterr().out)["policy"] == "policy.pt"
     assert (tmp_path / "elsewhere" / "policy.onnx").exists()
-    with pytest.raises(SystemExit, match=r"error: '.*' is not the folder of a run"):
+    with pytest.raises(SystemExit, match=r"error: '.*' is not a run folder"):
         main([str(tmp_path)])
 
 

@@ -253,7 +253,7 @@ class TestInARun:
     @pytest.fixture
     def measured_soon(self, monkeypatch):
         """After 20 updates, not 100, it is told which regularizer is faint."""
-        monkeypatch.setattr("torchrl_l2c2.experiment.learn.learner.MEASURED_AFTER", 20)
+        monkeypatch.setattr("torchrl_l2c2.experiment.learn.learner.MEASURE_AFTER", 20)
 
     @pytest.mark.parametrize("kind", ["constant", "ramp", "target"])
     def test_a_gain_that_does_not_rise_by_itself_is_told_to_be_faint(self, kind, measured_soon):
@@ -264,7 +264,7 @@ class TestInARun:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             run.train(2)
-        told = [w for w in caught if "regularizer's terms are less" in str(w.message)]
+        told = [w for w in caught if "regularizer's terms are below" in str(w.message)]
         assert len(told) == (kind != "target")
         if kind == "ramp":
             assert run.agent.loss.regularizer_gain == run.metrics[-1]["gain_measured"] > 0.0
@@ -381,7 +381,7 @@ class TestRefusals:
             warnings.simplefilter("always")
             run.train(3)
         told = [str(w.message) for w in caught if f"gain_of={column} is" in str(w.message)]
-        assert len(told) == 1 and "numbers of at least 0" in told[0]
+        assert len(told) == 1 and "Choose a nonnegative metric" in told[0]
 
     @pytest.mark.parametrize(
         ("settings", "message"),

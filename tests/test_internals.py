@@ -31,10 +31,10 @@ from torchrl_l2c2 import ObservationNoise, make_actor, make_critic
 from torchrl_l2c2.experiment.agents._torchrl_internals import (
     RowWriter,
     TraceableClipPPOLoss,
+    add_noise,
+    clear_detached_parameters,
     first_observation,
-    forget_traced,
     load_replay_state,
-    noisy,
     replay_state,
     simulator_of,
     stored_tensors,
@@ -181,7 +181,7 @@ def test_noise_is_that_of_the_transform():
     seen = torch.arange(3.0)
     one, other = (ObservationNoise(0.5, generator=torch.Generator().manual_seed(2)) for _ in "ab")
     expected = one(TensorDict({"observation": seen}))["observation"]
-    assert torch.equal(noisy(other, seen), expected) and not torch.equal(expected, seen)
+    assert torch.equal(add_noise(other, seen), expected) and not torch.equal(expected, seen)
 
 
 def ppo(kind):
@@ -226,7 +226,7 @@ def test_a_loss_forgets_what_it_detached():
     loss = ClipPPOLoss(make_actor(3, 1), ValueOperator(network, ["observation"]))
     before = loss._cached_critic_network_params_detached
     assert loss._cached_critic_network_params_detached is before
-    forget_traced(loss)
+    clear_detached_parameters(loss)
     assert loss._cached_critic_network_params_detached is not before
 
 

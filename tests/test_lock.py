@@ -66,9 +66,9 @@ def test_of_two_processes_one_has_the_folder_and_the_other_is_told_which(tmp_pat
 def test_a_folder_is_given_back_with_its_holder(tmp_path):
     """By a call or by being collected; the one process may have several."""
     first, second = Run(), Run()
-    give_back = lock_folder(tmp_path, first)
+    release = lock_folder(tmp_path, first)
     lock_folder(tmp_path, second)
-    give_back()
+    release()
     other = contender(tmp_path)
     go(other)
     assert "in use by process" in other.stdout.readline()

@@ -29,7 +29,7 @@ from torchrl_l2c2.experiment import (
 from torchrl_l2c2.experiment.agents.normalization import Normalization
 from torchrl_l2c2.experiment.agents.optimizers import anneal, make_optimizer
 from torchrl_l2c2.experiment.envs.environments import NOISE_SEED
-from torchrl_l2c2.experiment.learn.learner import MOST_SKIPPED
+from torchrl_l2c2.experiment.learn.learner import MAX_SKIPPED
 from torchrl_l2c2.experiment.run.checkpoints import list_checkpoints
 from torchrl_l2c2.experiment.run.evaluation import LateTests
 from torchrl_l2c2.experiment.settings.tasks import Budget
@@ -94,7 +94,7 @@ def test_the_observation_before_is_normalized_as_the_others():
     now = {"observation": seen[:-1], "previous_observation": seen[:-1].clone()}
     frames = TensorDict({**now, "next": then}, [20])
     norm([frames])
-    norm.follow()
+    norm.apply_statistics()
     (given,) = norm([frames])
     assert given["previous_observation"].equal(given["observation"])
     assert not given["observation"].allclose(frames["observation"])
@@ -150,7 +150,7 @@ def test_a_transition_that_spoils_batches_is_drawn_once(compile):
     assert run.learner.skipped_updates == rows[0]["skipped_updates"] == 1
     assert run.learner.updates > 20
     factor = run.config.algorithm.reward_factor
-    assert run.learner.update.culprit == (29, pytest.approx(1e30 * factor, rel=1e-3))
+    assert run.learner.update.bad_row == (29, pytest.approx(1e30 * factor, rel=1e-3))
 
 
 def test_a_run_that_skips_every_update_stops_and_names_the_reward():
@@ -159,14 +159,14 @@ def test_a_run_that_skips_every_update_stops_and_names_the_reward():
     run.train()
     updates = run.learner.updates
     trained = next(p for p in run.agent.loss.parameters() if p.requires_grad)
-    for skipped in (MOST_SKIPPED - 1, MOST_SKIPPED):
+    for skipped in (MAX_SKIPPED - 1, MAX_SKIPPED):
         hook = trained.register_hook(lambda gradient: gradient * math.nan)
         run.learner.learn(skipped)
         hook.remove()
-        if skipped < MOST_SKIPPED:
+        if skipped < MAX_SKIPPED:
             run.learner.report(80)
             run.learner.learn(1)
-    row, reward = run.learner.update.culprit
+    row, reward = run.learner.update.bad_row
     reward /= run.config.algorithm.reward_factor
     told = rf"^100 updates .* after update {updates + 1} \(frame 80\), .* Row {row} .*{reward:g}:"
     with pytest.raises(FloatingPointError, match=told):

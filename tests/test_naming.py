@@ -18,7 +18,7 @@ from torchrl_l2c2.experiment import (
     UniformReplayConfig,
 )
 from torchrl_l2c2.experiment.settings.config import GROUPS
-from torchrl_l2c2.experiment.settings.naming import LONGEST, run_name
+from torchrl_l2c2.experiment.settings.naming import MAX_PART_LENGTH, run_name
 
 SWINGUP = GROUPS["task"]["swingup"]
 
@@ -83,7 +83,7 @@ def test_shells_hydra_and_every_file_system_take_a_name_as_it_is(beta, env_id, h
     (override,) = OverridesParser.create().parse_overrides([f"resume=outputs/{name}"])
     assert override.value() == f"outputs/{name}" and not override.is_sweep_override()
     for part in name.split("/"):
-        assert 0 < len(part) <= LONGEST and not part.endswith(".")
+        assert 0 < len(part) <= MAX_PART_LENGTH and not part.endswith(".")
 
 
 def test_long_names_of_different_settings_differ():

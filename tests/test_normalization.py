@@ -42,7 +42,7 @@ def test_a_rollout_has_the_statistics_that_acted():
     first = norm(frames)
     for given, played in zip(first, frames, strict=True):
         assert given["observation"].equal(played["observation"].clamp(-10, 10))
-    norm.follow()
+    norm.apply_statistics()
     all_seen = torch.cat([each["observation"] for each in frames])
     mean, deviation = all_seen.mean(0), all_seen.std(0, unbiased=False)
     second = norm(frames)
@@ -69,7 +69,7 @@ def test_what_is_far_out_is_clipped():
     """At ten deviations."""
     norm, frames = make(), [rollout(30), rollout(30, seed=1)]
     norm(frames)
-    norm.follow()
+    norm.apply_statistics()
     assert norm.normalize(torch.tensor([1e6, -1e6])).tolist() == [10.0, -10.0]
     frames[0]["next", "reward"][3] = 1e6
     assert norm.normalized(frames[0])["next", "reward"].max() == 10.0
@@ -86,7 +86,7 @@ def test_what_never_changes_is_divided_by_a_ten_thousandth():
 def test_either_is_left_as_it_is_where_it_is_not_normalized(kind):
     norm, frames = make(**{kind: False}), [rollout(30), rollout(30, seed=1)]
     norm(frames)
-    norm.follow()
+    norm.apply_statistics()
     given = norm(frames)[0]
     same = given["next", "observation"].equal(frames[0]["next", "observation"])
     assert same == (kind == "observations")

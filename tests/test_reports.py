@@ -741,11 +741,11 @@ class TestReport:
         with pytest.raises(SystemExit, match=r"error: there is no file"):
             main(["--from", str(tmp_path / "runs.csv")])
         write_records(tmp_path / "none.csv", [])
-        with pytest.raises(SystemExit, match=r"error: no record of a run in '.*none\.csv'"):
+        with pytest.raises(SystemExit, match=r"error: no runs in '.*none\.csv'"):
             main(["--from", str(tmp_path / "none.csv"), "--output", str(tmp_path / "rep")])
         with pytest.raises(SystemExit):
             main([])
-        assert "name folders of runs" in capsys.readouterr().err
+        assert "expected either folders of runs" in capsys.readouterr().err
 
 
 def test_a_report_that_cannot_be_drawn_leaves_none(tmp_path, monkeypatch):

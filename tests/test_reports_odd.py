@@ -136,10 +136,10 @@ class TestFolders:
     @pytest.mark.parametrize(
         ("name", "old", "new", "told"),
         [
-            ("metrics.csv", "\n3,300,", "\n3,3x,", "line 4: frames is no number, but '3x'"),
+            ("metrics.csv", "\n3,300,", "\n3,3x,", "line 4: frames must be a number, got '3x'"),
             ("metrics.csv", None, "episode,frames\n", "has 0 episodes, fewer than the 1"),
             ("evaluation.json", '"return_mean": 21.0', f'"return_mean": {"9" * 400}', "too large"),
-            ("versions.json", None, "[" * 99999, "brackets within brackets"),
+            ("versions.json", None, "[" * 99999, "too many nested brackets"),
         ],
     )
     def test_a_damaged_run_is_named_and_left_out(self, tmp_path, name, old, new, told):

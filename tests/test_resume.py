@@ -32,8 +32,8 @@ from torchrl_l2c2.experiment import (
     UniformReplayConfig,
 )
 from torchrl_l2c2.experiment.analysis.reports import find_runs, finished_run, read_runs
-from torchrl_l2c2.experiment.cli.train import _end_logged, run
-from torchrl_l2c2.experiment.errors import OtherRunError, warnings_told
+from torchrl_l2c2.experiment.cli.train import _log_errors, run
+from torchrl_l2c2.experiment.errors import OtherRunError, warnings_as_lines
 from torchrl_l2c2.experiment.run.checkpoints import (
     CheckpointError,
     list_checkpoints,
@@ -43,7 +43,7 @@ from torchrl_l2c2.experiment.run.checkpoints import (
 from torchrl_l2c2.experiment.run.continuation import check_same_settings
 from torchrl_l2c2.experiment.run.files import write_json
 from torchrl_l2c2.experiment.run.policies import load_policy
-from torchrl_l2c2.experiment.run.progress import say
+from torchrl_l2c2.experiment.run.progress import show_and_log
 from torchrl_l2c2.experiment.settings.config import GROUPS
 from torchrl_l2c2.experiment.settings.identity import fingerprint
 from torchrl_l2c2.experiment.settings.naming import run_name
@@ -267,7 +267,7 @@ def test_a_setting_that_is_new_and_off_leaves_a_run_finished(ended):
 
 def test_what_only_training_reads_is_told_when_that_is_over(trained):
     """And not where the run goes on."""
-    told = "evaluate_every=2 changes nothing: it is of training, which is over .* Choose another"
+    told = "evaluate_every=2 has no effect: training is over .* Choose another"
     with pytest.warns(UserWarning, match=told):
         Experiment(small(evaluate_every=2), trained).close()
     with warnings.catch_warnings():
@@ -281,7 +281,7 @@ def test_a_finished_run_without_checkpoints_is_not_begun_anew(ended):
         path.unlink()
     before = contents(ended)
     with pytest.raises(
-        CheckpointError, match=r"has ended, and no checkpoint.* any more to continue"
+        CheckpointError, match=r"has the results of a run, but no checkpoint.* to continue"
     ):
         Experiment(small(test_episodes=3), ended)
     assert contents(ended) == before
@@ -302,7 +302,7 @@ def test_a_test_of_other_length_replaces_the_old_one_when_it_has_ended(ended):
 def test_changed_settings_are_refused_and_nothing_is_overwritten(trained):
     """The error names the setting with both values."""
     before = contents(trained)
-    with pytest.raises(ValueError, match=r"regularizer.sigma=1.0, not 2.0: give the same"):
+    with pytest.raises(ValueError, match=r"regularizer.sigma=1.0, not 2.0: use the same"):
         Experiment(small(regularizer=L2C2Config(sigma=2.0)), trained)
     assert contents(trained) == before
 
@@ -314,7 +314,7 @@ def test_a_damaged_newest_checkpoint_gives_the_run_from_the_one_before(tmp_path)
     expected, rows = parameter_hash(whole), lines(tmp_path)
     newest, older = list_checkpoints(tmp_path)
     newest.write_bytes(newest.read_bytes()[:-1])
-    with pytest.warns(UserWarning, match="checksum differs.*one before it is used"):
+    with pytest.warns(UserWarning, match="checksum differs.*previous checkpoint is used"):
         again = Experiment(small(), tmp_path)
     assert len(again.metrics) == int(older.stem.split("_")[1])
     again.train()
@@ -378,7 +378,7 @@ def test_what_is_no_run_is_refused_where_there_is_one_already(ended):
     values = {"resume": str(ended / "nonsense"), "allow_other_versions": False}
     for again in (partial(Experiment, small(), ended, resume=values["resume"]),
                   partial(run, small(), ended, values)):  # fmt: skip
-        with pytest.raises(CheckpointError, match=r"nonsense' holds no checkpoint_.*leave resume"):
+        with pytest.raises(CheckpointError, match=r"nonsense' has no checkpoint_.*leave resume"):
             again()
 
 
@@ -474,7 +474,7 @@ def test_what_changes_no_number_may_change(trained):
 def test_which_policies_are_tested_may_not_change_where_a_gain_follows_the_tests():
     """Nor are such runs pooled, or share a folder."""
     now, other = (small(regularizer=OF_TESTS, late_share=share) for share in (0.1, 0.5))
-    with pytest.raises(OtherRunError, match=r"late_share=0.1, not 0.5: .*shell, outputs=FOLDER"):
+    with pytest.raises(OtherRunError, match=r"late_share=0.1, not 0.5: .*line, outputs=FOLDER"):
         check_same_settings(now.to_dict(), other.to_dict())
     assert fingerprint(now.to_dict()) != fingerprint(other.to_dict())
     assert run_name(now) != run_name(other)
@@ -493,9 +493,7 @@ def test_a_setting_that_changes_nothing_may_be_new():
     saved = small().to_dict()
     del saved["regularizer"]["policy_distance"]
     check_same_settings(saved, small().to_dict())
-    with pytest.raises(
-        OtherRunError, match=r"policy_distance=none, as it is a setting since, not mean"
-    ):
+    with pytest.raises(OtherRunError, match=r"policy_distance=none \(a newer setting\), not mean"):
         now = small(regularizer=L2C2Config(policy_distance="mean"))
         check_same_settings(saved, now.to_dict())
 
@@ -503,7 +501,7 @@ def test_a_setting_that_changes_nothing_may_be_new():
 def test_another_choice_is_named_and_not_what_it_brings():
     """Its settings are others, too, and come first in the alphabet."""
     saved = small(regularizer=NoRegularizerConfig()).to_dict()
-    with pytest.raises(OtherRunError, match=r"made with regularizer=none, not l2c2: give the same"):
+    with pytest.raises(OtherRunError, match=r"made with regularizer=none, not l2c2: use the same"):
         check_same_settings(saved, small().to_dict())
 
 
@@ -516,7 +514,7 @@ def test_metrics_that_another_program_has_saved_are_refused(tmp_path):
     metrics = tmp_path / "metrics.csv"
     content = metrics.read_bytes()
     metrics.write_bytes(content.replace(b"\n", b"\r\n"))
-    with pytest.raises(ValueError, match="is not what the checkpoint was taken with"):
+    with pytest.raises(ValueError, match="was changed after the checkpoint"):
         Experiment(config, tmp_path)
     metrics.write_bytes(content)
     assert len(Experiment(config, tmp_path).train()) == 3
@@ -546,7 +544,7 @@ def test_a_full_disk_names_the_file_and_the_last_good_checkpoint(tmp_path, monke
 
 def test_a_warning_is_a_line_in_the_log_too(tmp_path, capsys):
     """And not Python's, with a line of its source."""
-    with warnings_told(partial(say, tmp_path)):
+    with warnings_as_lines(partial(show_and_log, tmp_path)):
         warnings.warn("hardly regularized", stacklevel=1)
     assert capsys.readouterr().err == "warning: hardly regularized\n"
     assert (tmp_path / "train.log").read_text().endswith(" warning: hardly regularized\n")
@@ -555,7 +553,7 @@ def test_a_warning_is_a_line_in_the_log_too(tmp_path, capsys):
 def test_an_error_that_there_is_no_room_to_log_is_told(tmp_path):
     """And not that of the log in its place."""
     (tmp_path / "train.log").mkdir()
-    with pytest.raises(ValueError, match="its own"), _end_logged(tmp_path):
+    with pytest.raises(ValueError, match="its own"), _log_errors(tmp_path):
         raise ValueError("its own")
 
 

@@ -85,8 +85,8 @@ def test_several_simulators_play_their_own_episodes():
     for seed, frames in zip(seeds, together, strict=True):
         assert_same(frames, played(collector_of(NOISY, [seed], 10, **mean), 2)[0])
     # Of 20 frames each, nine an episode: in the second rollout the one of frames 9 to 17 ends.
-    assert [episode.frame for episode in collector.ended] == [22, 23, 24]
-    for frames, episode in zip(together, collector.ended, strict=True):
+    assert [episode.frame for episode in collector.finished_episodes] == [22, 23, 24]
+    for frames, episode in zip(together, collector.finished_episodes, strict=True):
         assert_same(episode.transitions, frames[9:18])
 
 
@@ -96,7 +96,7 @@ def test_episodes_in_the_middle_are_saved(task):
     first = collector_of(task, [3, 4], 50)
     first.rollout()
     state, draws = first.generator_state(), torch.get_rng_state()
-    expected, ended = played(first, 4), [e.transitions for e in first.ended]
+    expected, ended = played(first, 4), [e.transitions for e in first.finished_episodes]
     again = collector_of(task, [8, 9], 50)
     again.set_generator_state(state)
     torch.set_rng_state(draws)
@@ -104,7 +104,7 @@ def test_episodes_in_the_middle_are_saved(task):
     assert sum(stream["next", "done"].sum() for stream in expected) >= 1
     for ours, theirs in zip(frames, expected, strict=True):
         assert (ours == theirs).all()
-    for ours, theirs in zip(again.ended, ended, strict=True):
+    for ours, theirs in zip(again.finished_episodes, ended, strict=True):
         assert (ours.transitions == theirs).all()
 
 
@@ -183,7 +183,7 @@ def test_a_simulator_that_does_not_repeat_itself_is_told():
     with pytest.warns(UserWarning, match="plays an episode differently the second time"):
         collector.set_generator_state(collector.generator_state())
     played(collector, 2)
-    assert len(collector.ended[-1].transitions) == 20
+    assert len(collector.finished_episodes[-1].transitions) == 20
 
 
 ADAM, NONE = AdamConfig(), NoRegularizerConfig()

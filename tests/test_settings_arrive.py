@@ -27,7 +27,7 @@ from torchrl_l2c2.experiment import (
 from torchrl_l2c2.experiment.agents.agent import Agent
 from torchrl_l2c2.experiment.agents.build import make_algorithm
 from torchrl_l2c2.experiment.agents.optimizers import make_optimizer
-from torchrl_l2c2.experiment.agents.regularizers import add_regularizer, neighborhood_of
+from torchrl_l2c2.experiment.agents.regularizers import add_regularizer, make_neighborhood
 from torchrl_l2c2.experiment.learn.replay import make_buffer
 from torchrl_l2c2.experiment.learn.update import make_update
 from torchrl_l2c2.experiment.settings.regularizers import REGULARIZERS, GainConfig
@@ -148,7 +148,7 @@ def test_those_of_a_regularizer(config, attributes):
     """Two runs of the same settings agree also where these are dropped."""
     loss = add_regularizer(normal(), config)
     assert {name: getattr(loss, name) for name in attributes} == attributes
-    if neighborhood_of(config) is not None:
+    if make_neighborhood(config) is not None:
         assert loss.l2c2_neighborhood.max_step == 2.0
 
 

@@ -185,7 +185,7 @@ def test_a_launcher_says_what_it_needs(name, monkeypatch):
 @pytest.mark.parametrize(
     ("sweep", "told"),
     [
-        ("seed=range(3,0)", "error: a sweep of no job: one of -m seed=range"),
+        ("seed=range(3,0)", "error: the sweep has no jobs: one of -m seed=range"),
         (
             "experiment=cartpole,pendulum",
             "error: experiment=cartpole,pendulum: each ",
@@ -197,7 +197,7 @@ def test_a_launcher_says_what_it_needs(name, monkeypatch):
         ("experiment=[cartpole,pendulum]", "error: experiment=[cartpole,pendulum]: each "),
         (
             "optimizer.lr=interval(0,1)",
-            "error: an interval is nothing to sweep over: examples",
+            "error: sweeps do not support intervals: use examples",
         ),
     ],
 )
@@ -207,7 +207,7 @@ def test_a_sweep_of_nothing_says_so(sweep, told):
         check_sweep(["-m", sweep])
     check_sweep(["-m", "regularizer=glob(l2c2*)", "seed=0,1", "experiment=cartpole"])
     with begin_sweep(["-m", "regularizer=glob(l2c2*)"]) as begun:
-        assert begun.standing(2, {}) == "run 2"
+        assert begun.status(2, {}) == "run 2"
 
 
 def test_a_sweep_that_is_refused_ends_and_leaves_nothing(tmp_path):
@@ -235,16 +235,16 @@ def test_a_sweep_says_how_much_of_it_is_left():
     """By each task's mean of what is finished, and the tasks' mean for one of which none is."""
     with begin_sweep(["-m", "seed=0,1,2", "~logger"]) as begun:
         params = {"seed": "range(0,18)", "task": "a,b,c", "regularizer": "none,caps"}
-        assert begun.standing(1, params) == "run 1 of 18"
+        assert begun.status(1, params) == "run 1 of 18"
         # Of a 30 minutes and 50, of b 20; then c takes 30, and five of each are 7.5 hours.
         for number, seconds in enumerate((1800.0, 3000.0, 1200.0, float("nan"))):
             begun.add_finished(number, Path("run"), seconds)
-        assert begun.standing(5, params) == "run 5 of 18, about 7.0 h left"
+        assert begun.status(5, params) == "run 5 of 18, about 7.0 h left"
         # As a job sees it, in whatever process.
         with begun.job(4, "seed=0"), begun.job(5, "seed=0"):
-            standing = Sweep.of_this_job().standing(7, params)
-            assert standing == "run 7 of 18, about 3.0 h left"
-        assert begun.standing(18, params) == "run 18 of 18, about 30 min left"
+            status = Sweep.of_this_job().status(7, params)
+            assert status == "run 7 of 18, about 3.0 h left"
+        assert begun.status(18, params) == "run 18 of 18, about 30 min left"
 
 
 def test_a_job_that_did_not_end_is_named_and_known_when_it_begins_again(tmp_path):
@@ -271,7 +271,7 @@ def test_two_jobs_do_not_share_a_folder(tmp_path):
         sweep.claim(1, tmp_path / "seed_1")
         sweep.claim(0, tmp_path / "seed_0")
         with pytest.raises(
-            SettingError, match=r"another for job 2 than for job 0 .*seed_0: they have"
+            SettingError, match=r"differ between jobs 0 and 2 .*seed_0: their settings"
         ):
             sweep.claim(2, tmp_path / "seed_0")
 
@@ -291,7 +291,7 @@ def test_a_machine_without_the_outputs_is_named(tmp_path):
     with begin_sweep() as begun:
         begun.share(tmp_path / "outputs")
         (tmp_path / "outputs").rename(tmp_path / "moved")
-        with pytest.raises(UserError, match=r"outputs' is not on .* all machines share"):
+        with pytest.raises(UserError, match=r"outputs' does not exist on .* all machines share"):
             Sweep.of_this_job()
 
 

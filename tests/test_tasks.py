@@ -205,7 +205,7 @@ def test_actions_that_can_take_one_value_alone_are_refused_where_they_are_drawn(
     if name == "td3":
         experiment(name, task())
         return
-    with pytest.raises(ValueError, match=r"entries \[1\] of this task's can take only one value"):
+    with pytest.raises(ValueError, match=r"entries \[1\] of this task's actions have only one"):
         experiment(name, task())
 
 
@@ -232,16 +232,19 @@ def test_a_reward_may_be_an_array_of_one_number(monkeypatch, name, settings):
         if count == 1:
             assert all(math.isfinite(row["return"]) for row in run.train())
             continue
-        with pytest.raises(SimulatorError, match=r"Still-v0 failed .* must be one number, got arr"):
+        with pytest.raises(
+            SimulatorError,
+            match=r"Still-v0 failed .* expected one number as the reward",
+        ):
             run.train()
 
 
 @pytest.mark.parametrize(
     ("method", "raises", "message"),
     [
-        ("__init__", KeyError("licence"), "Still-v0 could not begin: KeyError: 'licence'"),
-        ("reset", TypeError("no seed"), "Still-v0 could not begin: TypeError: no seed"),
-        ("reset", SystemExit(3), "Still-v0 could not begin: SystemExit: 3"),
+        ("__init__", KeyError("licence"), "Still-v0 could not start: KeyError: 'licence'"),
+        ("reset", TypeError("no seed"), "Still-v0 could not start: TypeError: no seed"),
+        ("reset", SystemExit(3), "Still-v0 could not start: SystemExit: 3"),
     ],
 )
 def test_what_a_task_raises_before_it_plays_names_it(monkeypatch, method, raises, message):
@@ -300,7 +303,7 @@ def test_a_task_that_cannot_draw_says_so(monkeypatch, modes):
     """It has no render(), or none that gives pictures."""
     for name, value in {"space": VECTOR, "modes": modes}.items():
         monkeypatch.setitem(gymnasium.registry["Drawn-v0"].kwargs, name, value)
-    with pytest.raises(ValueError, match="Drawn-v0 draws no pictures: it has no render_mode"):
+    with pytest.raises(ValueError, match="Drawn-v0 cannot render pictures: it has no render_mode"):
         make_env(task("Drawn-v0"), 0, render=Drawing())
     make_env(task("Drawn-v0"), 0).close()
 
@@ -308,7 +311,7 @@ def test_a_task_that_cannot_draw_says_so(monkeypatch, modes):
 def test_a_task_without_pictures_is_not_trained_for_a_video(monkeypatch, tmp_path):
     """It would be found out at the end."""
     still(monkeypatch)
-    with pytest.raises(ValueError, match="Still-v0 draws no pictures"):
+    with pytest.raises(ValueError, match="Still-v0 cannot render pictures"):
         run(ExperimentConfig(task=task(), record=True), tmp_path / "run", {"resume": None})
     assert not (tmp_path / "run").exists()
 
@@ -351,7 +354,7 @@ def test_discrete_actions_that_start_elsewhere_are_those_of_the_task(monkeypatch
 def test_actions_that_are_no_vector_are_refused(monkeypatch, action):
     """In one line that says what may be."""
     still(monkeypatch, action=action)
-    with pytest.raises(ValueError, match="actions must be one vector of floats or one Discrete"):
+    with pytest.raises(ValueError, match="must be one vector of floats or Discrete"):
         make_env(task(), 0)
 
 
@@ -376,7 +379,7 @@ def test_an_episode_is_as_long_as_the_task_is_registered():
 
 def test_a_task_without_a_limit_needs_one():
     """In one line with the setting's name."""
-    with pytest.raises(ValueError, match=r"without a limit of its episodes: set task\.max_steps"):
+    with pytest.raises(ValueError, match=r"without a time limit: set task\.max_steps"):
         make_env(task(max_steps=None), 0)
 
 

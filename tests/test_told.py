@@ -80,7 +80,7 @@ def test_a_parameter_that_is_not_finite_stops_every_algorithm(tmp_path, monkeypa
 
     last = make(name, **few).train(2)[-1]["updates"]
     run.agent.optimizer.step = broken
-    run.learner.renew()
+    run.learner.rebuild_update()
     with pytest.raises(FloatingPointError, match=f"not finite after update {last}: ") as stopped:
         run.train(2)
     assert parameter_name in str(stopped.value)
@@ -94,7 +94,7 @@ def test_an_action_that_is_not_finite_stops_every_algorithm(name):
     for parameter in run.agent.policy.parameters():
         parameter.data.fill_(float("nan"))
     first = 11 if name in ("sac", "td3") else 1  # the first that is not random
-    message = rf"action is not finite at frame {first}: \[nan\]. The policy gave it"
+    message = rf"action is not finite at frame {first}: \[nan\]. It comes from the policy"
     with pytest.raises(FloatingPointError, match=message):
         run.train()
 
@@ -103,7 +103,7 @@ def test_a_run_without_an_update_says_so(tmp_path):
     """At its end, in its metrics and beside its test episodes."""
     run = make("sac", tmp_path, algorithm=SACConfig(hidden=(8,), random_frames=81))
     (message,) = warned(run.train)
-    assert message.startswith("no update was made in 80 frames, the first 81 of which were random")
+    assert message.startswith("no update was made in 80 frames, of which the first 81 were random")
     assert run.metrics[-1]["updates"] == 0
     run.finish(run.test())
     written = json.loads((tmp_path / "evaluation.json").read_text())["training"]
@@ -156,7 +156,7 @@ def test_actions_of_several_ranges_are_told_of_td3s_noise():
         warnings.simplefilter("error")
         make_td3(env)
     space.high[1], space.low[1] = 0.1, -0.1
-    with pytest.warns(UserWarning, match=r"half their ranges, got \[1.0, 0.1.*RescaleAction"):
+    with pytest.warns(UserWarning, match=r"half ranges \[1.0, 0.1.*RescaleAction"):
         make_td3(env)
 
 
@@ -211,7 +211,7 @@ def test_frozen_parameters_have_no_part_in_a_share():
 @pytest.fixture
 def measured_soon(monkeypatch):
     """After 15 updates, not 100, it is told which regularizer is faint."""
-    monkeypatch.setattr("torchrl_l2c2.experiment.learn.learner.MEASURED_AFTER", 15)
+    monkeypatch.setattr("torchrl_l2c2.experiment.learn.learner.MEASURE_AFTER", 15)
 
 
 def many_updates(name, regularizer, updates=20):
@@ -265,5 +265,5 @@ def test_looking_for_a_faint_regularizer_changes_no_number(monkeypatch, measured
         return torch.cat([p.detach().flatten() for p in run.agent.loss.state_dict().values()])
 
     looked = parameters()
-    monkeypatch.setattr("torchrl_l2c2.experiment.learn.learner.MEASURED_AFTER", 10**9)
+    monkeypatch.setattr("torchrl_l2c2.experiment.learn.learner.MEASURE_AFTER", 10**9)
     assert torch.equal(looked, parameters())

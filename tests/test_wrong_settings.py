@@ -15,7 +15,12 @@ from pydantic import TypeAdapter
 from small import own_nodes
 
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig
-from torchrl_l2c2.experiment.cli.composition import CONF, composing, folder_named, register
+from torchrl_l2c2.experiment.cli.composition import (
+    CONF,
+    check_folder_name,
+    composition_errors,
+    register,
+)
 from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.settings.config import GROUPS
 from torchrl_l2c2.experiment.settings.fields import SettingError, describe
@@ -41,7 +46,7 @@ def settings_of():
         ("seed=-1", "seed must be greater than or equal to 0, got -1."),
         ("seed=4294967000", "seed must be less than 2147483648, got 4294967000."),
         ("seed=zero", "seed must be a valid integer, got 'zero'."),
-        ("device=mps", "device must be cpu, cuda or cuda:N, a number from 0 up, got 'mps'."),
+        ("device=mps", "device must be cpu, cuda or cuda:N with N >= 0, got 'mps'."),
         ("seed=1.5", "seed must be a valid integer, got 1.5."),
         ("threads=1e11", "threads must be less than or equal to 1024, got 100000000000."),
         (
@@ -76,13 +81,13 @@ def settings_of():
         ("algorithm.gamma=1", "algorithm.gamma must be less than 1, got 1."),
         ("algorithm.hidden=100", "algorithm.hidden must be a list, got 100."),
         ("algorithm.hidden=[0]", "algorithm.hidden must be greater than or equal to 1, got 0."),
-        ("algorithm.replay_ratio=1 algorithm.updates=1", "replay_ratio and updates both say"),
+        ("algorithm.replay_ratio=1 algorithm.updates=1", "replay_ratio and updates both set"),
         ("optimizer=adam optimizer.betas=[0.9,1]", "betas must each be in [0, 1), got [0.9, 1.0]."),
         ("replay.batch_size=0", "replay.batch_size must be greater than or equal to 1, got 0."),
         ("replay.capacity=8", "replay.capacity must be at least the batch_size (32), got 8."),
         ("optimizer.lr=-1", "optimizer.lr must be greater than or equal to 0, got -1."),
-        ("algorithm=ppo replay=uniform", "'uniform' is nothing that algorithm 'ppo' can learn"),
-        ("replay=rollout", "'rollout' is nothing that algorithm 'ppo_rpe' can learn from"),
+        ("algorithm=ppo replay=uniform", "'uniform' does not work with algorithm 'ppo'"),
+        ("replay=rollout", "'rollout' does not work with algorithm 'ppo_rpe'"),
     ],
 )
 def test_a_wrong_setting_gives_its_line(settings_of, line, message):
@@ -97,7 +102,7 @@ def test_a_wrong_setting_gives_its_line(settings_of, line, message):
     [
         ("task.epsodes=3", "task.epsodes is not a setting; did you mean task.episodes? --help"),
         ("sed=1", "sed is not a setting; did you mean seed? --help lists every setting."),
-        ("algorithm.num_envs=4", "algorithm.num_envs is only a setting of algorithm=ppo."),
+        ("algorithm.num_envs=4", "algorithm.num_envs is a setting of algorithm=ppo only."),
         (
             "regularizer=lipsnet",
             "Expected regularizer to be one of asap, caps, cats, grad_caps, l2c2,",
@@ -114,7 +119,7 @@ def test_a_wrong_setting_gives_its_line(settings_of, line, message):
 def test_what_cannot_be_composed_ends_in_a_line(settings_of, monkeypatch, line, told):
     """Of a name that there is not, it says which was meant; never a traceback."""
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
-    with pytest.raises(SystemExit) as ended, composing():
+    with pytest.raises(SystemExit) as ended, composition_errors():
         settings_of(line)
     said = str(ended.value)
     assert "HYDRA_FULL_ERROR" not in os.environ
@@ -125,8 +130,8 @@ def test_what_cannot_be_composed_ends_in_a_line(settings_of, monkeypatch, line, 
 def test_a_folder_that_hydra_cannot_make_ends_in_a_line(tmp_path):
     """Of ``hydra.run.dir``, say."""
     (tmp_path / "file").touch()
-    told = r"error: '.*run' cannot be made \(Not a directory\); choose another."
-    with pytest.raises(SystemExit, match=told), composing():
+    told = r"error: '.*run' cannot be created \(Not a directory\); choose another."
+    with pytest.raises(SystemExit, match=told), composition_errors():
         (tmp_path / "file" / "run").mkdir(parents=True)
 
 
@@ -142,12 +147,12 @@ def test_a_folder_that_hydra_cannot_make_ends_in_a_line(tmp_path):
             "sigma=2",
             "sigma is not a setting; did you mean regularizer.sigma? --help lists every setting.",
         ),
-        ("outputs=~/runs", "No shell expands this ~: write $HOME."),
+        ("outputs=~/runs", "Shells do not expand ~ here: write $HOME."),
     ],
 )
 def test_what_cannot_be_composed_ends_with_what_was_meant(settings_of, line, meant):
     """Of choices, of settings without their group, and of a path."""
-    with pytest.raises(SystemExit) as ended, composing():
+    with pytest.raises(SystemExit) as ended, composition_errors():
         settings_of(line)
     assert str(ended.value).endswith(meant)
 
@@ -155,7 +160,7 @@ def test_what_cannot_be_composed_ends_with_what_was_meant(settings_of, line, mea
 def test_the_whole_error_is_shown_where_it_is_asked_for(settings_of, monkeypatch):
     """As Hydra has it."""
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
-    with pytest.raises(HydraException, match="Could not override 'sed'"), composing():
+    with pytest.raises(HydraException, match="Could not override 'sed'"), composition_errors():
         settings_of("sed=1")
 
 
@@ -166,8 +171,10 @@ def test_the_whole_error_is_shown_where_it_is_asked_for(settings_of, monkeypatch
 def test_what_is_no_folder_is_refused(setting, given):
     """A number may name one, and nothing need be resumed."""
     with pytest.raises(SettingError, match=rf"{setting} must be a folder, got "):
-        folder_named(setting, given)
-    assert folder_named("outputs", 2026) == "2026" and folder_named("resume", None) is None
+        check_folder_name(setting, given)
+    assert (
+        check_folder_name("outputs", 2026) == "2026" and check_folder_name("resume", None) is None
+    )
 
 
 def kinds_of_settings():

@@ -1,7 +1,7 @@
-"""The paper's experiment, built from the components: needs the ``experiment`` extra.
+"""The paper's experiment, built from the components. Requires the ``experiment`` extra.
 
-The public names are listed, with the modules they live in, in ``__init__.pyi``; a module is
-imported when one of its names is first used, so that settings are read without waiting for torch.
+``__init__.pyi`` lists the public names and their modules. A module is imported when one of its
+names is first used: settings do not import torch.
 """
 
 import lazy_loader

@@ -1,6 +1,6 @@
-"""The errors that a command shows in one line, and how a command ends with one.
+"""Errors that a command shows in one line.
 
-Every other error is a bug, of this package or of a user's own code, and shows its traceback.
+Every other error is a bug in this package or in a user's own code, and is shown with its traceback.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from typing import Any
 
 
 class UserError(ValueError):
-    """A mistake of the user; the text says what to do."""
+    """A mistake of the user. The message states what to do."""
 
 
 class OtherRunError(UserError):
-    """A checkpoint is of a run with other settings."""
+    """A checkpoint belongs to a run with other settings."""
 
 
 class MissingPackageError(UserError, ImportError):
-    """A package of an extra is not installed."""
+    """A package of an optional extra is not installed."""
 
 
 class SimulatorError(RuntimeError):
-    """The environment or the policy in it raised an error; the cause is chained."""
+    """An error in the environment or its policy. The original error is chained."""
 
 
 class CompilerError(RuntimeError):
@@ -42,20 +42,20 @@ NO_MEMORY = ("DefaultCPUAllocator: can't allocate memory", "Storage size calcula
 
 
 def is_lack_of_memory(error: BaseException) -> bool:
-    """Recognizes a lack of memory, on the CPU or on a GPU."""
-    torch = sys.modules.get("torch")  # Without it, nothing of its kind can be raised.
+    """Checks whether memory ran out, on the CPU or on a GPU."""
+    torch = sys.modules.get("torch")  # Its errors exist only if it has been imported.
     if isinstance(error, (MemoryError, torch.OutOfMemoryError) if torch else MemoryError):
         return True
     return isinstance(error, RuntimeError) and any(text in str(error) for text in NO_MEMORY)
 
 
-def is_told_in_a_line(error: BaseException) -> bool:
-    """Tells mistakes of the user and failures from outside from bugs."""
+def is_one_line_error(error: BaseException) -> bool:
+    """Checks whether an error is a user's mistake or an outside failure, not a bug."""
     return isinstance(error, (UserError, *OUTSIDE)) or is_lack_of_memory(error)
 
 
-def raised_by_component(error: BaseException) -> bool:
-    """Tells a refusal by a component of this package from an error in other code."""
+def is_raised_by_component(error: BaseException) -> bool:
+    """Checks whether a component of this package raised the error, and not the experiment."""
     *_, (frame, _) = traceback.walk_tb(error.__traceback__)
     module = frame.f_globals.get("__name__", "")
     experiment = __name__.rpartition(".")[0]
@@ -64,21 +64,21 @@ def raised_by_component(error: BaseException) -> bool:
 
 
 def show_cause(error: Exception) -> None:
-    """Prints where a user's own environment or policy failed; nothing for other errors."""
+    """Prints the traceback of a user's own environment or policy. Ignores other errors."""
     if isinstance(error, SimulatorError) and error.__cause__ is not None:
         traceback.print_exception(error.__cause__)
 
 
 @contextmanager
-def warnings_told(tell: Callable[[str], Any]) -> Iterator[None]:
-    """Warnings are lines like others, without where in the program they come from.
+def warnings_as_lines(log: Callable[[str], Any]) -> Iterator[None]:
+    """Passes warnings to a function as plain lines, without file and line number.
 
     Args:
-        tell (callable): what a line is given to.
+        log (callable): Function that receives each line.
     """
 
     def show(message: Warning | str, *_: Any, **__: Any) -> None:
-        tell(f"warning: {message}")
+        log(f"warning: {message}")
 
     with warnings.catch_warnings():
         warnings.showwarning = show
@@ -86,19 +86,19 @@ def warnings_told(tell: Callable[[str], Any]) -> Iterator[None]:
 
 
 @contextmanager
-def told_in_a_line() -> Iterator[None]:
-    """Ends a command with one line where what went wrong says so by itself, or Ctrl-C ends it.
+def one_line_errors() -> Iterator[None]:
+    """Ends a command with one line after a user's mistake, an outside failure or Ctrl-C.
 
-    Warnings are lines, too.
+    Warnings are also shown in one line. Bugs keep their traceback.
 
     Raises:
-        SystemExit: with that line.
+        SystemExit: With the error's line, or with status 130 after Ctrl-C.
     """
     try:
-        with warnings_told(partial(print, file=sys.stderr)):
+        with warnings_as_lines(partial(print, file=sys.stderr)):
             yield
     except Exception as error:
-        if not is_told_in_a_line(error):
+        if not is_one_line_error(error):
             raise
         show_cause(error)
         sys.exit(f"error: {error}")

@@ -1,6 +1,6 @@
-"""Private names of TorchRL that the experiment uses. No other file of it may use one.
+"""Private TorchRL names that the experiment uses. No other file of it may use any.
 
-Tests compare what each gives with what TorchRL's public way gives (``tests/test_internals.py``).
+``tests/test_internals.py`` compares their results with TorchRL's public functions.
 """
 
 from __future__ import annotations
@@ -27,28 +27,28 @@ from torchrl_l2c2.transforms import ObservationNoise
 
 
 def simulator_of(env: GymWrapper) -> Env:
-    """The Gymnasium environment with its wrappers, which is played without TorchRL's own step.
+    """Returns the Gymnasium environment with its wrappers, to step it without TorchRL.
 
-    The public ``env.unwrapped`` is below Gymnasium's wrappers.
+    The public ``env.unwrapped`` leaves out Gymnasium's wrappers.
     """
     return env._env
 
 
 def first_observation(collector: Collector) -> Tensor:
-    """The observation of the reset that the collector makes when it is made.
+    """Returns the observation of the reset in the collector's constructor.
 
-    The public way is another reset, which changes the random numbers of all that follows.
+    The public way is another reset, which would change all later random numbers.
     """
     observation: Tensor = collector._carrier.get("observation")
     return observation.clone()
 
 
-def noisy(noise: ObservationNoise, observation: Tensor) -> Tensor:
-    """The observation with noise; the public call takes a TensorDict, at every frame."""
+def add_noise(noise: ObservationNoise, observation: Tensor) -> Tensor:
+    """Returns the observation with noise. The public call needs a TensorDict at every frame."""
     return noise._apply_transform(observation)
 
 
-def forget_traced(loss: LossModule) -> None:
+def clear_detached_parameters(loss: LossModule) -> None:
     """Has TorchRL's losses detach their parameters anew: they keep detached ones if traced."""
     for module in loss.modules():
         if isinstance(module, LossModule):
@@ -56,34 +56,34 @@ def forget_traced(loss: LossModule) -> None:
 
 
 def stored_tensors(storage: LazyTensorStorage) -> TensorDictBase | None:
-    """The storage's own tensors ``[capacity, ...]``; the public ``storage[:]`` copies them."""
+    """Returns the storage's tensors ``[capacity, ...]``; the public ``storage[:]`` copies them."""
     tensors: TensorDictBase | None = storage._storage
     return tensors
 
 
 class RowWriter:
-    """Stores single rows where ``replay.extend`` would, and leaves the buffer as it would.
+    """Fast replacement of ``replay.extend`` for single rows, with the same effect on the buffer.
 
-    For one row ``extend`` takes longer than all that a frame is made of otherwise: specs, nested
-    TensorDicts and copies are for batches.
+    ``extend`` is made for batches: for one row it takes longer than the rest of a frame.
 
     Args:
-        replay (TensorDictReplayBuffer): as :meth:`ExperimentConfig.make_replay` makes it:
-            one-dimensional, in turn.
+        replay (TensorDictReplayBuffer): Buffer of :func:`~..learn.replay.make_replay`, with one
+            batch dimension and a round-robin writer.
     """
 
     def __init__(self, replay: TensorDictReplayBuffer) -> None:
         self._replay = replay
-        # TorchRL's properties of a buffer take long.
+        # The buffer's properties are slow.
         self._storage, self._writer = replay.storage, replay.writer
         self._source: TensorDictBase | None = None
         self._stored: list[tuple[NestedKey, Tensor]] = []
 
     def write(self, row: Mapping[NestedKey, Tensor]) -> None:
-        """Stores a row; the first decides which entries are stored.
+        """Stores a row. The first row determines which entries are stored.
 
         Args:
-            row (Mapping): entries without a batch dimension; more than are stored does no harm.
+            row (Mapping): Entries by key, without a batch dimension. Entries that the first row did
+                not have are ignored.
         """
         if not self._storage.initialized:
             batch = TensorDict(batch_size=[1])
@@ -91,7 +91,7 @@ class RowWriter:
                 batch.set(key, value.unsqueeze(0).to(self._storage.device))
             self._replay.extend(batch)
             return
-        if self._storage._storage is not self._source:  # The first time, or after loading.
+        if self._storage._storage is not self._source:  # The first row, or after loading.
             self._source = self._storage._storage
             self._stored = list(self._source.items(True, True))
         cursor, length = self._writer._cursor, self._storage._len
@@ -107,7 +107,7 @@ class RowWriter:
 
 
 def replay_state(replay: TensorDictReplayBuffer) -> dict[str, Any]:
-    """A replay buffer's ``state_dict`` with the priorities as tensors instead of C++ objects."""
+    """Returns a buffer's ``state_dict`` with priorities as tensors instead of C++ objects."""
     state = dict(replay.state_dict())
     if isinstance(replay, TensorDictPrioritizedReplayBuffer):
         sampler = dict(state["_sampler"])
@@ -119,7 +119,7 @@ def replay_state(replay: TensorDictReplayBuffer) -> dict[str, Any]:
 
 
 def load_replay_state(replay: TensorDictReplayBuffer, state: Mapping[str, Any]) -> None:
-    """Restores what :func:`replay_state` gave into a buffer made with the same settings."""
+    """Restores a state of :func:`replay_state` into a buffer with the same settings."""
     state = dict(state)
     if isinstance(replay, TensorDictPrioritizedReplayBuffer):
         sampler = dict(state["_sampler"])
@@ -132,15 +132,15 @@ def load_replay_state(replay: TensorDictReplayBuffer, state: Mapping[str, Any]) 
         state["_sampler"] = sampler
     replay.load_state_dict(state)
     storage = replay.storage
-    if storage._storage is not None:  # It is on the saved state's device if it was empty.
+    if storage._storage is not None:  # An empty storage takes the saved state's device.
         storage._storage = storage._storage.to(storage.device)
 
 
 class TraceableClipPPOLoss(ClipPPOLoss):
-    """TorchRL's clipped PPO, with an entropy bonus that can be a part of a graph.
+    """TorchRL's clipped PPO loss with an entropy bonus that can be traced.
 
-    TorchRL's loss looks whether an entropy is finite, and otherwise estimates it: what a graph
-    computes may not depend on that. The entropy of a normal with a positive scale is finite.
+    TorchRL's loss checks whether the entropy is finite, and otherwise estimates it. A graph cannot
+    depend on values, and the entropy of a normal with a positive scale is finite.
     """
 
     def _get_entropy(self, dist: Distribution, adv_shape: torch.Size) -> Tensor:

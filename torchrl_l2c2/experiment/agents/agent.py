@@ -1,4 +1,4 @@
-"""The agent: everything that learns in a run, built from an algorithm's settings."""
+"""The agent of a run: loss, policy, optimizer and target networks."""
 
 from __future__ import annotations
 
@@ -19,27 +19,28 @@ from torchrl.objectives.value import GAE
 
 from torchrl_l2c2.experiment.agents.normalization import Normalization
 
-# They look into their tensors to decide what to do, which a graph cannot.
-EXPLORING = (AdditiveGaussianModule, EGreedyModule, OrnsteinUhlenbeckProcessModule)
+# They branch on tensor values, which a graph cannot.
+EXPLORATION_MODULES = (AdditiveGaussianModule, EGreedyModule, OrnsteinUhlenbeckProcessModule)
 
 
 @dataclass
 class Agent:
-    """Everything that learns in a run.
+    """Loss, policy, optimizer and target networks of a run.
 
     Attributes:
-        loss: regularized.
-        policy: acts; shares its parameters with ``loss``, so it is always the current one, or is
-            a copy on the CPU (:meth:`act_on_cpu`).
-        optimizer: of all of the loss's parameters.
-        target_updater: moves the target networks when the policy is updated, as in TD3; ``None``
-            without any.
-        advantage: estimates advantages of an episode, for on-policy learning.
-        max_grad_norm: norm that gradients are scaled down to; ``None`` leaves them.
-        policy_terms: the algorithm's own terms that train the policy; a regularizer's loss knows
-            its own.
-        policy_delay: updates of the values per update of the policy.
-        normalization: normalization of the training data, also inside ``policy``; or ``None``.
+        loss: Loss with the regularizer's terms.
+        policy: Policy that acts. It shares its parameters with ``loss``, or is a copy on the CPU
+            (:meth:`act_on_cpu`).
+        optimizer: Optimizer of all parameters of the loss.
+        target_updater: Updater of the target networks, called when the policy is updated, as in
+            TD3; ``None`` without target networks.
+        advantage: Advantage estimator of on-policy algorithms, or ``None``.
+        max_grad_norm: Maximum norm of the gradient; larger gradients are scaled down. ``None``: no
+            maximum.
+        policy_terms: Keys of the loss terms that train the policy. The regularizer's terms are
+            added automatically.
+        policy_delay: Value updates per update of the policy.
+        normalization: Normalization of the training data and inside ``policy``, or ``None``.
     """
 
     loss: LossModule
@@ -58,24 +59,29 @@ class Agent:
 
     @property
     def exploration(self) -> nn.Module | None:
-        """The part of ``policy`` that only explores; ``None`` where it samples."""
-        return exploring_in(self.policy)
+        """Exploration module at the end of ``policy``; ``None`` if the policy samples itself."""
+        return exploration_module(self.policy)
 
     @property
     def device(self) -> torch.device:
-        """Device of the loss's parameters, and of its batches."""
+        """Device of the loss's parameters and batches."""
         return next(self.loss.parameters()).device
 
-    def as_learned(self, transitions: TensorDictBase, reward_factor: float) -> TensorDictBase:
-        """A copy of transitions as the loss reads them: scaled rewards, its device, advantages."""
+    def prepare_for_loss(self, transitions: TensorDictBase, reward_factor: float) -> TensorDictBase:
+        """Returns a copy of transitions on the loss's device, with scaled rewards and advantages.
+
+        Args:
+            transitions (TensorDictBase): Transitions ``[T]``.
+            reward_factor (float): Factor on the rewards.
+        """
         scaled = transitions["next", "reward"] * reward_factor
         transitions = transitions.copy().set(("next", "reward"), scaled)
-        if self.device.type != "cpu":  # Finding out that all is there takes long, too.
+        if self.device.type != "cpu":  # The call is slow even if nothing is moved.
             transitions = transitions.to(self.device)
         return transitions if self.advantage is None else self.advantage(transitions)
 
     def load_networks(self, state: Mapping[str, Any]) -> None:
-        """Restores what a policy acts by: networks, their inputs' scales, exploration."""
+        """Restores the networks, the exploration and the normalization from a checkpoint."""
         self.loss.load_state_dict(state["loss"])
         if self.exploration is not None:
             self.exploration.load_state_dict(state["exploration"])
@@ -83,29 +89,29 @@ class Agent:
             self.normalization.load_state_dict(state["normalization"])
 
     def act_on_cpu(self) -> None:
-        """Has a copy of the policy act on the CPU, whatever the device of the loss is.
+        """Replaces the acting policy by a copy on the CPU.
 
-        For one observation after the other the way to another device takes longer than the policy.
+        For single observations, the transfer to another device takes longer than the policy.
         """
-        self._trained = network_of(self.policy)
+        self._trained = without_exploration(self.policy)
         self.policy = deepcopy(self.policy).to("cpu")
 
     @torch.no_grad()
     def refresh_policy(self) -> None:
-        """Gives a copy of the policy that acts the parameters as they are now."""
+        """Copies the current parameters to the acting policy on the CPU, if there is one."""
         if self._trained is None:
             return
-        acting, trained = network_of(self.policy).state_dict(), self._trained.state_dict()
+        acting, trained = without_exploration(self.policy).state_dict(), self._trained.state_dict()
         for name, value in acting.items():
             value.copy_(trained[name])
 
 
-def exploring_in(policy: TensorDictModule) -> nn.Module | None:
-    """The module of TorchRL's at the end of a policy that only explores; ``None`` without one."""
+def exploration_module(policy: TensorDictModule) -> nn.Module | None:
+    """Returns the exploration module of TorchRL at the end of a policy, or ``None``."""
     last = policy[-1] if isinstance(policy, TensorDictSequential) else None
-    return last if isinstance(last, EXPLORING) else None
+    return last if isinstance(last, EXPLORATION_MODULES) else None
 
 
-def network_of(policy: TensorDictModule) -> TensorDictModule:
-    """The policy without what only explores."""
-    return policy if exploring_in(policy) is None else policy[:-1]
+def without_exploration(policy: TensorDictModule) -> TensorDictModule:
+    """Returns the policy without its exploration module."""
+    return policy if exploration_module(policy) is None else policy[:-1]

@@ -1,4 +1,4 @@
-"""An agent from the settings of a run."""
+"""Agents from the settings of a run."""
 
 from __future__ import annotations
 
@@ -29,21 +29,24 @@ from torchrl_l2c2.experiment.settings.regularizers import RegularizerConfig
 
 
 def make_agent(config: ExperimentConfig, env: EnvBase) -> Agent:
-    """Builds what learns, on the device of the settings.
+    """Builds the agent of a run on the device of the settings.
 
     Args:
-        config (ExperimentConfig): the settings.
-        env (EnvBase): an environment with the observation and action of the task.
+        config (ExperimentConfig): Settings of the run.
+        env (EnvBase): Environment with the task's observations and actions.
+
+    Returns:
+        Agent: Agent with new networks.
 
     Raises:
-        SettingError: PyTorch does not find the device, or the regularizer does not work with the
+        SettingError: If PyTorch does not find the device, or the regularizer does not work with the
             algorithm.
-        UserError: the algorithm cannot take the task's actions.
+        UserError: If the algorithm does not support the task's actions.
     """
     check_device_found(config.device)
     device = torch.device(config.device)
     with device, warnings.catch_warnings():
-        # Target networks get updaters of this package's.
+        # This package adds the target networks' updaters later.
         warnings.filterwarnings("ignore", "No target network updater")
         agent = make_algorithm(config.algorithm, env, config.regularizer, config.optimizer)
     if device.type != "cpu":
@@ -60,13 +63,16 @@ def make_algorithm(
     ``make_algorithm.register(MyConfig, function)`` adds an algorithm.
 
     Args:
-        config: the settings of the algorithm.
-        env (EnvBase): an environment with the observation and action of the task.
-        regularizer (RegularizerConfig): the settings of the regularizer.
-        optimizer (AdaTermConfig or AdamConfig): the settings of the optimizer.
+        config: Settings of the algorithm.
+        env (EnvBase): Environment with the task's observations and actions.
+        regularizer (RegularizerConfig): Settings of the regularizer.
+        optimizer (AdaTermConfig or AdamConfig): Settings of the optimizer.
+
+    Returns:
+        Agent: Agent with new networks.
 
     Raises:
-        TypeError: there is no function for these settings.
+        TypeError: If no function is registered for these settings.
     """
     raise TypeError(
         f"make_algorithm has no function for {type(config).__name__}. Add it with "
@@ -82,15 +88,15 @@ make_algorithm.register(DQNConfig, make_dqn)
 
 
 def check_device_found(device: str) -> None:
-    """Refuses a device that PyTorch does not find.
+    """Checks that PyTorch finds a device.
 
     Raises:
-        SettingError: The device is not there; names the number of CUDA devices.
+        SettingError: If PyTorch does not find the device.
     """
     found = torch.cuda.device_count()
     if device != "cpu" and (torch.device(device).index or 0) >= found:
         raise SettingError(
             "device",
-            f"must be a device of this machine; PyTorch finds {found} CUDA devices, got "
+            f"must be a device of this machine, where PyTorch finds {found} CUDA devices, got "
             f"{device!r}: use device=cpu.",
         )

@@ -1,4 +1,4 @@
-"""Deep Q-learning."""
+"""Double deep Q-learning."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torchrl.modules import EGreedyModule, QValueActor
 from torchrl.objectives import DQNLoss, SoftUpdate
 
 from torchrl_l2c2.experiment.agents.agent import Agent
-from torchrl_l2c2.experiment.agents.networks import check_actions, perceptron, sharing
+from torchrl_l2c2.experiment.agents.networks import check_actions, perceptron, shared_copy
 from torchrl_l2c2.experiment.agents.optimizers import make_optimizer
 from torchrl_l2c2.experiment.agents.regularizers import add_regularizer
 from torchrl_l2c2.experiment.settings.algorithms import DQNConfig
@@ -33,7 +33,7 @@ def make_dqn(
     )
     return Agent(
         loss,
-        policy=TensorDictSequential(sharing(values, loss.value_network_params), greedy),
+        policy=TensorDictSequential(shared_copy(values, loss.value_network_params), greedy),
         optimizer=make_optimizer(optimizer, loss.parameters()),
         target_updater=SoftUpdate(loss, tau=config.tau),
     )

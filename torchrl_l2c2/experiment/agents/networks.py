@@ -1,4 +1,4 @@
-"""Networks that several algorithms build, and their demands on an environment."""
+"""Networks shared by several algorithms, and checks of the environment's actions."""
 
 from __future__ import annotations
 
@@ -26,60 +26,65 @@ from torchrl_l2c2.experiment.errors import UserError
 
 
 def check_actions(
-    env: EnvBase, algorithm: str, *, continuous: bool, squashed: bool = False, drawn: bool = True
+    env: EnvBase, algorithm: str, *, continuous: bool, squashed: bool = False, sampled: bool = True
 ) -> None:
-    """Refuses actions that an algorithm cannot take.
+    """Checks that an algorithm supports the environment's actions.
+
+    Args:
+        env (EnvBase): Environment.
+        algorithm (str): Name of the algorithm, for errors.
 
     Keyword Args:
-        continuous (bool): whether the algorithm needs continuous actions, or else discrete ones.
-        squashed (bool): whether they are squashed into their bounds. Default ``False``.
-        drawn (bool): whether they are drawn from a distribution between these. Default ``True``.
+        continuous (bool): Whether the algorithm needs continuous or discrete actions.
+        squashed (bool): Whether actions are squashed into their bounds. Default ``False``.
+        sampled (bool): Whether squashed actions are sampled from a distribution, which needs bounds
+            that differ. Default ``True``.
 
     Raises:
-        ValueError: they are discrete where continuous ones are needed, or the other way round, or
-            have no bounds to be squashed into, or none to draw between.
+        ValueError: If the actions are not continuous or discrete as required, or squashed actions
+            have no bounds or equal bounds.
     """
     if env.action_spec.dtype.is_floating_point != continuous:
         raise UserError(
             f"algorithm={algorithm} needs {'continuous' if continuous else 'discrete'} actions, "
-            f"this task's are {type(env.action_spec).__name__} of shape "
+            f"got {type(env.action_spec).__name__} of shape "
             f"{tuple(env.action_spec.shape)}: use algorithm="
             f"{'dqn' if continuous else 'ppo_rpe'}, or another algorithm."
         )
     if squashed and not _bounded(env.action_spec):
         raise UserError(
-            f"algorithm={algorithm} squashes actions into their bounds, and this task's have none: "
-            "use algorithm=ppo_rpe with algorithm.squash=none, or register the task with a "
-            "gymnasium.ActionWrapper that has bounds."
+            f"algorithm={algorithm} squashes actions into their bounds, but this task's actions "
+            "have none: use algorithm=ppo_rpe with algorithm.squash=none, or register the task "
+            "with a gymnasium.ActionWrapper that has bounds."
         )
-    bounds = action_bounds(env) if squashed and drawn else ()
-    if bounds and (still := (bounds[0] >= bounds[1]).nonzero().flatten().tolist()):
+    bounds = action_bounds(env) if squashed and sampled else ()
+    if bounds and (fixed := (bounds[0] >= bounds[1]).nonzero().flatten().tolist()):
         raise UserError(
-            f"algorithm={algorithm} squashes actions into their bounds, and entries {still} of "
-            "this task's can take only one value: register the task with a "
+            f"algorithm={algorithm} squashes actions into their bounds, but entries {fixed} of "
+            "this task's actions have only one possible value: register the task with a "
             "gymnasium.ActionWrapper that leaves them out."
         )
 
 
 def _bounded(spec: TensorSpec) -> bool:
-    # An unbounded one has the largest floats as its low and high.
+    # An unbounded spec has the largest floats as low and high.
     sides = (spec.space.low, spec.space.high)
     return isinstance(spec, Bounded) and all(bool(side.isfinite().all()) for side in sides)
 
 
 def action_bounds(env: EnvBase) -> tuple[Tensor, Tensor] | tuple[()]:
-    """The least and the largest action, ``[A]`` each; nothing where there are none."""
+    """Returns the lower and upper bounds ``[A]`` of actions, or an empty tuple without bounds."""
     spec = env.action_spec.to(torch.get_default_device())
     return (spec.space.low, spec.space.high) if _bounded(spec) else ()
 
 
 def clip_bounds(env: EnvBase) -> tuple[Tensor, Tensor]:
-    """The least and the largest action, ``[A]`` each; infinite where there is none."""
+    """Returns the lower and upper bounds ``[A]`` of actions, infinite without bounds."""
     spec = env.action_spec.to(torch.get_default_device())
     low, high = spec.space.low, spec.space.high
     if isinstance(spec, Bounded):
         return low, high
-    # An unbounded one has the largest floats as its low and high.
+    # An unbounded spec has the largest floats as low and high.
     return torch.full_like(low, -torch.inf), torch.full_like(high, torch.inf)
 
 
@@ -89,8 +94,8 @@ def observation_size(env: EnvBase) -> int:
     return size
 
 
-def sharing(network: TensorDictModule, parameters: TensorDictParams) -> TensorDictModule:
-    """A copy of a network on a loss's own parameters: it changes as they do."""
+def shared_copy(network: TensorDictModule, parameters: TensorDictParams) -> TensorDictModule:
+    """Returns a copy of a network that shares its parameters with a loss."""
     copy = deepcopy(network)
     parameters.data.to_module(copy)
     return copy
@@ -104,10 +109,16 @@ def perceptron(
     *,
     extra_features: int = 0,
 ) -> nn.Module:
-    """Makes fully connected layers on an observation.
+    """Returns fully connected layers on an observation.
+
+    Args:
+        env (EnvBase): Environment with the task's observations.
+        out_features (int): Number of outputs.
+        hidden (tuple of int): Numbers of neurons of the hidden layers.
+        activation (type): Class of the activations.
 
     Keyword Args:
-        extra_features (int): size of a second input, such as the action. Default 0.
+        extra_features (int): Length of a second input, such as the action. Default 0.
     """
     return MLP(
         in_features=observation_size(env) + extra_features,
@@ -126,14 +137,19 @@ def normal_actor(
     log_scale: float | None = None,
     exponential: bool = False,
 ) -> TensorDictModule:
-    """A diagonal normal.
+    """Returns a policy with a diagonal normal distribution.
+
+    Args:
+        env (EnvBase): Environment with the task's observations and actions.
+        hidden (tuple of int): Numbers of neurons of the hidden layers.
+        activation (type): Class of the activations.
 
     Keyword Args:
-        squash (bool): whether tanh squashes it into the action's bounds. Default ``True``.
-        log_scale (float, optional): what the logarithm of the scale begins with, as a parameter
-            of its own. Default: the scale is an output of the network.
-        exponential (bool): whether such an output is the scale's logarithm, cut to [-20, 2],
-            instead of going through a softplus. Default ``False``.
+        squash (bool): Whether tanh squashes actions into their bounds. Default ``True``.
+        log_scale (float, optional): Initial logarithm of the scale, which is then a parameter
+            independent of the state. Default: the scale is an output of the network.
+        exponential (bool): Whether the network's output is the logarithm of the scale, clipped to
+            [-20, 2], instead of the input of a softplus. Default ``False``.
     """
     spec = env.action_spec.to(torch.get_default_device())
     size = spec.shape[-1]
@@ -148,7 +164,7 @@ def normal_actor(
     return ProbabilisticActor(
         TensorDictModule(network, ["observation"], ["loc", "scale"]),
         in_keys=["loc", "scale"],
-        # An unsquashed one's samples lie beyond the bounds.
+        # Samples without squashing may exceed the bounds.
         spec=spec if squash else None,
         distribution_class=TanhNormal if squash else IndependentNormal,
         distribution_kwargs=squashed,
@@ -159,7 +175,7 @@ def normal_actor(
 
 
 class LogScaleExtractor(nn.Module):
-    """Halves an output into a location and a scale, the logarithm of which it is.
+    """Splits an output into the location and the logarithm of the scale.
 
     Examples:
         >>> import torch
@@ -171,16 +187,19 @@ class LogScaleExtractor(nn.Module):
     LIMITS = (-20.0, 2.0)
 
     def forward(self, output: Tensor) -> tuple[Tensor, Tensor]:
-        """An output ``[*B, 2 A]`` to location and scale, each ``[*B, A]``."""
+        """Converts an output ``[*B, 2 A]`` to location and scale, each ``[*B, A]``."""
         loc, log_scale = output.chunk(2, -1)
         return loc, log_scale.clamp(*self.LIMITS).exp()
 
 
 def orthogonal(network: nn.Module, *, last: float) -> None:
-    """Orthogonal weights with a gain of the root of 2, and no biases.
+    r"""Initializes weights orthogonally with a gain of :math:`\sqrt{2}`, and biases to 0.
+
+    Args:
+        network (nn.Module): Network, changed in place.
 
     Keyword Args:
-        last (float): gain of the last layer. Smaller ones have outputs nearer to 0 at first.
+        last (float): Gain of the last layer. Smaller values give initial outputs closer to 0.
     """
     layers = [layer for layer in network.modules() if isinstance(layer, nn.Linear)]
     for layer in layers:
@@ -190,6 +209,6 @@ def orthogonal(network: nn.Module, *, last: float) -> None:
 
 
 def action_value(env: EnvBase, hidden: tuple[int, ...]) -> ValueOperator:
-    """The value of an action at an observation."""
+    """Returns a network for the value of an action at an observation."""
     network = perceptron(env, 1, hidden, nn.ReLU, extra_features=env.action_spec.shape[-1])
     return ValueOperator(network, in_keys=["observation", "action"])

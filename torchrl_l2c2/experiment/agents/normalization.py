@@ -1,4 +1,4 @@
-"""Normalization of observations and rewards, and the policy with its normalization."""
+"""Normalization of observations and rewards, and a policy that contains it."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from torchrl.envs.utils import exploration_type
 
 from torchrl_l2c2.experiment.envs.frames import PREVIOUS
 
-LARGEST = 10.0  # normalized values are clipped to [-LARGEST, LARGEST]
-EPSILON = 1e-8  # added to variances
+CLIP = 10.0  # Normalized values are clipped to [-CLIP, CLIP].
+EPSILON = 1e-8  # Added to variances.
 
 
 class Normalization(nn.Module):
@@ -24,31 +24,31 @@ class Normalization(nn.Module):
         s \to \frac{s - \mathrm{mean}(s)}{\sqrt{\mathrm{var}(s) + 10^{-8}}}, \qquad
         r \to \frac{r}{\sqrt{\mathrm{var}(R) + 10^{-8}}}, \qquad R_t = \gamma R_{t-1} + r_t,
 
-    both clipped to 10, as ``VecNormalize`` of Stable-Baselines3 does. Rewards keep their sign and
-    their zero: subtracting a mean, as TorchRL's ``VecNormV2`` does, would change the optimal policy
-    where an episode can end early.
+    Both are clipped to [-10, 10], as by ``VecNormalize`` of Stable-Baselines3. Rewards keep their
+    sign. TorchRL's ``VecNormV2`` subtracts a mean, which would change the optimal policy of tasks
+    whose episodes can end early.
 
-    The statistics of observations stay fixed until :meth:`follow`. A whole rollout is played and
-    learned from with the same statistics: ``s`` and ``s'`` are normalized alike, and likelihoods
-    belong to the policy that acted. The ``state_dict`` holds all statistics.
+    New statistics of observations take effect at :meth:`apply_statistics`. Collection and learning
+    of a rollout use the same statistics: ``s`` and ``s'`` are normalized equally, and
+    log-likelihoods belong to the policy that acted. The ``state_dict`` contains all statistics.
 
     Args:
-        size (int): length of an observation.
+        size (int): Length of an observation.
 
     Keyword Args:
-        observations (bool): whether observations are normalized.
-        rewards (bool): whether rewards are normalized.
-        gamma (float): the discount, from 0 to 1. Larger values sum more rewards to :math:`R`.
-        streams (int): number of simulators, at least 1; each has an :math:`R`.
+        observations (bool): Whether observations are normalized.
+        rewards (bool): Whether rewards are normalized.
+        gamma (float): Discount factor, from 0 to 1. Larger values sum more rewards in :math:`R`.
+        streams (int): Number of simulators, at least 1. Each has its own :math:`R`.
 
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> norm = Normalization(1, observations=True, rewards=False, gamma=0.9, streams=1)
         >>> seen, false = torch.tensor([[1.0], [3.0]]), torch.zeros(2, 1, dtype=torch.bool)
-        >>> following = {"observation": seen, "reward": torch.ones(2, 1), "done": false}
-        >>> (before,) = norm([TensorDict({"observation": seen, "next": following}, [2])])
-        >>> norm.follow()
+        >>> after = {"observation": seen, "reward": torch.ones(2, 1), "done": false}
+        >>> (before,) = norm([TensorDict({"observation": seen, "next": after}, [2])])
+        >>> norm.apply_statistics()
         >>> before["observation"].flatten().tolist()
         [1.0, 3.0]
         >>> norm.normalize(seen).flatten().round().tolist()
@@ -70,22 +70,23 @@ class Normalization(nn.Module):
         self.seen, self.gained = Moments(size), Moments(1)
 
     def normalize(self, observation: Tensor) -> Tensor:
-        """Normalizes observations ``[*B, F]`` by the current statistics."""
+        """Normalizes observations ``[*B, F]`` with the applied statistics."""
         if not self._observations:
             return observation
         scaled: Tensor = (observation - self.mean) / self.scale
-        return scaled.clamp(-LARGEST, LARGEST)
+        return scaled.clamp(-CLIP, CLIP)
 
     @torch.no_grad()
     def forward(self, rollout: Sequence[TensorDictBase]) -> list[TensorDictBase]:
-        """Counts a rollout, and returns its frames normalized.
+        """Updates the statistics with a rollout, and returns its normalized frames.
 
         Args:
-            rollout (sequence of TensorDictBase): frames ``[T]`` of each stream, with
-                ``"observation"`` and, under ``"next"``, that, ``"reward"`` and ``"done"``.
+            rollout (sequence of TensorDictBase): Frames ``[T]`` of each simulator, with
+                ``"observation"`` and, under ``"next"``, ``"observation"``, ``"reward"`` and
+                ``"done"``.
 
         Returns:
-            list: copies with both observations and the reward normalized.
+            list: Copies with normalized observations and rewards.
         """
         device = self.mean.device
         if self._rewards:
@@ -97,7 +98,10 @@ class Normalization(nn.Module):
 
     @torch.no_grad()
     def normalized(self, frames: TensorDictBase) -> TensorDictBase:
-        """Copies frames with both observations and the reward normalized; nothing is counted."""
+        """Returns a copy of frames with normalized observations and rewards.
+
+        The statistics do not change.
+        """
         copied = frames.copy()
         for key in ("observation", ("next", "observation"), PREVIOUS):
             if key not in frames.keys(True):
@@ -105,11 +109,11 @@ class Normalization(nn.Module):
             copied.set(key, self.normalize(frames[key].to(self.mean.device)))
         if self._rewards:
             scaled = frames["next", "reward"].to(self.mean.device) / self.gained.scale.float()
-            copied.set(("next", "reward"), scaled.clamp(-LARGEST, LARGEST))
+            copied.set(("next", "reward"), scaled.clamp(-CLIP, CLIP))
         return copied
 
-    def follow(self) -> None:
-        """Makes the statistics of all counted observations the current ones."""
+    def apply_statistics(self) -> None:
+        """Applies the statistics of all observations so far to later normalizations."""
         if self._observations:
             self.mean.copy_(self.seen.mean)
             self.scale.copy_(self.seen.scale)
@@ -127,10 +131,10 @@ class Normalization(nn.Module):
 
 
 class Moments(nn.Module):
-    """Running mean and variance, 0 and 1 at first.
+    """Running mean and variance, initially 0 and 1.
 
     Args:
-        size (int): length of a counted vector.
+        size (int): Length of a vector.
 
     Examples:
         >>> import torch
@@ -149,36 +153,38 @@ class Moments(nn.Module):
         super().__init__()
         self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
         self.register_buffer("var", torch.ones(size, dtype=torch.float64))
-        # Weight of the first guess, which the first values replace.
+        # A small weight: the first values replace the initial mean and variance.
         self.register_buffer("count", torch.tensor(1e-4, dtype=torch.float64))
 
     @property
     def scale(self) -> Tensor:
-        """The standard deviation."""
+        """Standard deviation."""
         deviation: Tensor = (self.var + EPSILON).sqrt()
         return deviation
 
     def update(self, values: Tensor) -> None:
-        """Counts values ``[N, F]`` in, by the parallel form of Welford's algorithm (Chan 1983)."""
+        """Updates with values ``[N, F]`` by the parallel Welford algorithm (Chan 1983)."""
         values = values.double()
         number, mean = len(values), values.mean(0)
         total = self.count + number
-        apart = mean - self.mean
+        delta = mean - self.mean
         squares = self.var * self.count + values.var(0, unbiased=False) * number
-        self.var.copy_((squares + apart.square() * self.count * number / total) / total)
-        self.mean.add_(apart * number / total)
+        self.var.copy_((squares + delta.square() * self.count * number / total) / total)
+        self.mean.add_(delta * number / total)
         self.count.copy_(total)
 
 
 class ActingPolicy(TensorDictModuleBase):
-    """A policy with the normalization of its observations and the bounds of its actions.
+    """Policy with normalized observations and clipped mean actions.
+
+    Samples are not clipped, because their log-likelihood belongs to the unclipped action.
+    :meth:`clip_action` clips them for the task.
 
     Args:
-        policy (TensorDictModule): reads a normalized ``"observation"``.
+        policy (TensorDictModule): Policy that reads a normalized ``"observation"``.
         normalization (Normalization, optional): Normalization of the observations. Default: none.
-        low (Tensor, optional): lower bounds of the mean action. Default: none.
-        high (Tensor, optional): upper bounds of the mean action. Samples are not clipped, because
-            their likelihood is of the unclipped action; :meth:`taken` clips them.
+        low (Tensor, optional): Lower bounds ``[A]`` of the action. Default: none.
+        high (Tensor, optional): Upper bounds ``[A]`` of the action. Default: none.
     """
 
     low: Tensor | None
@@ -198,7 +204,7 @@ class ActingPolicy(TensorDictModuleBase):
         self.register_buffer("high", high, persistent=False)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes what the policy writes."""
+        """Writes the policy's outputs for the normalized observation."""
         seen = tensordict.get("observation")
         if self.normalization is not None:
             seen = self.normalization.normalize(seen)
@@ -206,11 +212,11 @@ class ActingPolicy(TensorDictModuleBase):
         for key in self.out_keys:
             tensordict.set(key, written.get(key))
         if exploration_type() is not ExplorationType.RANDOM:
-            tensordict.set("action", self.taken(tensordict.get("action")))
+            tensordict.set("action", self.clip_action(tensordict.get("action")))
         return tensordict
 
-    def taken(self, action: Tensor) -> Tensor:
-        """The action that the task gets: a sample ``[*B, A]``, clipped into the bounds."""
+    def clip_action(self, action: Tensor) -> Tensor:
+        """Clips sampled actions ``[*B, A]`` to the bounds, for the task."""
         if self.low is None or self.high is None:
             return action
         return torch.maximum(torch.minimum(action, self.high), self.low)

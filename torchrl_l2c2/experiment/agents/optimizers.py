@@ -1,4 +1,4 @@
-"""Optimizers from settings, and their learning rates over a training."""
+"""Optimizers from settings, and the decay of their learning rates."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torchrl_l2c2.optim import AdaTerm
 
 
 def make_optimizer(config: OptimizerConfig, parameters: Iterable[Parameter]) -> Optimizer:
-    """Builds the optimizer of these parameters."""
+    """Builds an optimizer of the parameters."""
     if isinstance(config, AdaTermConfig):
         return AdaTerm(
             parameters, lr=config.lr, beta=config.beta, eps=config.eps, nu_min=config.nu_min
@@ -22,18 +22,18 @@ def make_optimizer(config: OptimizerConfig, parameters: Iterable[Parameter]) -> 
 
 
 def anneal(config: OptimizerConfig, optimizer: Optimizer, done: float) -> None:
-    """Sets the learning rate after a share of the training, if it changes.
+    """Sets the learning rate for the progress of training, if it decays linearly.
 
     Args:
-        config (AdaTermConfig or AdamConfig): the settings that made the optimizer.
-        optimizer (Optimizer): its learning rates are set, in place where they are tensors.
-        done (float): share of the training that is over; beyond 1 the rate stays at 0.
+        config (AdaTermConfig or AdamConfig): Settings of the optimizer.
+        optimizer (Optimizer): Optimizer whose learning rates are set; tensors are set in place.
+        done (float): Completed share of training. The rate is 0 from 1 on.
     """
     if not config.linear:
         return
     rate = config.lr * max(0.0, 1.0 - done)
     for group in optimizer.param_groups:
-        if isinstance(group["lr"], torch.Tensor):  # A compiled step reads it.
+        if isinstance(group["lr"], torch.Tensor):  # A compiled step reads this tensor.
             group["lr"].fill_(rate)
         else:
             group["lr"] = rate

@@ -14,14 +14,14 @@ from torchrl_l2c2.experiment.agents.networks import (
     check_actions,
     clip_bounds,
     normal_actor,
+    observation_size,
     orthogonal,
     perceptron,
-    sharing,
+    shared_copy,
 )
 from torchrl_l2c2.experiment.agents.normalization import ActingPolicy, Normalization
 from torchrl_l2c2.experiment.agents.optimizers import make_optimizer
 from torchrl_l2c2.experiment.agents.regularizers import add_regularizer
-from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.settings.algorithms import PPOConfig
 from torchrl_l2c2.experiment.settings.optimizers import OptimizerConfig
 from torchrl_l2c2.experiment.settings.regularizers import RegularizerConfig
@@ -54,12 +54,12 @@ def make_ppo(
     advantage = GAE(
         gamma=config.gamma,
         lmbda=config.gae_lambda,
-        value_network=sharing(critic, loss.critic_network_params),
+        value_network=shared_copy(critic, loss.critic_network_params),
     )
     normalization = _normalization(config, env)
     return Agent(
         loss,
-        policy=_acting(config, sharing(actor, loss.actor_network_params), normalization, env),
+        policy=_acting(config, shared_copy(actor, loss.actor_network_params), normalization, env),
         optimizer=make_optimizer(optimizer, loss.parameters()),
         advantage=advantage,
         max_grad_norm=config.max_grad_norm,
@@ -71,14 +71,8 @@ def make_ppo(
 def _normalization(config: PPOConfig, env: EnvBase) -> Normalization | None:
     if not (config.normalize_observations or config.normalize_rewards):
         return None
-    shape = env.observation_spec["observation"].shape
-    if len(shape) != 1:
-        raise UserError(
-            "algorithm.normalize_observations and normalize_rewards are of tasks that show one "
-            f"vector, this one shows an image of shape {tuple(shape)}: set both to false."
-        )
     return Normalization(
-        shape[0],
+        observation_size(env),
         observations=config.normalize_observations,
         rewards=config.normalize_rewards,
         gamma=config.gamma,
@@ -89,7 +83,7 @@ def _normalization(config: PPOConfig, env: EnvBase) -> Normalization | None:
 def _acting(
     config: PPOConfig, policy: TensorDictModule, normalization: Normalization | None, env: EnvBase
 ) -> TensorDictModule:
-    """The policy for the task, with normalization and clipping inside."""
+    """Returns the acting policy, with normalization and clipping as in the settings."""
     if normalization is None and not config.clip_actions:
         return policy
     bounds = clip_bounds(env) if config.clip_actions else ()

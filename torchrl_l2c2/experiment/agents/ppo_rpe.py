@@ -9,7 +9,7 @@ from torchrl_l2c2.experiment.agents.agent import Agent
 from torchrl_l2c2.experiment.agents.networks import (
     check_actions,
     observation_size,
-    sharing,
+    shared_copy,
 )
 from torchrl_l2c2.experiment.agents.optimizers import make_optimizer
 from torchrl_l2c2.experiment.agents.regularizers import add_regularizer
@@ -61,7 +61,7 @@ def make_ppo_rpe(
     acting = "target_actor_network" if config.acting_policy == "target" else "actor_network"
     return Agent(
         loss,
-        policy=sharing(loss.actor_network, getattr(loss, f"{acting}_params")),
+        policy=shared_copy(loss.actor_network, getattr(loss, f"{acting}_params")),
         optimizer=make_optimizer(optimizer, loss.parameters()),
         target_updater=TSoftUpdate(loss, tau=config.tau, nu=config.nu),
         policy_terms=frozenset({"loss_actor"}),

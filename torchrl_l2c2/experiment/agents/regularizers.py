@@ -1,4 +1,4 @@
-"""Regularized losses, and the neighbors in their batches, from settings."""
+"""Regularized losses and sampled neighbors, from settings."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 from torchrl.objectives import LossModule
 
 from torchrl_l2c2.experiment.envs.frames import PREVIOUS
-from torchrl_l2c2.experiment.errors import raised_by_component
+from torchrl_l2c2.experiment.errors import is_raised_by_component
 from torchrl_l2c2.experiment.settings.fields import SettingError
 from torchrl_l2c2.experiment.settings.regularizers import (
     ASAPConfig,
@@ -36,15 +36,19 @@ from torchrl_l2c2.transforms import NeighborTransform
 
 
 def add_regularizer(loss: LossModule, config: RegularizerConfig) -> LossModule:
-    """Adds a regularizer's terms to a loss, with the strength of the settings.
+    """Adds a regularizer's terms to a loss and sets its strength.
+
+    Args:
+        loss (LossModule): Loss of the algorithm.
+        config (RegularizerConfig): Settings of the regularizer.
 
     Raises:
-        SettingError: the regularizer does not work with this loss.
+        SettingError: If the regularizer does not work with the loss.
     """
     try:
         loss = wrap(config, loss)
     except TypeError as error:
-        if not raised_by_component(error):
+        if not is_raised_by_component(error):
             raise
         raise SettingError("", f"regularizer={config.name}: {error}") from error
     if isinstance(config, GainConfig):
@@ -58,8 +62,12 @@ def wrap(config: RegularizerConfig, loss: LossModule) -> LossModule:
 
     ``wrap.register(MyConfig, function)`` adds a regularizer.
 
+    Args:
+        config (RegularizerConfig): Settings of the regularizer.
+        loss (LossModule): Loss of the algorithm.
+
     Raises:
-        NotImplementedError: there is no function for these settings.
+        NotImplementedError: If no function is registered for these settings.
     """
     raise NotImplementedError(
         f"wrap has no function for {type(config).__name__}. Add it with "
@@ -76,7 +84,7 @@ def _none(config: NoRegularizerConfig, loss: LossModule) -> LossModule:
 def _l2c2(config: L2C2Config, loss: LossModule) -> LossModule:
     return L2C2Loss(
         loss,
-        neighborhood=neighborhood_of(config),
+        neighborhood=make_neighborhood(config),
         beta=config.beta,
         num_samples=config.num_samples,
         over_neighbors=config.over_neighbors,
@@ -133,8 +141,8 @@ def _lcp(config: LCPConfig, loss: LossModule) -> LossModule:
     return LCPLoss(loss, config.coeff, of=config.of)
 
 
-def neighborhood_of(config: RegularizerConfig) -> Neighborhood | None:
-    """The neighborhood of the compared states; ``None`` for a regularizer without one."""
+def make_neighborhood(config: RegularizerConfig) -> Neighborhood | None:
+    """Returns L2C2's neighborhood, or ``None`` for other regularizers."""
     if not isinstance(config, L2C2Config):
         return None
     return Neighborhood(
@@ -149,7 +157,7 @@ def neighborhood_of(config: RegularizerConfig) -> Neighborhood | None:
 def make_neighbors(
     config: RegularizerConfig, generator: torch.Generator
 ) -> NeighborTransform | None:
-    """Makes the transform that draws neighbors in the replay buffer; ``None`` if not needed."""
-    if not isinstance(config, L2C2Config) or (near := neighborhood_of(config)) is None:
+    """Returns the transform that samples neighbors in the replay buffer, or ``None``."""
+    if not isinstance(config, L2C2Config) or (near := make_neighborhood(config)) is None:
         return None
     return NeighborTransform(near, num_samples=config.num_samples, generator=generator)

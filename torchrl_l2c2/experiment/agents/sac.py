@@ -11,7 +11,7 @@ from torchrl_l2c2.experiment.agents.networks import (
     action_value,
     check_actions,
     normal_actor,
-    sharing,
+    shared_copy,
 )
 from torchrl_l2c2.experiment.agents.optimizers import make_optimizer
 from torchrl_l2c2.experiment.agents.regularizers import add_regularizer
@@ -36,12 +36,12 @@ def make_sac(
         target_entropy="auto" if config.target_entropy is None else config.target_entropy,
     )
     loss.make_value_estimator(gamma=config.gamma)
-    # A buffer that is made when first read: in a compiled function it would be lost again.
+    # The first read creates this buffer; inside a compiled function it would be lost.
     loss.target_entropy  # noqa: B018
     loss = add_regularizer(loss, regularizer)
     return Agent(
         loss,
-        policy=sharing(actor, loss.actor_network_params),
+        policy=shared_copy(actor, loss.actor_network_params),
         optimizer=make_optimizer(optimizer, loss.parameters()),
         target_updater=SoftUpdate(loss, tau=config.tau),
         policy_terms=frozenset({"loss_actor"}),

@@ -17,7 +17,7 @@ from torchrl_l2c2.experiment.agents.networks import (
     action_value,
     check_actions,
     perceptron,
-    sharing,
+    shared_copy,
 )
 from torchrl_l2c2.experiment.agents.optimizers import make_optimizer
 from torchrl_l2c2.experiment.agents.regularizers import add_regularizer
@@ -30,7 +30,7 @@ def make_td3(
     config: TD3Config, env: EnvBase, regularizer: RegularizerConfig, optimizer: OptimizerConfig
 ) -> Agent:
     """Builds TD3, with the arguments of :func:`~.build.make_algorithm`."""
-    check_actions(env, config.name, continuous=True, squashed=True, drawn=False)
+    check_actions(env, config.name, continuous=True, squashed=True, sampled=False)
     spec = env.action_spec
     network = perceptron(env, spec.shape[-1], config.hidden, nn.ReLU)
     bounds = spec.to(torch.get_default_device())
@@ -52,7 +52,7 @@ def make_td3(
     noise = AdditiveGaussianModule(spec, sigma_init=sigma, sigma_end=sigma)
     return Agent(
         loss,
-        policy=TensorDictSequential(sharing(actor, loss.actor_network_params), noise),
+        policy=TensorDictSequential(shared_copy(actor, loss.actor_network_params), noise),
         optimizer=make_optimizer(optimizer, loss.parameters()),
         target_updater=SoftUpdate(loss, tau=config.tau),
         policy_terms=frozenset({"loss_actor"}),
@@ -61,18 +61,19 @@ def make_td3(
 
 
 def _half_range(spec: TensorSpec) -> float:
-    """Half the range of the widest action, the unit of TD3's noise.
+    """Returns half the largest range of the actions, the unit of TD3's noise.
 
     Warns:
-        UserWarning: some actions are narrower.
+        UserWarning: If the ranges of the actions differ.
     """
     half_ranges = (spec.space.high - spec.space.low) / 2
     half_range: float = half_ranges.max().item()
     if half_ranges.min() < half_range:
         warnings.warn(
-            "td3's noise is as wide for every action, a share of the largest of half their "
-            f"ranges, got {half_ranges.tolist()}: it fills the narrow ones. Scale the task's "
-            "actions to one range (gymnasium.wrappers.RescaleAction), or use algorithm=sac.",
+            "td3 uses the same noise for every action, relative to the largest half range, got "
+            f"half ranges {half_ranges.tolist()}: the noise is too large for narrow actions. Scale "
+            "the task's actions to one range (gymnasium.wrappers.RescaleAction), or use "
+            "algorithm=sac.",
             stacklevel=3,
         )
     return half_range

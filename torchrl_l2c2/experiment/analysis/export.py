@@ -31,7 +31,7 @@ from torchrl_l2c2.experiment.agents.networks import action_bounds
 from torchrl_l2c2.experiment.collect.episodes import play_episodes
 from torchrl_l2c2.experiment.envs.environments import untransformed
 from torchrl_l2c2.experiment.envs.pictures import control_rate
-from torchrl_l2c2.experiment.envs.spaces import CountedFromZero
+from torchrl_l2c2.experiment.envs.spaces import ZeroBasedActions
 from torchrl_l2c2.experiment.errors import MissingPackageError, UserError
 from torchrl_l2c2.experiment.run.files import (
     make_folder,
@@ -280,7 +280,7 @@ def entry_names(space: Any, size: int) -> list[str]:
 
 def _first_action(env: EnvBase) -> int | None:
     """The number that the task gives its first action; ``None`` where these are no numbers."""
-    counted = _wrapper(env, CountedFromZero)
+    counted = _wrapper(env, ZeroBasedActions)
     first = 0 if counted is None else counted.first
     return first if isinstance(env.action_spec, OneHot) else None
 

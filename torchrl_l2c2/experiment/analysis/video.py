@@ -21,7 +21,7 @@ from torchrl_l2c2.experiment.collect.episodes import play_episodes
 from torchrl_l2c2.experiment.envs.environments import make_env, untransformed
 from torchrl_l2c2.experiment.envs.pictures import USUAL_RATE, Drawing, control_rate
 from torchrl_l2c2.experiment.errors import MissingPackageError, UserError
-from torchrl_l2c2.experiment.run.files import make_folder_of
+from torchrl_l2c2.experiment.run.files import make_parent_folder
 from torchrl_l2c2.experiment.run.policies import load_policy, seed_of_test
 from torchrl_l2c2.experiment.run.process import ProcessState
 from torchrl_l2c2.experiment.settings.tasks import TaskConfig
@@ -50,7 +50,7 @@ def check_video(path: str | Path | None = None) -> None:
         return
     if Path(path).suffix.lower() not in ENDINGS:
         raise UserError(f"a video's file ends in {', '.join(ENDINGS)}, got {str(path)!r}.")
-    make_folder_of(path)
+    make_parent_folder(path)
 
 
 def check_pictures(task: TaskConfig) -> None:

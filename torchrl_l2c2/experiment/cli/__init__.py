@@ -1,1 +1,1 @@
-"""The command: its subcommands, Hydra, sweeps."""
+"""The command line: subcommands, Hydra and sweeps."""

@@ -1,4 +1,4 @@
-"""What Hydra composes of ``conf/`` and the settings' own defaults, and what a run reads of it."""
+"""Composition of a run's settings by Hydra, from ``conf/`` and the settings' defaults."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ from hydra.errors import (
 from hydra.types import RunMode
 from omegaconf.errors import OmegaConfBaseException
 
-from torchrl_l2c2.experiment.settings.config import GROUPS, STEERING, ExperimentConfig
+from torchrl_l2c2.experiment.settings.config import COMMAND_SETTINGS, GROUPS, ExperimentConfig
 from torchrl_l2c2.experiment.settings.fields import SettingError, describe
 from torchrl_l2c2.experiment.settings.naming import run_name
 from torchrl_l2c2.experiment.settings.regularizers import BEGIN_WITH_PRESET, preset_settings
 from torchrl_l2c2.presets import KINDS, preset
 
 PACKAGE = Path(__file__).parents[2]
-# Next to the package in a clone, inside it when installed.
+# Next to the package in a clone, inside the package if installed.
 CONF = next(folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if folder.is_dir())
 
-# Names that users may type for a setting.
-ALSO_CALLED = {"method": ["regularizer"], "methods": ["regularizer"]}
+# Other names that users may type.
+ALIASES = {"method": ["regularizer"], "methods": ["regularizer"]}
 
 
 def register() -> None:
-    """Gives Hydra every choice of every group, from the settings' own defaults.
+    """Registers every choice of every group with Hydra, from the settings' defaults.
 
-    ``conf/`` holds what combines them.
+    ``conf/`` contains combinations of them.
     """
     store = ConfigStore.instance()
     for group, choices in GROUPS.items():
@@ -60,28 +60,28 @@ def register() -> None:
 
 def _node(chosen: Any) -> dict[str, Any]:
     values = {k: list(v) if isinstance(v, tuple) else v for k, v in vars(chosen).items()}
-    if not hasattr(chosen, "usual_replay"):
+    if not hasattr(chosen, "default_replay"):
         return values
-    usual = [
-        {"override /replay@_global_.replay": chosen.usual_replay},
-        {"override /optimizer@_global_.optimizer": chosen.usual_optimizer},
+    defaults = [
+        {"override /replay@_global_.replay": chosen.default_replay},
+        {"override /optimizer@_global_.optimizer": chosen.default_optimizer},
     ]
-    return {"defaults": [*usual, "_self_"], **values}
+    return {"defaults": [*defaults, "_self_"], **values}
 
 
 def read(values: dict[str, Any]) -> tuple[ExperimentConfig, Path]:
-    """Returns a run's settings and its folder, which Hydra names or which is below ``outputs``.
+    """Returns a run's settings and its folder: below ``outputs``, or Hydra's if set.
 
     Args:
-        values (dict): the configuration.
+        values (dict): Configuration composed by Hydra.
 
     Raises:
-        SettingError: a setting that is unknown or outside its range.
+        SettingError: If a setting is unknown or outside its range.
     """
     chosen = HydraConfig.get()
     check_preset(values, chosen.runtime.choices.get("preset"))
     for name in ("outputs", "resume"):
-        values[name] = folder_named(name, values[name])
+        values[name] = check_folder_name(name, values[name])
     config = ExperimentConfig.from_dict(values)
     check_budget(config, chosen.overrides.task)
     multirun = chosen.mode == RunMode.MULTIRUN
@@ -94,10 +94,14 @@ def read(values: dict[str, Any]) -> tuple[ExperimentConfig, Path]:
 
 
 def check_preset(values: dict[str, Any], name: str | None) -> None:
-    """Refuses a task and an algorithm without settings in the preset.
+    """Checks that a preset has settings of the task and the algorithm.
+
+    Args:
+        values (dict): Configuration composed by Hydra.
+        name (str, optional): Name of the preset.
 
     Raises:
-        SettingError: with the tasks and algorithms of the preset.
+        SettingError: If it has none; states the preset's tasks and algorithms.
     """
     if values.get("preset") != "???":  # A preset replaces this mark.
         return
@@ -108,39 +112,39 @@ def check_preset(values: dict[str, Any], name: str | None) -> None:
     task, algorithm = values["task"]["name"], values["algorithm"]["name"]
     raise SettingError(
         "preset",
-        f"must have settings of task={task} with algorithm={algorithm}; {name} has settings "
-        f"of {', '.join(known)}: choose one of these, or preset=none.",
+        f"must have settings of task={task} with algorithm={algorithm}; {name} has settings of "
+        f"{', '.join(known)}: choose one of these, or preset=none.",
     )
 
 
 def check_budget(config: ExperimentConfig, given: Sequence[str]) -> None:
-    """Refuses a number of episodes if a preset sets a number of frames.
+    """Checks that the command line sets no episodes if a preset sets frames.
 
     Args:
-        config (ExperimentConfig): the settings.
-        given (Sequence of str): what the command line says.
+        config (ExperimentConfig): Settings of the run.
+        given (sequence of str): Overrides on the command line.
 
     Raises:
-        SettingError: with what to give instead.
+        SettingError: If ``task.episodes`` would be ignored.
     """
     episodes = any(each.startswith("task.episodes=") for each in given)
     if episodes and config.task.frames is not None:
         raise SettingError(
             "task.episodes",
-            f"is not read where there is task.frames, here {config.task.frames}: give "
-            "task.frames=... instead, or add task.frames=null.",
+            f"has no effect with task.frames={config.task.frames}: set task.frames=... instead, or "
+            "add task.frames=null.",
         )
 
 
 def check_folders(chosen: Any, outputs: str) -> None:
-    """Refuses Hydra's names of run folders, which a sweep does not read.
+    """Checks that a sweep sets no run folders by Hydra's settings, which sweeps ignore.
 
     Args:
         chosen (HydraConf): Hydra's configuration.
-        outputs (str): folder of the sweep's runs.
+        outputs (str): Folder of the sweep's runs.
 
     Raises:
-        SettingError: with what to give instead.
+        SettingError: If such a setting is changed.
     """
     whole = chosen.sweep.subdir == "." and chosen.sweep.dir != outputs
     for name, given in {
@@ -149,18 +153,18 @@ def check_folders(chosen: Any, outputs: str) -> None:
     }.items():
         if given is not None:
             raise SettingError(
-                name, f"is not where a sweep's runs go, got {given!r}: give outputs={given}."
+                name, f"does not set the folder of a sweep, got {given!r}: set outputs={given}."
             )
 
 
 @contextmanager
-def composing() -> Iterator[None]:
-    """Shows an error of Hydra's composition in one line, and exits.
+def composition_errors() -> Iterator[None]:
+    """Shows errors of Hydra's composition in one line and exits.
 
-    If the user has set ``HYDRA_FULL_ERROR``, Hydra prints its traceback instead.
+    With the environment variable ``HYDRA_FULL_ERROR``, Hydra shows a traceback instead.
 
     Raises:
-        SystemExit: with that line.
+        SystemExit: With the error's line.
     """
     shown = "HYDRA_FULL_ERROR" in os.environ
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
@@ -169,17 +173,17 @@ def composing() -> Iterator[None]:
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         if shown:
             raise
-        sys.exit(f"error: {refusal(error)}")
-    except OSError as error:  # Hydra cannot make the run's folder.
+        sys.exit(f"error: {one_line_message(error)}")
+    except OSError as error:  # Hydra cannot create the run's folder.
         if shown or error.filename is None:
             raise
-        sys.exit(f"error: {error.filename!r} cannot be made ({error.strerror}); choose another.")
+        sys.exit(f"error: {error.filename!r} cannot be created ({error.strerror}); choose another.")
     finally:
         if not shown:
             os.environ.pop("HYDRA_FULL_ERROR", None)
 
 
-def refusal(error: Exception) -> str:
+def one_line_message(error: Exception) -> str:
     """Returns the text of an error of Hydra or OmegaConf in one line, with what to write instead.
 
     Reads the attributes of the errors, not their texts.
@@ -217,13 +221,13 @@ def _unknown_choice(group: str, name: str, choices: Sequence[str]) -> str:
 
 
 def unknown_setting(name: str) -> str:
-    """Text about an unknown name: the group that has it, or the most similar setting.
+    """Returns a message about an unknown setting: the choices that have it, or a similar name.
 
     Examples:
         >>> unknown_setting("task.epsodes")
         'task.epsodes is not a setting; did you mean task.episodes? --help lists every setting.'
         >>> unknown_setting("algorithm.num_envs")
-        'algorithm.num_envs is only a setting of algorithm=ppo.'
+        'algorithm.num_envs is a setting of algorithm=ppo only.'
         >>> unknown_setting("sigma")
         'sigma is not a setting; did you mean regularizer.sigma? --help lists every setting.'
         >>> unknown_setting("methods")
@@ -237,17 +241,17 @@ def unknown_setting(name: str) -> str:
     }
     if having := [of[1] for of, names in settings.items() if of[0] == group and setting in names]:
         chosen = f"{group}={' or '.join(having)}"
-        return f"{name} is only a setting of {chosen}.{_two_commands(group, having)}"
-    known = {*STEERING, *(field.name for field in dataclasses.fields(ExperimentConfig))}
+        return f"{name} is a setting of {chosen} only.{_suggest_two_commands(group, having)}"
+    known = {*COMMAND_SETTINGS, *(field.name for field in dataclasses.fields(ExperimentConfig))}
     known |= {f"{of[0]}.{each}" for of, names in settings.items() for each in names}
     near = sorted(each for each in known if each.endswith(f".{name}"))
-    near = near or ALSO_CALLED.get(name) or get_close_matches(name, sorted(known), 1)
-    meant = f"; did you mean {near[0]}?" if near else "."
-    return f"{name} is not a setting{meant} --help lists every setting."
+    near = near or ALIASES.get(name) or get_close_matches(name, sorted(known), 1)
+    suggestion = f"; did you mean {near[0]}?" if near else "."
+    return f"{name} is not a setting{suggestion} --help lists every setting."
 
 
-def _two_commands(group: str, having: Sequence[str]) -> str:
-    """Advice for a sweep over choices if only some of them have the setting."""
+def _suggest_two_commands(group: str, having: Sequence[str]) -> str:
+    """Returns advice for sweeps over choices of which only some have the setting."""
     prefix = f"{group}="
     swept = next((each for each in sys.argv if each.startswith(prefix) and "," in each), "")
     choices = swept.removeprefix(prefix).split(",") if swept else []
@@ -256,16 +260,20 @@ def _two_commands(group: str, having: Sequence[str]) -> str:
         return ""
     others = ",".join(choice for choice in choices if choice in having)
     return (
-        f" Run two commands: with {prefix}{','.join(lacking)} and without the setting, then with "
-        f"{prefix}{others} and with it."
+        f" Run two commands: {prefix}{','.join(lacking)} without the setting, and {prefix}{others} "
+        "with it."
     )
 
 
-def folder_named(setting: str, given: Any) -> str | None:
-    """Checks the name of a folder, which may be a number; ``resume`` may be ``None``.
+def check_folder_name(setting: str, given: Any) -> str | None:
+    """Returns the name of a folder as text. It may be a number, and ``resume`` may be ``None``.
+
+    Args:
+        setting (str): Name of the setting.
+        given: Value of the setting.
 
     Raises:
-        SettingError: another value.
+        SettingError: If the value is not the name of a folder.
     """
     if setting == "resume" and given is None:
         return None
@@ -275,27 +283,24 @@ def folder_named(setting: str, given: Any) -> str | None:
     return named
 
 
-def preset_used(config: ExperimentConfig) -> str | None:
-    """Names the regularizer's preset in a line, or says that there is none."""
+def describe_preset(config: ExperimentConfig) -> str | None:
+    """Describes the regularizer's preset in one line; ``None`` if it uses no presets."""
     regularizer, algorithm = config.regularizer, config.algorithm.name
     if regularizer.name not in BEGIN_WITH_PRESET:
         return None
     method, _ = BEGIN_WITH_PRESET[regularizer.name]
     if algorithm not in KINDS:
-        return (
-            f"regularizer={regularizer.name}: there is no preset for {algorithm}; the settings are "
-            "given, or as in the paper"
-        )
-    begins = preset_settings(regularizer.name, algorithm)
-    chosen = ", ".join(f"{name}={getattr(regularizer, name)}" for name in begins)
-    where = preset(method, algorithm)
-    origin = f"{where.evidence}, on {where.tasks}" if where.evidence else "its authors' settings"
+        return f"regularizer={regularizer.name}: there is no preset for {algorithm}, only defaults"
+    initial = preset_settings(regularizer.name, algorithm)
+    chosen = ", ".join(f"{name}={getattr(regularizer, name)}" for name in initial)
+    source = preset(method, algorithm)
+    origin = f"{source.evidence}, on {source.tasks}" if source.evidence else "its authors' settings"
     return f"regularizer={regularizer.name}: {chosen} (the preset for {algorithm}: {origin})"
 
 
-def tell_sweep() -> None:
-    """Reports that the configuration describes a comparison if only one run is made."""
+def show_sweep_hint() -> None:
+    """Prints a hint if the configuration describes a comparison, but only one run is trained."""
     chosen = HydraConfig.get()
     if chosen.sweeper.params:
         sweeps = " ".join(f"{name}={value}" for name, value in chosen.sweeper.params.items())
-        print(f"one run of the comparison {sweeps}: add -m for all of it", flush=True)
+        print(f"one run of the comparison {sweeps}: add -m for all runs", flush=True)

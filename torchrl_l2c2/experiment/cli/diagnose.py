@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from torchrl_l2c2.experiment.errors import told_in_a_line
+from torchrl_l2c2.experiment.errors import one_line_errors
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -16,20 +16,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if chosen.episodes < 1:
         parser.error(f"--episodes must be at least 1, got {chosen.episodes}")
     if len(set(chosen.names or ())) < len(chosen.names or ()):
-        parser.error(f"--names: each run needs one of its own, got {chosen.names}")
+        parser.error(f"--names must differ from each other, got {chosen.names}")
     if chosen.actions and not chosen.actions.endswith(".svg"):
-        parser.error(f"--actions must be an SVG file, named FILE.svg, got {chosen.actions}")
-    with told_in_a_line():
+        parser.error(f"--actions must be an SVG file, FILE.svg, got {chosen.actions}")
+    with one_line_errors():
         from torchrl_l2c2.experiment.analysis import diagnosis
         from torchrl_l2c2.experiment.envs.environments import TEST_SEED
-        from torchrl_l2c2.experiment.run.files import make_folder_of, write_atomically
+        from torchrl_l2c2.experiment.run.files import make_parent_folder, write_atomically
 
         folders = diagnosis.run_folders(chosen.folders)
         if chosen.names and len(chosen.names) != len(folders):
-            parser.error(f"--names: one for each of the {len(folders)} runs, got {chosen.names}")
-        # Before anything is played that could be lost.
+            parser.error(f"--names must have {len(folders)} names, one per run, got {chosen.names}")
+        # Before the episodes, whose results could otherwise be lost.
         for given in filter(None, (chosen.output, chosen.actions)):
-            make_folder_of(given)
+            make_parent_folder(given)
         diagnoses = [
             diagnosis.diagnose_run(
                 folder,
@@ -56,16 +56,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m torchrl_l2c2 diagnose",
-        description="Writes one page that shows why the policies of runs shake.",
+        description="Writes a page that shows why policies shake.",
     )
     add = parser.add_argument
-    add("folders", nargs="+", metavar="FOLDER", help="run folders, or folders that hold runs")
-    add("--names", nargs="+", help="names of the runs (default: what tells them apart)")
-    add("--output", help="the page (default: diagnosis.html in the first folder)")
-    add("--actions", help="an SVG file for the actions of all runs, row by row (default: none)")
-    add("--episodes", type=int, default=3, help="episodes that measures are averaged over (3)")
+    add("folders", nargs="+", metavar="FOLDER", help="run folders, or folders that contain runs")
+    add("--names", nargs="+", help="names of the runs (default: the settings that differ)")
+    add("--output", help="HTML file (default: diagnosis.html in the first folder)")
+    add("--actions", help="SVG file for the actions of all runs, row by row (default: none)")
+    add("--episodes", type=int, default=3, help="number of measured episodes (default: 3)")
     add("--seed", type=int, help="random seed, the same for all runs (default: 1000003)")
-    add("--noise", type=float, help="standard deviation of the noise (default: the task's)")
+    add(
+        "--noise",
+        type=float,
+        help="standard deviation of the noise on observations (default: the task's)",
+    )
     add("--best", action="store_true", help="policy_best.pt instead of policy.pt")
-    add("--no-video", action="store_true", help="no film of the task, which is faster")
+    add("--no-video", action="store_true", help="no video of the task, which is faster")
     return parser

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torchrl_l2c2.experiment.errors import told_in_a_line
+from torchrl_l2c2.experiment.errors import one_line_errors
 
 if TYPE_CHECKING:
     from torchrl_l2c2.experiment.run.evaluation import Evaluation
@@ -16,21 +16,21 @@ COLUMNS = ("return_mean", "return_std", "action_variation_mean", "action_variati
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Plays test episodes and prints their summary: JSON, or a table of several noise levels."""
+    """Plays test episodes and prints their summary, as JSON or as a table of noise levels."""
     parser = _parser()
     chosen = parser.parse_args(arguments)
     if chosen.record and chosen.sampled:
-        parser.error("--record shows mean actions; leave it or --sampled out")
+        parser.error("--record shows mean actions: leave out --record or --sampled")
     levels = chosen.noise or [None]
-    with told_in_a_line():
+    with one_line_errors():
         from torchrl_l2c2.experiment.analysis.video import check_video, record_video
-        from torchrl_l2c2.experiment.run.files import make_folder_of, to_json, write_json
+        from torchrl_l2c2.experiment.run.files import make_parent_folder, to_json, write_json
 
-        # Before anything is played that could be lost.
+        # Before the episodes, whose results could otherwise be lost.
         if chosen.record:
             check_video(chosen.record)
         if chosen.output:
-            make_folder_of(chosen.output)
+            make_parent_folder(chosen.output)
         played = {level: _play(chosen, level) for level in levels}
         if len(played) == 1:
             print(to_json(played[levels[0]].summary()), flush=True)
@@ -56,7 +56,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Plays test episodes with a run's policy.",
     )
     add = parser.add_argument
-    add("folder", help="a run's folder, finished or not")
+    add("folder", help="run folder, finished or not")
     add("--episodes", type=int, default=100, help="number of episodes (default: 100)")
     add("--seed", type=int, help="random seed (default: the seed of the run's test)")
     add(
@@ -64,13 +64,13 @@ def _parser() -> argparse.ArgumentParser:
         type=float,
         nargs="+",
         metavar="LEVEL",
-        help="standard deviations of the noise on observations, such as 0 0.05 0.1; several make a "
-        "table (default: the task's)",
+        help="standard deviations of the noise on observations, such as 0 0.05 0.1; several levels "
+        "give a table (default: the task's)",
     )
-    add("--sampled", action="store_true", help="act with samples, as in training")
+    add("--sampled", action="store_true", help="sampled actions, as in training")
     add("--best", action="store_true", help="policy_best.pt instead of policy.pt")
-    add("--output", help="a JSON file for the summary and every episode")
-    add("--record", metavar="VIDEO", help="a file such as test.mp4: a video of the first episode")
+    add("--output", help="JSON file for the summary and all episodes")
+    add("--record", metavar="VIDEO", help="file for a video of the first episode, such as test.mp4")
     return parser
 
 
@@ -80,7 +80,7 @@ def _play(chosen: argparse.Namespace, noise: float | None) -> Evaluation:
     from torchrl_l2c2.experiment.run.process import ProcessState
 
     with ProcessState(seed_of_test(chosen.folder, chosen.seed)):
-        # Within, as some tasks draw from the global generators where they are made.
+        # Inside the context: some tasks use the global random generators when they are created.
         policy, env, max_steps = load_policy(
             chosen.folder, seed=chosen.seed, noise_scale=noise, best=chosen.best
         )
@@ -97,7 +97,7 @@ def _play(chosen: argparse.Namespace, noise: float | None) -> Evaluation:
 
 
 def _table(played: dict[float | None, Evaluation]) -> str:
-    """The summary of every noise level, a line each."""
+    """Formats the summaries, one line per noise level."""
     lines = [f"{'noise':>8}  {'return':>20}  {'action variation':>20}"]
     for level, test in played.items():
         summary = test.summary()

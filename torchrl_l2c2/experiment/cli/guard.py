@@ -1,8 +1,7 @@
-"""Ends the processes of a sweep once the one that began it is gone, however it went.
+"""Program that ends the processes of a sweep after the process that started it has ended.
 
-A program of its own, for the standard library alone: ``python guard.py MARK``, where MARK is in the
-environment of every process that belongs to the sweep. A launcher's process that waits for a job
-would not notice by itself that none will come.
+``python guard.py MARK``, with the standard library only. MARK is in the environment of all
+processes of the sweep. Without it, a launcher's worker would wait for further jobs forever.
 """
 
 from __future__ import annotations
@@ -13,18 +12,18 @@ import sys
 import time
 from pathlib import Path
 
-# Jobs that train notice by themselves.
+# Training jobs end by themselves.
 GRACE_SECONDS = 1.0
 
 
 def marked(mark: str) -> list[int]:
-    """Other processes with this text in their environment; Slurm's other jobs are Slurm's own."""
+    """Returns the other processes of the same Slurm job with this text in their environment."""
     found = []
     own_job = _slurm_job(Path("/proc/self/environ").read_bytes())
     for path in Path("/proc").glob("[0-9]*/environ"):
         try:
             environment = path.read_bytes()
-        except OSError:  # ended, or another user's
+        except OSError:  # The process has ended or belongs to another user.
             continue
         number = int(path.parent.name)
         belongs = mark.encode() in environment and _slurm_job(environment) == own_job
@@ -38,7 +37,7 @@ def _slurm_job(environment: bytes) -> list[bytes]:
 
 
 def main() -> None:
-    """Waits until nobody holds the other end of the input, then ends what is left."""
+    """Waits until the other end of the input is closed, then ends the remaining processes."""
     sys.stdin.buffer.read()
     time.sleep(GRACE_SECONDS)
     while left := marked(sys.argv[1]):

@@ -11,15 +11,15 @@ from torchrl_l2c2._version import __version__
 
 # Packages of the experiment extra, which the components do not need.
 PACKAGES = ("gymnasium", "hydra", "pydantic", "matplotlib", "tqdm", "filelock")
-# Name: module and help. Each module has a ``main(arguments)``.
+# Name: module and help. Each module has a function ``main(arguments)``.
 COMMANDS = {
-    "train": ("train", "trains a run; task=hopper seed=1, for example"),
-    "evaluate": ("evaluate", "plays test episodes, also with noise on the observations"),
+    "train": ("train", "trains a policy, for example: train task=hopper seed=1"),
+    "evaluate": ("evaluate", "plays test episodes, also with noise on observations"),
     "diagnose": ("diagnose", "writes a page that shows why policies shake"),
-    "report": ("report", "tables and learning curves of runs"),
+    "report": ("report", "writes tables and learning curves of runs"),
     "export": ("export", "writes a policy as ONNX and as a torch.export program"),
     "video": ("video", "records test episodes"),
-    "settings": ("manual", "prints every setting as Markdown"),
+    "settings": ("manual", "prints all settings as Markdown"),
 }
 HELP = (
     f"torchrl_l2c2 {__version__}: policies that do not shake, for TorchRL\n\n"
@@ -33,11 +33,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Runs a subcommand.
 
     Args:
-        arguments (sequence of str, optional): the subcommand and its options. Default: the command
-            line's.
+        arguments (sequence of str, optional): Subcommand and its options. Default: the process's
+            command line.
 
     Raises:
-        SystemExit: with one line if the subcommand is unknown or a package is missing.
+        SystemExit: If the subcommand is unknown or a package is missing, with one line.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     if not given or given[0] in ("-h", "--help"):
@@ -45,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     name, rest = given[0], given[1:]
     if name not in COMMANDS:
-        hint = f" Write: train {' '.join(given)}" if "=" in name else ""
+        hint = f" Did you mean: train {' '.join(given)}" if "=" in name else ""
         sys.exit(f"error: Expected one of {', '.join(COMMANDS)}, got {name!r}.{hint}")
     if missing := [each for each in PACKAGES if find_spec(each) is None]:
         sys.exit(

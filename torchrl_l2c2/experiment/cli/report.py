@@ -8,14 +8,14 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torchrl_l2c2.experiment.errors import UserError, told_in_a_line
+from torchrl_l2c2.experiment.errors import UserError, one_line_errors
 
 if TYPE_CHECKING:
     from torchrl_l2c2.experiment.run.finished import FinishedRun, Record
 
 DESCRIPTION = """\
-Reads every finished run below folders, prints a table of them, and writes a report: tables,
-statistics and pictures, as one page, as Markdown, SVG and JSON.
+Reads all finished runs below folders, prints a table, and writes a report with tables, statistics
+and pictures, as one HTML page and as Markdown, SVG and JSON.
 """
 EXAMPLES = """\
 examples:
@@ -26,14 +26,14 @@ examples:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Does what the command line says; an error is one line."""
+    """Prints a table of runs and writes a report."""
     parser = _parser()
     chosen = parser.parse_args(arguments)
     if bool(chosen.folders) == bool(chosen.records):
-        parser.error("name folders of runs, or files of records with --from")
+        parser.error("expected either folders of runs, or CSV files with --from")
     if chosen.records and chosen.csv:
-        parser.error("--csv writes records of folders; --from has them already")
-    with told_in_a_line():
+        parser.error("--csv works only with folders: leave out --csv or --from")
+    with one_line_errors():
         _report(chosen)
 
 
@@ -45,21 +45,26 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add("folders", nargs="*", metavar="FOLDER", help="of runs, at any depth, e.g. outputs/swingup")
+    add(
+        "folders",
+        nargs="*",
+        metavar="FOLDER",
+        help="folders that contain runs at any depth, such as outputs/swingup",
+    )
     add(
         "--from",
         dest="records",
         nargs="+",
         metavar="CSV",
-        help="records of runs instead of their folders",
+        help="CSV files of --csv, instead of folders",
     )
     add(
         "--output",
         metavar="FOLDER",
-        help="of the report (default: report/ in the first folder; with --from or --csv there is a "
-        "report only if this is given)",
+        help="folder of the report (default: report/ in the first folder; with --from or --csv, no "
+        "report without this option)",
     )
-    add("--csv", metavar="CSV", help="file that gets a line for every run, or its newer line")
+    add("--csv", metavar="CSV", help="CSV file to which runs are added, one line per run")
     return parser
 
 
@@ -76,7 +81,7 @@ def _report(chosen: argparse.Namespace) -> None:
     if chosen.output or not (chosen.records or chosen.csv):
         folder = Path(chosen.output or Path(chosen.folders[0]) / "report")
         written.append(f"report: {write_report(folder, records, runs, notes)}")
-    # Last: who reads but the first lines of it has the files all the same.
+    # Printed last: a closed output, as with head, must not prevent the files.
     print("\n\n".join([printed_table(records), *notes, *written]))
 
 
@@ -91,9 +96,9 @@ def _read(
         return [run.record for run in found.runs], found.runs, found.notes
     for file in chosen.records:
         if not Path(file).exists():
-            raise FileNotFoundError(f"there is no file {file!r}; make it with --csv.")
+            raise FileNotFoundError(f"there is no file {file!r}: create it with --csv.")
     records = merge([], chain.from_iterable(map(read_records, chosen.records)))
     if not records:
         named = ", ".join(map(repr, chosen.records))
-        raise UserError(f"no record of a run in {named}; make them with --csv.")
+        raise UserError(f"no runs in {named}: add them with --csv.")
     return records, [], []

@@ -1,7 +1,7 @@
-"""Messages between the jobs of a sweep and the process that began it, on one or many machines.
+"""Messages between the jobs of a sweep and the process that started it, also across machines.
 
-A folder next to the runs holds one file per message, because several machines cannot append to one
-file: a request to stop, and the jobs that run, have finished or have failed.
+A folder next to the runs has one file per message, because several machines cannot append to one
+file: requests to stop, and running, finished and failed jobs.
 """
 
 from __future__ import annotations
@@ -33,77 +33,87 @@ from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
-from torchrl_l2c2.experiment.errors import UserError, told_in_a_line
+from torchrl_l2c2.experiment.errors import UserError, one_line_errors
 from torchrl_l2c2.experiment.run.files import make_folder
 from torchrl_l2c2.experiment.run.signals import FINISHING, SAME_SIGNAL_SECONDS, terminate
 from torchrl_l2c2.experiment.settings.fields import SettingError
 
-VARIABLE = "TORCHRL_L2C2_SWEEP"  # environment variable, inherited by a launcher's processes
+VARIABLE = "TORCHRL_L2C2_SWEEP"  # Environment variable, inherited by a launcher's processes.
 POLL_SECONDS = 0.2
-REMOTE_POLL_SECONDS = 2.0  # hundreds of machines may share the file system
+REMOTE_POLL_SECONDS = 2.0  # Hundreds of machines may share the file system.
 LOST = "lost with its process or machine, or still running"
 GUARD = Path(__file__).with_name("guard.py")
 
 
 class Sweep:
-    """A sweep, for the process that began it and for its jobs.
+    """A sweep, in the process that started it or in one of its jobs.
+
+    Args:
+        folder (Path): Folder of the messages.
+        started_by (tuple): Host name and process id of the process that started the sweep.
+        overrides (sequence of str): Overrides of its command.
 
     Attributes:
-        begun_by: machine and process that began it.
-        overrides: overrides of its command.
-        begun_here: the sweep that this process began, or ``None``.
-        job_is_here: whether a job runs in this process.
+        started_here: Sweep that this process started, or ``None``.
+        job_is_here: Whether a job runs in this process.
     """
 
-    begun_here: Sweep | None = None
+    started_here: Sweep | None = None
     job_is_here = False
-    _following = False
+    _watching = False
 
-    def __init__(self, folder: Path, begun_by: tuple[str, int], overrides: Sequence[str]) -> None:
-        self._folder, self.begun_by, self.overrides = folder, begun_by, overrides
+    def __init__(self, folder: Path, started_by: tuple[str, int], overrides: Sequence[str]) -> None:
+        self._folder, self.started_by, self.overrides = folder, started_by, overrides
 
     @classmethod
     def of_this_job(cls) -> Sweep:
-        """The sweep that this job belongs to.
+        """Returns the sweep of this job, from the environment.
 
         Raises:
-            UserError: The launcher did not pass the sweep on, or its folder is missing here.
+            UserError: If the launcher did not pass on the environment variable, or this machine
+                does not have the folder.
         """
         if VARIABLE not in os.environ:
-            raise UserError(f"the launcher passes no {VARIABLE} on to the jobs' environment.")
+            raise UserError(
+                f"the launcher did not pass the environment variable {VARIABLE} to the job: "
+                "configure it to pass the environment."
+            )
         folder, (host, process), overrides, _ = json.loads(os.environ[VARIABLE])
         if not Path(folder).parent.is_dir():
             raise UserError(
-                f"{str(Path(folder).parent)!r} is not on {socket.gethostname()}: choose an outputs "
-                "folder on a file system that all machines share."
+                f"{str(Path(folder).parent)!r} does not exist on {socket.gethostname()}: choose an "
+                "outputs folder on a file system that all machines share."
             )
         return cls(Path(folder), (host, process), overrides)
 
     @property
     def is_remote(self) -> bool:
-        """Checks whether another program, such as a cluster, started this process."""
-        host, process = self.begun_by
+        """Checks whether another program, such as a cluster's scheduler, started this process."""
+        host, process = self.started_by
         return host != socket.gethostname() or process not in (os.getpid(), os.getppid())
 
     @property
     def stopped_by(self) -> int | None:
-        """The signal that stopped the sweep; ``None`` while it continues."""
+        """Signal that stopped the sweep; ``None`` while it continues."""
         try:
             return int((self._folder / "stopped").read_text())
         except OSError:
-            # A job that was still to come, of a sweep that has ended.
+            # Without a folder the sweep has ended, and this job was still waiting.
             return None if self._folder.is_dir() else signal.SIGTERM
 
     def stop(self, signal_number: int) -> None:
-        """Stops the sweep: no job begins, and training jobs save and end."""
+        """Stops the sweep: no job starts, and running jobs save and end."""
         if self.stopped_by is None:
             self._put("stopped", str(signal_number))
 
     def share(self, outputs: Path) -> None:
-        """Moves the messages to a folder that all machines see, before any job begins.
+        """Moves the messages to a folder that all machines can read, before any job starts.
+
+        Args:
+            outputs (Path): Parent folder of the messages.
 
         Raises:
-            OSError: The folder cannot be written to.
+            OSError: If the folder is not writable.
         """
         stopped, self._folder = self.stopped_by, make_folder(outputs) / f".{self._folder.name}"
         self._folder.mkdir()
@@ -112,22 +122,22 @@ class Sweep:
             self.stop(stopped)
 
     def publish(self) -> None:
-        """Passes the sweep on to processes that start from now on."""
-        told = [str(self._folder), self.begun_by, [*self.overrides], os.getcwd()]
-        os.environ[VARIABLE] = json.dumps(told)
+        """Passes the sweep to all later child processes, by the environment."""
+        values = [str(self._folder), self.started_by, [*self.overrides], os.getcwd()]
+        os.environ[VARIABLE] = json.dumps(values)
 
     def end(self) -> None:
-        """Ends the messages; jobs that still run somewhere save and end."""
+        """Removes the messages: jobs that are still running save and end."""
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def add_failure(self, number: int, job: str, reason: str) -> None:
-        """Stores the reason of a job's failure until the end of the sweep."""
+        """Stores the reason for a job's failure until the end of the sweep."""
         self._put(f"failed_{number:06d}", json.dumps([job, reason]))
         self._ended(number)
 
     @property
     def failures(self) -> list[tuple[str, str]]:
-        """Jobs that failed or did not end, with the reason in one line."""
+        """Failed and lost jobs, with the reason in one line."""
         failed = {number: (job, reason) for number, (job, reason) in self._all("failed")}
         if self.stopped_by is None:
             lost = f"{LOST}; the same command continues it"
@@ -135,24 +145,29 @@ class Sweep:
         return [failed[number] for number in sorted(failed)]
 
     def claim(self, number: int, folder: Path) -> None:
-        """Keeps a run's folder for one job of the sweep.
+        """Reserves a run's folder for one job of the sweep.
+
+        Args:
+            number (int): Number of the job.
+            folder (Path): Run folder.
 
         Raises:
-            SettingError: another job has it, whose results would be replaced.
+            SettingError: If another job has the folder: its results would be replaced.
         """
         claim = self._folder / f"claim_{hashlib.sha256(str(folder).encode()).hexdigest()[:16]}"
         try:
-            # If two jobs begin at once, one of them makes the file.
+            # Mode "x": if two jobs start at once, only one of them creates the file.
             with open(claim, "x") as file:
                 file.write(str(number))
         except FileExistsError:
             if (other := claim.read_text()) != str(number):
                 raise SettingError(
                     "outputs",
-                    f"must be another for job {number} than for job {other} of the sweep, which "
-                    f"both have {folder}: they have the same settings, or differ in such as name "
-                    "no folder (how long is trained and tested, threads, ...). Leave one out, "
-                    "sweep over outputs, too, or give two commands.",
+                    f"must differ between jobs {other} and {number} of the sweep, which have the "
+                    f"same folder {folder}: their settings are the same, or differ only in "
+                    "settings that are not part of the folder's name (length of training and "
+                    "tests, threads, ...). Leave one job out, sweep over outputs as well, or run "
+                    "two commands.",
                 ) from None
         except FileNotFoundError:  # The sweep has ended.
             return
@@ -163,19 +178,19 @@ class Sweep:
 
     @property
     def finished(self) -> list[Path]:
-        """Folders of the runs that are finished, by this sweep or before."""
+        """Folders of the finished runs, including runs that were finished before the sweep."""
         return [Path(folder) for _, (folder, _) in self._all("finished")]
 
-    def standing(self, number: int, params: Mapping[str, str]) -> str:
-        """State of a sweep when a job begins, such as ``"run 3 of 72, about 4.1 h left"``.
+    def status(self, number: int, params: Mapping[str, str]) -> str:
+        """Returns the progress at the start of a job, such as ``"run 3 of 72, about 4.1 h left"``.
 
         Args:
-            number (int): The job's number, from 1.
-            params (Mapping): sweeps of the configuration, by setting.
+            number (int): Number of the job, from 1.
+            params (Mapping): Sweeps in the configuration, by setting.
         """
         try:
             tasks = [job.get("task") for job in list_jobs(self.overrides, params)]
-        except HydraException:  # A glob, which stands for as many as Hydra finds.
+        except HydraException:  # A glob: only Hydra knows the number of jobs.
             return f"run {number}"
         seconds: dict[str | None, list[float]] = defaultdict(list)
         for finished, (_, each) in self._all("finished"):
@@ -184,30 +199,30 @@ class Sweep:
         place = f"run {number} of {len(tasks)}"
         if not seconds:
             return place
-        # Durations differ between tasks; a task without a finished run counts as their mean.
+        # Durations differ between tasks; tasks without a finished run count with the mean.
         of_task = {task: statistics.fmean(each) for task, each in seconds.items()}
-        usual = statistics.fmean(of_task.values())
-        left = sum(of_task.get(task, usual) for task in tasks[number - 1 :])
+        mean = statistics.fmean(of_task.values())
+        left = sum(of_task.get(task, mean) for task in tasks[number - 1 :])
         return f"{place}, {_about(left / max(1, len(self._all('running'))))} left"
 
     @contextlib.contextmanager
     def job(self, number: int, job: str) -> Iterator[bool]:
-        """Context in which a job of the sweep runs; a stop ends the job in order.
+        """Context manager for a job of the sweep. Stopping the sweep ends the job in order.
 
         Args:
-            number (int): The job's number, the same if the job is begun again.
-            job (str): The job's name.
+            number (int): Number of the job, the same if it is started again.
+            job (str): Name of the job.
 
         Yields:
-            bool: Whether the job was begun before, and lost.
+            bool: Whether the job was started before and lost.
         """
-        begun_before = (self._folder / f"running_{number:06d}").exists()
+        started_before = (self._folder / f"running_{number:06d}").exists()
         self._put(f"running_{number:06d}", json.dumps(job))
-        if self.begun_by != (socket.gethostname(), os.getpid()):
-            self._follow()
+        if self.started_by != (socket.gethostname(), os.getpid()):
+            self._watch()
         Sweep.job_is_here = True
         try:
-            yield begun_before
+            yield started_before
             self._ended(number)
         finally:
             Sweep.job_is_here = False
@@ -216,79 +231,83 @@ class Sweep:
         (self._folder / f"running_{number:06d}").unlink(missing_ok=True)
 
     def _put(self, name: str, content: str) -> None:
-        """Writes a file in one step, unless the sweep has ended."""
+        """Writes a message atomically, unless the sweep has ended."""
         partial = self._folder / f".{name}.{socket.gethostname()}.{os.getpid()}"
         with contextlib.suppress(FileNotFoundError):
             partial.write_text(content)
             partial.replace(self._folder / name)
 
     def _all(self, kind: str) -> list[tuple[int, Any]]:
-        """Messages of a kind, with the numbers of their jobs."""
-        told = []
+        """Returns the messages of a kind, with the numbers of their jobs."""
+        messages = []
         for path in sorted(self._folder.glob(f"{kind}_*")):
-            with contextlib.suppress(FileNotFoundError):  # A job that has just ended.
-                told.append((int(path.name.rpartition("_")[2]), json.loads(path.read_text())))
-        return told
+            with contextlib.suppress(FileNotFoundError):  # The job has just ended.
+                messages.append((int(path.name.rpartition("_")[2]), json.loads(path.read_text())))
+        return messages
 
-    def _follow(self) -> None:
-        """Ends this process with the sweep: a stop arrives as SIGTERM.
+    def _watch(self) -> None:
+        """Watches the sweep in a thread: after a stop, this process gets SIGTERM.
 
-        A local process also ends with the process that began the sweep.
+        A local process also ends with the process that started the sweep.
         """
         signal.signal(signal.SIGTERM, terminate)
-        if Sweep._following:
+        if Sweep._watching:
             return
-        Sweep._following = True
+        Sweep._watching = True
         remote = self.is_remote
 
-        def follow() -> None:
-            told = False
+        def watch() -> None:
+            interrupted = False
             while True:
                 time.sleep(REMOTE_POLL_SECONDS if remote else POLL_SECONDS)
-                if not remote and os.getppid() != self.begun_by[1]:
+                if not remote and os.getppid() != self.started_by[1]:
                     os._exit(1)
-                if not told and Sweep.job_is_here and self.stopped_by is not None:
-                    told = True
+                if not interrupted and Sweep.job_is_here and self.stopped_by is not None:
+                    interrupted = True
                     _thread.interrupt_main(signal.SIGTERM)
 
-        threading.Thread(target=follow, daemon=True).start()
+        threading.Thread(target=watch, daemon=True).start()
 
 
 class ShareSweep(Callback):
-    """Keeps the messages of a sweep next to its runs, where every machine can read them."""
+    """Hydra callback that moves a sweep's messages next to its runs, for all machines."""
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        """Called by Hydra, once the folder is known and before its launcher starts.
+        """Moves the messages before Hydra's launcher starts.
 
         Raises:
-            SystemExit: the folder cannot be written to; Hydra swallows other errors.
+            SystemExit: If the folder is not writable. Hydra would swallow other errors.
         """
-        if Sweep.begun_here is not None:
-            with told_in_a_line():
-                Sweep.begun_here.share(Path(config.hydra.sweep.dir).absolute())
+        if Sweep.started_here is not None:
+            with one_line_errors():
+                Sweep.started_here.share(Path(config.hydra.sweep.dir).absolute())
 
 
 def enter_folder() -> None:
-    """Changes to the working directory of the sweep, for launchers that start elsewhere."""
+    """Changes to the sweep's working directory, for launchers that start jobs elsewhere."""
     os.chdir(json.loads(os.environ[VARIABLE])[-1])
 
 
 def start_guard(mark: str) -> None:
-    """Starts a guard, which ends processes with this mark in their environment after this one."""
+    """Starts a guard, which ends the processes with this mark when this process has ended."""
     if not Path("/proc/self/environ").exists():
         return
     command = [sys.executable, "-I", "-S", str(GUARD), mark]
     guard = subprocess.Popen(command, stdin=subprocess.PIPE)
     assert guard.stdin is not None
-    # Before the launcher registers anything, hence after it at the end.
+    # Exit handlers run in reverse order: this one, registered first, runs after the launcher's.
     atexit.register(guard.stdin.close)
 
 
 def list_jobs(overrides: Sequence[str], params: Mapping[str, str]) -> list[dict[str, str]]:
-    """Lists the choices of a sweep for each of its jobs; the command's overrides come first.
+    """Returns the swept settings of each job of a sweep.
+
+    Args:
+        overrides (sequence of str): Overrides of the command, which replace ``params``.
+        params (Mapping): Sweeps in the configuration, by setting.
 
     Raises:
-        HydraException: A sweep without a list of values: a glob or an interval.
+        HydraException: If a sweep has no list of values, as a glob or an interval.
 
     Examples:
         >>> jobs = list_jobs(["-m", "seed=0,1", "task=ant"], {"seed": "range(0,18)", "beta": "1,2"})
@@ -315,30 +334,30 @@ def _about(seconds: float) -> str:
 
 @contextlib.contextmanager
 def begin_sweep(overrides: Sequence[str] = ()) -> Iterator[Sweep]:
-    """Begins a sweep in this process: the first Ctrl-C or SIGTERM stops it in order.
+    """Starts a sweep in this process. The first Ctrl-C or SIGTERM stops it in order.
 
     Args:
-        overrides (sequence of str): Overrides of the command.
+        overrides (sequence of str): Overrides of the command. Default: none.
     """
-    # Until the runs' folder is known.
+    # A temporary folder, until the folder of the runs is known.
     with tempfile.TemporaryDirectory(prefix="torchrl_l2c2_") as folder:
-        begun_by = (socket.gethostname(), os.getpid())
-        sweep, first = Sweep(Path(folder), begun_by, overrides), 0.0
+        started_by = (socket.gethostname(), os.getpid())
+        sweep, first = Sweep(Path(folder), started_by, overrides), 0.0
 
         def receive(number: int, frame: Any) -> None:
             nonlocal first
             if sweep.stopped_by is None:
                 first = time.monotonic()
                 sweep.stop(number)
-                if Sweep.job_is_here:  # and not training, where it has a handler of its own
+                if Sweep.job_is_here:  # Not training, which has its own handler.
                     terminate(number, frame)
-                print(f"\n{FINISHING}; once more: at once", file=sys.stderr, flush=True)
+                print(f"\n{FINISHING}; a second signal ends at once", file=sys.stderr, flush=True)
             elif time.monotonic() - first > SAME_SIGNAL_SECONDS:
                 terminate(number, frame)
 
         start_guard(Path(folder).name)
         sweep.publish()
-        Sweep.begun_here = sweep
+        Sweep.started_here = sweep
         previous = {n: signal.signal(n, receive) for n in (signal.SIGINT, signal.SIGTERM)}
         try:
             yield sweep
@@ -346,4 +365,4 @@ def begin_sweep(overrides: Sequence[str] = ()) -> Iterator[Sweep]:
             sweep.end()
             for number, handler in previous.items():
                 signal.signal(number, handler)
-            Sweep.begun_here = None
+            Sweep.started_here = None

@@ -1,4 +1,4 @@
-"""``train``: settings from a shell, by Hydra, to a run and its result.
+"""``train``: trains a run or a sweep, with settings from the command line by Hydra.
 
 ``python train.py`` in a clone, ``python -m torchrl_l2c2 train`` anywhere.
 """
@@ -27,24 +27,24 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_l2c2.experiment.cli.composition import (
     CONF,
-    composing,
-    preset_used,
+    composition_errors,
+    describe_preset,
     read,
     register,
-    tell_sweep,
+    show_sweep_hint,
 )
 from torchrl_l2c2.experiment.cli.manual import manual
 from torchrl_l2c2.experiment.cli.sweep import Sweep, begin_sweep, list_jobs
 from torchrl_l2c2.experiment.errors import (
     UserError,
     is_lack_of_memory,
-    is_told_in_a_line,
+    is_one_line_error,
     show_cause,
-    warnings_told,
+    warnings_as_lines,
 )
 from torchrl_l2c2.experiment.run.files import make_folder
 from torchrl_l2c2.experiment.run.metrics_log import check_installed
-from torchrl_l2c2.experiment.run.progress import log, say
+from torchrl_l2c2.experiment.run.progress import log, show_and_log
 from torchrl_l2c2.experiment.run.signals import (
     Interrupted,
     Terminated,
@@ -57,19 +57,23 @@ from torchrl_l2c2.experiment.settings.fields import SettingError
 if TYPE_CHECKING:
     from torchrl_l2c2.experiment.run.finished import FinishedRun
 
-# How long a file server may hold the lock of a machine that was lost.
+# Maximum time for which a file server holds the lock of a crashed machine.
 LOST_SECONDS = 180.0
-# Of conf/hydra/launcher/: the plugin, and the extra that brings it.
+# Launchers in conf/hydra/launcher/: plugin, and the extra that installs it.
 LAUNCHERS = {
     "ray_cluster": ("hydra_plugins.hydra_ray_launcher", "ray"),
     "slurm_cluster": ("hydra_plugins.hydra_submitit_launcher", "slurm"),
 }
 
-OF_MEMORY = "algorithm.hidden, replay.capacity, replay.batch_size or threads"
+MEMORY_SETTINGS = "algorithm.hidden, replay.capacity, replay.batch_size or threads"
 
 
 def check_launcher(arguments: Sequence[str]) -> None:
-    """Says which extra a launcher needs, where Hydra would say that it cannot be loaded."""
+    """Checks that a launcher's extra is installed, before Hydra fails to load the launcher.
+
+    Raises:
+        SystemExit: If the extra is missing, with the command that installs it.
+    """
     for name, (plugin, extra) in LAUNCHERS.items():
         if f"hydra/launcher={name}" in arguments and find_spec(plugin) is None:
             needed = f"pip install 'torchrl-l2c2[{extra}]'"
@@ -77,7 +81,11 @@ def check_launcher(arguments: Sequence[str]) -> None:
 
 
 def check_sweep(arguments: Sequence[str]) -> None:
-    """Ends where a sweep has no job, several comparisons or an interval."""
+    """Checks that a sweep has jobs, only one comparison, and no interval.
+
+    Raises:
+        SystemExit: If not, with the reason.
+    """
     try:
         for comparison in OverridesParser.create().parse_overrides(
             [each for each in arguments if each.lstrip("+").startswith("experiment=")]
@@ -85,75 +93,75 @@ def check_sweep(arguments: Sequence[str]) -> None:
             if comparison.is_sweep_override() or isinstance(comparison.value(), list):
                 sys.exit(
                     f"error: {comparison.input_line}: each comparison has its own seeds and "
-                    "launcher, which a sweep over comparisons would leave out. Run a command for "
-                    "each of them."
+                    "launcher, which a sweep over comparisons would ignore. Run one command per "
+                    "comparison."
                 )
         empty = not list_jobs(arguments, {})
-    except HydraException as error:  # Of which Hydra itself says more, or finds what a glob is.
+    except HydraException as error:  # Hydra reports other errors itself, and resolves globs.
         if "INTERVAL" in str(error):
-            sys.exit("error: an interval is nothing to sweep over: examples/search.py searches.")
+            sys.exit("error: sweeps do not support intervals: use examples/search.py.")
         return
     if empty:
-        sys.exit(f"error: a sweep of no job: one of {' '.join(arguments)} has no value.")
+        sys.exit(f"error: the sweep has no jobs: one of {' '.join(arguments)} has no value.")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Trains a run or a sweep.
 
     Args:
-        arguments (sequence of str, optional): overrides and options of Hydra, which replace the
-            process's command line. Default: the command line.
+        arguments (sequence of str, optional): Hydra's overrides and options, which replace the
+            process's command line. Default: the process's command line.
     """
     if arguments is not None:
-        sys.argv[1:] = arguments  # Hydra reads it there.
-    if {"-h", "--help"} & set(sys.argv[1:]):  # Hydra's own help takes seconds to compose.
-        with _reader_may_leave():
+        sys.argv[1:] = arguments  # Hydra reads sys.argv.
+    if {"-h", "--help"} & set(sys.argv[1:]):  # Hydra's own help takes seconds.
+        with _allow_closed_output():
             print(manual(), end="", flush=True)
         return
     check_launcher(sys.argv)
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Nothing is reported unasked.
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # No telemetry by default.
     keep_ctrl_c_from_children()
     signal.signal(signal.SIGTERM, terminate)
-    if "" not in sys.path:  # As with python -m: modules with tasks may lie here.
+    if "" not in sys.path:  # As with python -m: the folder may have modules with tasks.
         sys.path.append(os.getcwd())
     register()
-    if not any(map(_asks_for_a_sweep, sys.argv[1:])):
-        with composing(), _reader_may_leave():
+    if not any(map(_is_multirun, sys.argv[1:])):
+        with composition_errors(), _allow_closed_output():
             _main()
             sys.stdout.flush()
         return
     check_sweep(sys.argv[1:])
     with begin_sweep(sys.argv[1:]) as sweep:
         try:
-            with composing():
+            with composition_errors():
                 _main()
         except KeyboardInterrupt:
             sweep.stop(signal.SIGINT)
         finally:
-            tell_end(sweep)
+            show_sweep_end(sweep)
         stopped_by, failures = sweep.stopped_by, sweep.failures
     sys.exit(bool(failures) if stopped_by is None else 128 + stopped_by)
 
 
 @contextmanager
-def _reader_may_leave() -> Iterator[None]:
-    """Ends in order where the output's reader has closed it, as in ``--help | head``."""
+def _allow_closed_output() -> Iterator[None]:
+    """Exits without a traceback if the output is closed, as in ``--help | head``."""
     try:
         yield
     except BrokenPipeError:
-        # Python flushes once more when it ends.
+        # Python flushes the output again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
 
 
-def _asks_for_a_sweep(argument: str) -> bool:
-    """Hydra takes the beginning of an option for the whole."""
-    begun = argument.startswith("--m") and "--multirun".startswith(argument)
-    return begun or argument in ("-m", "hydra.mode=MULTIRUN")
+def _is_multirun(argument: str) -> bool:
+    """Checks for Hydra's option ``--multirun``, which may be abbreviated."""
+    abbreviated = argument.startswith("--m") and "--multirun".startswith(argument)
+    return abbreviated or argument in ("-m", "hydra.mode=MULTIRUN")
 
 
-def tell_end(sweep: Sweep) -> None:
-    """Prints the end of a sweep: a table of its runs, its failures, and how to continue."""
+def show_sweep_end(sweep: Sweep) -> None:
+    """Prints a table of a sweep's runs, its failures, and how to continue."""
     if sweep.finished:
         from torchrl_l2c2.experiment.analysis.reports import sweep_summary
 
@@ -172,30 +180,30 @@ def _main(values: DictConfig) -> None:
         _run_job(plain, Sweep.of_this_job())
         return
     try:
-        tell_sweep()
+        show_sweep_hint()
         run(*read(plain), plain)
     except Interrupted as interruption:
         print(interruption, file=sys.stderr)
         sys.exit(128 + interruption.signal_number)
-    except KeyboardInterrupt as interruption:  # Not while training, or a second one.
+    except KeyboardInterrupt as interruption:  # Outside of training, or a second signal.
         print("interrupted; the same command continues.", file=sys.stderr)
         sys.exit(128 + (signal.SIGTERM if isinstance(interruption, Terminated) else signal.SIGINT))
     except Exception as error:
-        _tell(error)
+        _print_error(error)
         sys.exit(1)
 
 
 def _run_job(values: dict[str, Any], sweep: Sweep) -> None:
-    """Runs a job; if it fails, the sweep continues with the others."""
+    """Runs a job of a sweep. If it fails, the sweep continues with the other jobs."""
     if sweep.stopped_by is not None:
         return
     number, job = HydraConfig.get().job.num, " ".join(HydraConfig.get().overrides.task)
     try:
-        with sweep.job(number, job) as begun_before:
-            patience = LOST_SECONDS if begun_before else 0.0
+        with sweep.job(number, job) as started_before:
+            patience = LOST_SECONDS if started_before else 0.0
             config, folder = read(values)
             sweep.claim(number, folder)
-            finished = run(config, folder, values, _standing(sweep), patience)
+            finished = run(config, folder, values, _sweep_status(sweep), patience)
             if finished is not None:
                 sweep.add_finished(number, finished.folder, finished.record.seconds)
     except (Interrupted, KeyboardInterrupt) as interruption:
@@ -203,64 +211,71 @@ def _run_job(values: dict[str, Any], sweep: Sweep) -> None:
         if isinstance(interruption, Interrupted):
             print(interruption, file=sys.stderr)
         if sweep.is_remote and sweep.stopped_by is None:
-            # Its machine is wanted back. Ended so, the program that started it begins it again.
+            # A scheduler preempted the job. With this exit status it starts the job again.
             sys.exit(128 + stopped_by)
         sweep.stop(stopped_by)
     except Exception as error:
-        sweep.add_failure(number, job, _tell(error).splitlines()[0])
+        sweep.add_failure(number, job, _print_error(error).splitlines()[0])
 
 
-def _standing(sweep: Sweep) -> str:
+def _sweep_status(sweep: Sweep) -> str:
     chosen = HydraConfig.get()
-    return sweep.standing(chosen.job.num + 1, chosen.sweeper.params or {})
+    return sweep.status(chosen.job.num + 1, chosen.sweeper.params or {})
 
 
-def _tell(error: Exception) -> str:
-    """Prints an error: one line, with the lines of a simulator that failed; a bug's traceback."""
-    if not is_told_in_a_line(error):
+def _print_error(error: Exception) -> str:
+    """Prints an error in one line, or with a traceback if it is a bug, and returns its message.
+
+    The traceback of a failed simulator is also printed.
+    """
+    if not is_one_line_error(error):
         traceback.print_exception(error)
         return "".join(traceback.format_exception_only(error)).strip()
     show_cause(error)
-    told = str(error) or type(error).__name__
+    message = str(error) or type(error).__name__
     if isinstance(error, SettingError):
-        told += " --help lists every setting."
+        message += " --help lists every setting."
     elif is_lack_of_memory(error):
-        told = f"{told.rstrip('.')}. There is no memory for it: choose smaller {OF_MEMORY}."
-    print(f"error: {told}", file=sys.stderr)
-    return told
+        message = f"{message.rstrip('.')}. Not enough memory: decrease {MEMORY_SETTINGS}."
+    print(f"error: {message}", file=sys.stderr)
+    return message
 
 
 def run(
     config: ExperimentConfig,
     folder: Path,
     values: dict[str, Any],
-    standing: str = "",
+    status: str = "",
     patience: float = 0.0,
 ) -> FinishedRun | None:
-    """One run in its folder, its progress and its result, if it tests its policy.
+    """Trains and tests a run, or shows its results if it is finished.
 
     Args:
-        config (ExperimentConfig): its settings.
-        folder (Path): The run's folder.
-        values (dict): The configuration, which names the run to continue from.
-        standing (str): State of the sweep, shown before the run's name and progress.
-        patience (float): seconds to wait for a process that has its folder.
+        config (ExperimentConfig): Settings of the run.
+        folder (Path): Run folder.
+        values (dict): Configuration with the settings of the command.
+        status (str): Progress of the sweep, shown before the run's name. Default: none.
+        patience (float): Maximum time in seconds to wait for another process that uses the folder.
+            Default 0.
+
+    Returns:
+        FinishedRun: The finished run; ``None`` without test episodes.
     """
-    # Imported here: settings are checked, and the run is named, before torch is imported.
-    from torchrl_l2c2.experiment.envs.spaces import check_known
-    from torchrl_l2c2.experiment.run.continuation import check_elsewhere, tell_past
+    # Local imports: settings are checked before torch is imported.
+    from torchrl_l2c2.experiment.envs.spaces import check_env_id
+    from torchrl_l2c2.experiment.run.continuation import check_resume_folder, warn_ignored_settings
     from torchrl_l2c2.experiment.run.finished import finished_run
     from torchrl_l2c2.experiment.run.lock import wait_for_folder
 
-    check_elsewhere(values["resume"])
+    check_resume_folder(values["resume"])
     if not (folder / "evaluation.json").exists():
         check_installed(config.logger.name)
-        check_known(config.task.env_id)
+        check_env_id(config.task.env_id)
     chosen = (config.task, config.algorithm, config.regularizer)
-    named = f"{', '.join(group.name for group in chosen)}, seed {config.seed}: {folder}"
-    print(f"{standing}: {named}" if standing else named, flush=True)
-    if (told := preset_used(config)) is not None:
-        print(told, flush=True)
+    name = f"{', '.join(group.name for group in chosen)}, seed {config.seed}: {folder}"
+    print(f"{status}: {name}" if status else name, flush=True)
+    if (description := describe_preset(config)) is not None:
+        print(description, flush=True)
     from torchrl_l2c2.experiment.agents.build import check_device_found
     from torchrl_l2c2.experiment.analysis.video import check_pictures, check_video, record_video
 
@@ -271,16 +286,19 @@ def run(
     if records:
         check_video()
         check_pictures(config.task)
-    _quieten()
+    _silence_libraries()
     wait_for_folder(folder, patience)
-    with _end_logged(folder):
+    with _log_errors(folder):
         finished = finished_run(folder, config.to_dict())
         if finished is None:
-            finished = _train(config, folder, values, standing)
+            finished = _train(config, folder, values, status)
         else:
-            print("finished before: its results follow; another seed= or outputs= begins anew.")
-            with warnings_told(partial(say, folder)):
-                tell_past(finished.config, config.to_dict())
+            print(
+                "finished before: these are its results. Use another seed= or outputs= for a new "
+                "run."
+            )
+            with warnings_as_lines(partial(show_and_log, folder)):
+                warn_ignored_settings(finished.config, config.to_dict())
         if records:
             record_video(folder, video)
         if finished is not None:
@@ -290,46 +308,45 @@ def run(
     return finished
 
 
-def _quieten() -> None:
-    """Libraries say nothing that a user of the command could act on."""
-    for chatty in ("torchrl", "matplotlib", "torch"):
-        logging.getLogger(chatty).setLevel(logging.ERROR)
+def _silence_libraries() -> None:
+    """Silences messages of libraries that a user of the command cannot act on."""
+    for library in ("torchrl", "matplotlib", "torch"):
+        logging.getLogger(library).setLevel(logging.ERROR)
     warnings.simplefilter("ignore", FutureWarning)
     warnings.filterwarnings("ignore", "No target network updater")
 
 
 def _train(
-    config: ExperimentConfig, folder: Path, values: dict[str, Any], standing: str
+    config: ExperimentConfig, folder: Path, values: dict[str, Any], status: str
 ) -> FinishedRun | None:
-    """Trains and tests a policy, or trains it alone where no test is asked for."""
+    """Trains a policy, and tests it unless ``test_episodes`` is 0."""
     from torchrl_l2c2.experiment.run.experiment import Experiment
     from torchrl_l2c2.experiment.run.policies import save_policy
     from torchrl_l2c2.experiment.run.process import keep_freed_memory
 
     keep_freed_memory()
-    going_on = {name: values[name] for name in ("resume", "allow_other_versions")}
+    options = {name: values[name] for name in ("resume", "allow_other_versions")}
     with (
-        warnings_told(partial(say, folder)),
-        closing(Experiment(config, folder, **going_on)) as experiment,
+        warnings_as_lines(partial(show_and_log, folder)),
+        closing(Experiment(config, folder, **options)) as experiment,
     ):
-        if (told := preset_used(config)) is not None:
-            log(folder, told)
-        experiment.train(progress=standing or True)
+        if (description := describe_preset(config)) is not None:
+            log(folder, description)
+        experiment.train(progress=status or True)
         if not config.test_episodes:
             save_policy(experiment.agent.policy, folder / "policy.pt")
             return None
         tests = [experiment.test(sampled=s, progress=True) for s in (False, True)]
         finished = experiment.finish(*tests)
-        from torchrl_l2c2.experiment.analysis.reports import (
-            result_lines,  # After it: not at start-up.
-        )
+        # Imported after training: not needed at start-up.
+        from torchrl_l2c2.experiment.analysis.reports import result_lines
 
         log(folder, f"finished:\n{result_lines(finished)}")
         return finished
 
 
 def _show(finished: FinishedRun) -> None:
-    """The result, and a picture of how it was learned."""
+    """Prints the result and draws the learning curves."""
     from torchrl_l2c2.experiment.analysis.reports import draw_learning_curves, result_lines
 
     print(result_lines(finished))
@@ -340,20 +357,17 @@ def _show(finished: FinishedRun) -> None:
 
 
 @contextmanager
-def _end_logged(folder: Path) -> Iterator[None]:
-    """Writes the error that ends a run early into its ``train.log``.
-
-    A mistake of the user is only shown: it changes nothing in the folder, and makes none.
-    """
+def _log_errors(folder: Path) -> Iterator[None]:
+    """Writes errors that end a run to its ``train.log``, except for mistakes of the user."""
     try:
         yield
     except UserError:
         raise
     except (KeyboardInterrupt, Exception) as error:
         stopped = isinstance(error, KeyboardInterrupt | Interrupted)
-        told = [str(error) or "interrupted"] if stopped else traceback.format_exception(error)
-        with suppress(OSError):  # The error itself may be that there is no room.
-            if not stopped and not is_told_in_a_line(error):
+        lines = [str(error) or "interrupted"] if stopped else traceback.format_exception(error)
+        with suppress(OSError):  # The error itself may be a full disk.
+            if not stopped and not is_one_line_error(error):
                 make_folder(folder)
-            log(folder, "".join(told))
+            log(folder, "".join(lines))
         raise

@@ -14,9 +14,9 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
 from torchrl_l2c2.experiment.agents._torchrl_internals import first_observation
-from torchrl_l2c2.experiment.collect.acting import on_tensors
+from torchrl_l2c2.experiment.collect.acting import policy_function
 from torchrl_l2c2.experiment.collect.simulation import Simulation, split_environment
-from torchrl_l2c2.experiment.envs.environments import NOISE_SEED, simulating
+from torchrl_l2c2.experiment.envs.environments import NOISE_SEED, simulator_errors
 from torchrl_l2c2.experiment.envs.frames import Frame, stack_frames
 
 
@@ -90,12 +90,12 @@ class EpisodeCollector(Collector):
         self.stop_at_done = stop_at_done
         self._random_frames_left = random_frames
         self._policy_keys = [key for key in policy.out_keys if not key.startswith("_")]
-        self._act = on_tensors(policy, self._policy_keys, compile_policy)
+        self._act = policy_function(policy, self._policy_keys, compile_policy)
         # For policies whose samples exceed the bounds: frames keep the sample, the task gets this.
         self._taken: Callable[[Tensor], Tensor] | None = getattr(policy, "taken", None)
         self._action_spec = self._simulation.env.action_spec
         continuous = self._action_spec.dtype.is_floating_point
-        self._to_action = as_array if continuous else self._simulation.env.read_action
+        self._to_action = copy_to_numpy if continuous else self._simulation.env.read_action
 
     @torch.no_grad()
     def rollout(self) -> TensorDictBase:
@@ -108,7 +108,7 @@ class EpisodeCollector(Collector):
                     if frames[-1].done and self.stop_at_done:
                         break
         except BaseException:
-            self._simulation.drop_episode()
+            self._simulation.discard_episode()
             raise
         return stack_frames(frames)
 
@@ -130,7 +130,7 @@ class EpisodeCollector(Collector):
 
     def reset(self, index: Any = None, **kwargs: Any) -> None:
         """Ends the current episode; the next frame starts another one."""
-        self._simulation.drop_episode()
+        self._simulation.discard_episode()
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
         """Seeds the simulator and, with a different seed, its noise; starts a new episode.
@@ -146,7 +146,7 @@ class EpisodeCollector(Collector):
         noise = self._simulation.noise
         if noise is not None and noise.generator is not None:
             noise.generator.manual_seed(seed + NOISE_SEED)
-        self._simulation.drop_episode()
+        self._simulation.discard_episode()
         return next_seed
 
     def generator_state(self) -> dict[str, Any]:
@@ -165,7 +165,7 @@ class EpisodeCollector(Collector):
         self._random_frames_left = state["random_frames_left"]
 
 
-def as_array(action: Tensor) -> np.ndarray:
+def copy_to_numpy(action: Tensor) -> np.ndarray:
     """Copies an action for the simulator, which may write into it."""
     return action.numpy().copy()
 
@@ -199,7 +199,7 @@ def play_episodes(
         )
     try:
         for number in range(1, episodes + 1):
-            with simulating(f"the task failed in test episode {number}"):
+            with simulator_errors(f"the task failed in test episode {number}"):
                 if collector is None:
                     with torch.no_grad(), set_exploration_type(exploration):
                         episode = env.rollout(max_steps, policy)

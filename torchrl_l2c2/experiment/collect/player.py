@@ -15,7 +15,7 @@ from torchrl.modules import EGreedyModule
 from torchrl_l2c2.experiment.agents.agent import Agent
 from torchrl_l2c2.experiment.collect.episodes import EpisodeCollector
 from torchrl_l2c2.experiment.collect.rollouts import RolloutCollector
-from torchrl_l2c2.experiment.envs.environments import make_env, simulating, time_limit
+from torchrl_l2c2.experiment.envs.environments import make_env, simulator_errors, time_limit
 from torchrl_l2c2.experiment.envs.frames import Frame, check_finite, stack_frames
 from torchrl_l2c2.experiment.settings.config import ExperimentConfig
 from torchrl_l2c2.metrics import action_variation
@@ -97,7 +97,7 @@ class Player:
         assert isinstance(self.collector, EpisodeCollector)  # make_collector ensures it.
         transitions = self._simulate(self.collector.rollout)
         self._check_and_count(transitions)
-        return self.measured(transitions, self.frames)
+        return self.measure(transitions, self.frames)
 
     def play_rollout(self) -> tuple[list[TensorDictBase], list[Episode]]:
         """Plays a rollout: the next frames ``[T]`` of every simulator, and the ended episodes.
@@ -110,9 +110,9 @@ class Player:
         first_frame, rollout = self.frames, self._simulate(self.collector.rollout)
         for frames in rollout:
             self._check_and_count(frames)
-        ended = self.collector.ended
+        ended = self.collector.finished_episodes
         episodes = [
-            self.measured(e.transitions, first_frame + e.frame, ends_round=e is ended[-1])
+            self.measure(e.transitions, first_frame + e.frame, ends_round=e is ended[-1])
             for e in ended
         ]
         return rollout, episodes
@@ -131,13 +131,13 @@ class Player:
         self._count(1)
         return frame
 
-    def drop_episode(self) -> None:
+    def discard_episode(self) -> None:
         """Discards the episode that :meth:`step` has begun; the next frame starts another one."""
         assert isinstance(self.collector, EpisodeCollector)
         self.collector.reset()
 
     def _simulate(self, play: Callable[[], Played]) -> Played:
-        with simulating(f"{self._env_id} failed beyond frame {self.frames}"):
+        with simulator_errors(f"{self._env_id} failed beyond frame {self.frames}"):
             return play()
 
     def _check_and_count(self, frames: TensorDictBase) -> None:
@@ -150,7 +150,7 @@ class Player:
             self._agent.exploration.step(frames)
 
     @torch.no_grad()
-    def measured(
+    def measure(
         self, transitions: TensorDictBase, last_frame: int, *, ends_round: bool = True
     ) -> Episode:
         """Measures an episode: its return and the smoothness of the policy's mean at its states.

@@ -12,12 +12,12 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
-from torchrl_l2c2.experiment.collect.acting import on_tensors
+from torchrl_l2c2.experiment.collect.acting import policy_function
 from torchrl_l2c2.experiment.collect.simulation import Simulation
 from torchrl_l2c2.experiment.envs.frames import Frame, stack_frames
 
 
-class Ended(NamedTuple):
+class FinishedEpisode(NamedTuple):
     """An episode that ended in a rollout.
 
     Attributes:
@@ -52,7 +52,7 @@ class RolloutCollector:
         keep_previous (bool): as for :class:`~torchrl_l2c2.experiment.EpisodeCollector`.
 
     Attributes:
-        ended: the episodes that ended in the last rollout, in the order of their ends.
+        finished_episodes: the episodes that ended in the last rollout, in the order of their ends.
 
     Raises:
         ValueError: an environment with transforms other than
@@ -66,7 +66,7 @@ class RolloutCollector:
         >>> collector = RolloutCollector(envs, actor, frames_per_batch=20)
         >>> [frames.shape for frames in collector.rollout()]
         [torch.Size([10]), torch.Size([10])]
-        >>> [(episode.frame, len(episode.transitions)) for episode in collector.ended]
+        >>> [(episode.frame, len(episode.transitions)) for episode in collector.finished_episodes]
         [(13, 7), (14, 7)]
         >>> collector.shutdown()
     """
@@ -89,16 +89,16 @@ class RolloutCollector:
         self._simulations = [Simulation(env, keep_previous=keep_previous) for env in envs]
         self._steps = frames_per_batch // len(envs)
         self._policy_keys = [key for key in policy.out_keys if not key.startswith("_")]
-        self._act = on_tensors(policy, self._policy_keys, compile_policy)
+        self._act = policy_function(policy, self._policy_keys, compile_policy)
         self._exploration_type = exploration_type
         space: Any = self._simulations[0].env.action_space
         self._low, self._high = space.low, space.high
-        self.ended: list[Ended] = []
+        self.finished_episodes: list[FinishedEpisode] = []
 
     @torch.no_grad()
     def rollout(self) -> list[TensorDictBase]:
         """Plays the next frames ``[T]`` of every simulator."""
-        self.ended = []
+        self.finished_episodes = []
         played: list[list[Frame]] = [[] for _ in self._simulations]
         with set_exploration_type(self._exploration_type):
             for step in range(self._steps):
@@ -113,7 +113,9 @@ class RolloutCollector:
                     )
                     if played[place][-1].done:
                         frame = step * len(self._simulations) + place + 1
-                        self.ended.append(Ended(frame, stack_frames(simulation.frames)))
+                        self.finished_episodes.append(
+                            FinishedEpisode(frame, stack_frames(simulation.frames))
+                        )
         return [stack_frames(frames) for frames in played]
 
     def generator_state(self) -> dict[str, Any]:

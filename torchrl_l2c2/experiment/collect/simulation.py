@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 from torchrl.envs import Compose, EnvBase, GymWrapper, Transform, TransformedEnv
 
-from torchrl_l2c2.experiment.agents._torchrl_internals import noisy, simulator_of
-from torchrl_l2c2.experiment.envs.frames import PREVIOUS, Frame, as_reward
+from torchrl_l2c2.experiment.agents._torchrl_internals import add_noise, simulator_of
+from torchrl_l2c2.experiment.envs.frames import PREVIOUS, Frame, reward_to_float
 from torchrl_l2c2.transforms import ObservationNoise
 
 
@@ -79,12 +79,12 @@ class Simulation:
             outputs[PREVIOUS] = self.frames[-1].observation if self.frames else before
         seen, reward, terminated, truncated, _ = self._gymnasium.step(action)
         after = self._observe(seen)
-        frame = Frame(before, outputs, after, as_reward(reward), terminated, truncated)
+        frame = Frame(before, outputs, after, reward_to_float(reward), terminated, truncated)
         self.next_observation = None if frame.done else after
         self.frames.append(frame)
         return frame
 
-    def drop_episode(self) -> None:
+    def discard_episode(self) -> None:
         """Ends the current episode; the next frame starts another one."""
         self.next_observation, self.frames = None, []
 
@@ -102,7 +102,7 @@ class Simulation:
         generator.state = json.loads(states["simulator"])
         if self.noise is not None:
             self.noise.set_extra_state(states["noise"])
-        self.drop_episode()
+        self.discard_episode()
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the generators' states at the start of the episode, and the policy's outputs."""
@@ -137,13 +137,13 @@ class Simulation:
                 "and the run differs from an uninterrupted one.",
                 stacklevel=5,
             )
-            self.drop_episode()
+            self.discard_episode()
 
     def _observe(self, seen: np.ndarray) -> Tensor:
         """Copies an observation, because simulators may write into theirs, and adds the noise."""
         if self.noise is None:
             return torch.tensor(seen, dtype=self._dtype)
-        return noisy(self.noise, torch.as_tensor(seen, dtype=self._dtype))
+        return add_noise(self.noise, torch.as_tensor(seen, dtype=self._dtype))
 
 
 def split_environment(env: EnvBase) -> tuple[GymWrapper, ObservationNoise | None] | None:

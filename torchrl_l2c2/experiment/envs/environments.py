@@ -1,4 +1,4 @@
-"""The noisy tasks: Gymnasium environments with white noise on every observation."""
+"""Gymnasium environments of the tasks, with white noise on every observation."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from torchrl.envs import EnvBase, GymWrapper, TransformedEnv
 from torchrl_l2c2.experiment.envs.pictures import Drawing, PictureRecorder
 from torchrl_l2c2.experiment.envs.spaces import (
     Env,
-    observing_vector,
-    taking_vector,
     unknown_task,
+    with_vector_action,
+    with_vector_observation,
 )
 from torchrl_l2c2.experiment.errors import CompilerError, SimulatorError, UserError
 from torchrl_l2c2.transforms import ObservationNoise
@@ -28,68 +28,68 @@ from torchrl_l2c2.transforms import ObservationNoise
 if TYPE_CHECKING:
     from torchrl_l2c2.experiment.settings.tasks import TaskConfig
 
-# Added to the seed of test episodes, so that they are not training episodes again.
+# Added to the run's seed for test episodes, to differ from the training episodes.
 TEST_SEED = 1_000_003
-# Added to the seed of an environment for its noise: it is not to draw what the simulator, or the
-# policy with its samples, draws.
+# Added to an environment's seed for its noise, to differ from the simulator's and the policy's
+# random numbers.
 NOISE_SEED = 7_919
 
 
 @contextlib.contextmanager
-def simulating(what: str) -> Iterator[None]:
-    """Makes errors of a task, or of the policy that acts in it, a :class:`SimulatorError`.
+def simulator_errors(what: str) -> Iterator[None]:
+    """Converts errors of a task, or of the policy that acts in it, to :class:`SimulatorError`.
 
     Args:
-        what (str): what failed and where: the beginning of the error's text.
+        what (str): Description of the failure and its place, the first part of the message.
 
     Raises:
-        SimulatorError: something raised an error, or tried to end the process.
-        CompilerError: the policy could not be compiled, which is no fault of the task.
+        SimulatorError: If the block raises an error or tries to end the process.
+        CompilerError: If the policy could not be compiled; it is not converted.
     """
     try:
         yield
     except CompilerError:
         raise
     except (Exception, SystemExit) as error:
-        told = " ".join(str(error).split())  # in a line, as it stands in one of a sweep's end
-        raise SimulatorError(f"{what}: {type(error).__name__}: {told}") from error
+        message = " ".join(str(error).split())  # One line, as in a sweep's summary.
+        raise SimulatorError(f"{what}: {type(error).__name__}: {message}") from error
 
 
 def make_env(task: TaskConfig, seed: int, *, render: Drawing | None = None) -> EnvBase:
-    """Makes a task's environment, noisy and seeded.
+    """Creates a task's environment with its noise, and seeds both.
 
     Args:
-        task (TaskConfig): the Gymnasium id and the noise.
-        seed (int): of the simulator and, separately, of the noise.
+        task (TaskConfig): Settings of the task.
+        seed (int): Seed of the simulator. The noise's seed is derived from it.
 
     Keyword Args:
-        render (Drawing, optional): which states are drawn, by a :class:`~.pictures.PictureRecorder`
+        render (Drawing, optional): States to render, by a :class:`~.pictures.PictureRecorder`
             around the Gymnasium environment. Default: none.
 
     Returns:
-        EnvBase: a ``GymWrapper`` that observes one vector of float32, with noise transformed by
-            :class:`ObservationNoise`.
+        EnvBase: A ``GymWrapper`` whose observation is a vector of float32, with
+        :class:`ObservationNoise` if the task has noise.
 
     Raises:
-        ValueError: an id that Gymnasium does not know, a task without a time limit, or one whose
-            observations or actions are not vectors of numbers; or one that draws no pictures, with
-            ``render``.
-        SimulatorError: the environment itself raises an error when it is made or reset.
+        ValueError: If Gymnasium does not know the id, the task has no time limit or cannot render,
+            or its observations or actions have an unsupported type.
+        SimulatorError: If the environment raises an error when it is created or reset.
     """
-    simulator = observing_vector(taking_vector(_make(task, render)), flatten=task.flatten)
+    simulator = with_vector_action(_make(task, render))
+    simulator = with_vector_observation(simulator, flatten=task.flatten)
     if task.action_rate:
         simulator = ActionRatePenalty(simulator, task.action_rate)
     if render is not None:
         simulator = PictureRecorder(simulator, render)
     try:
-        with _explained(task), quiet_output():
+        with _task_errors(task), quiet_output():
             env = GymWrapper(simulator)
             env.reset()
     except SimulatorError as error:
         if render is not None and isinstance(
             error.__cause__, NotImplementedError
         ):  # Gymnasium's own render()
-            raise _draws_nothing(task) from error.__cause__
+            raise _cannot_render(task) from error.__cause__
         raise
     env.set_seed(seed)
     if not task.noise_scale:
@@ -104,14 +104,15 @@ class ActionRatePenalty(gymnasium.Wrapper[Any, Any, Any, Any]):
     .. math::
         r_t - \frac{w}{A} \sum_i \Big( \frac{a_{t,i} - a_{t-1,i}}{h_i} \Big)^2
 
-    with half the range :math:`h_i` of each action; the first reward of an episode is unchanged.
+    :math:`A` is the number of actions and :math:`h_i` half the range of each. The first reward of
+    an episode is unchanged.
 
     Args:
-        env (gymnasium.Env): an environment with bounded actions.
-        weight (float): :math:`w`. Larger values give smoother actions and lower returns.
+        env (gymnasium.Env): Environment with bounded actions.
+        weight (float): Weight :math:`w`. Larger values give smoother actions and lower returns.
 
     Raises:
-        UserError: the actions have no bounds.
+        UserError: If the actions have no bounds.
 
     Examples:
         >>> env = ActionRatePenalty(gymnasium.make("Pendulum-v1"), weight=1.0)
@@ -148,34 +149,34 @@ class ActionRatePenalty(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 def time_limit(task: TaskConfig) -> int:
-    """Frames of a task's longest episode: its own setting, or what Gymnasium has registered.
+    """Returns a task's maximum frames per episode: ``task.max_steps``, or Gymnasium's own limit.
 
     Raises:
-        ValueError: neither is there, or Gymnasium does not know the task.
+        ValueError: If there is no limit, or Gymnasium does not know the task.
     """
     if task.max_steps is not None:
         return task.max_steps
     module, _, name = task.env_id.rpartition(":")
-    with _explained(task):
+    with _task_errors(task):
         if module:
             importlib.import_module(module)
         registered = gymnasium.spec(name).max_episode_steps
     if registered is None:
         raise UserError(
-            f"task.env_id={task.env_id!r} is registered without a limit of its episodes: set "
+            f"task.env_id={task.env_id!r} is registered without a time limit: set "
             "task.max_steps, for example to 1000."
         )
     return registered
 
 
 def untransformed(env: EnvBase) -> Any:
-    """The environment below TorchRL's transforms; itself where it has none."""
+    """Returns the environment below TorchRL's transforms, or itself without transforms."""
     return getattr(env, "base_env", env)
 
 
 def _make(task: TaskConfig, render: Drawing | None) -> Env:
     limit = time_limit(task)
-    with _explained(task), quiet_output():
+    with _task_errors(task), quiet_output():
         if render is None:
             return gymnasium.make(task.env_id, max_episode_steps=limit)
         try:
@@ -185,22 +186,22 @@ def _make(task: TaskConfig, render: Drawing | None) -> Env:
                 render_mode="rgb_array",
                 **render.options(task.env_id),
             )
-            draws, cause = env.render_mode in env.metadata.get("render_modes", ()), None
-        except TypeError as error:  # It knows of no render_mode at all.
-            draws, cause = False, error
-    if not draws:
-        raise _draws_nothing(task) from cause
+            renders, cause = env.render_mode in env.metadata.get("render_modes", ()), None
+        except TypeError as error:  # It has no render_mode argument.
+            renders, cause = False, error
+    if not renders:
+        raise _cannot_render(task) from cause
     return env
 
 
-def _draws_nothing(task: TaskConfig) -> UserError:
-    return UserError(f"{task.env_id} draws no pictures: it has no render_mode 'rgb_array'.")
+def _cannot_render(task: TaskConfig) -> UserError:
+    return UserError(f"{task.env_id} cannot render pictures: it has no render_mode 'rgb_array'.")
 
 
 @contextlib.contextmanager
-def _explained(task: TaskConfig) -> Iterator[None]:
+def _task_errors(task: TaskConfig) -> Iterator[None]:
     try:
-        with simulating(f"{task.env_id} could not begin"):
+        with simulator_errors(f"{task.env_id} could not start"):
             yield
     except SimulatorError as error:
         cause = error.__cause__
@@ -211,7 +212,7 @@ def _explained(task: TaskConfig) -> Iterator[None]:
 
 @contextlib.contextmanager
 def quiet_output() -> Iterator[None]:
-    """Keeps what a C library prints, as Bullet does at start, off the screen."""
+    """Hides the output of C libraries, such as Bullet's banner."""
     for stream in (sys.stdout, sys.stderr):
         stream.flush()
     saved = [os.dup(number) for number in (1, 2)]
@@ -221,7 +222,7 @@ def quiet_output() -> Iterator[None]:
             os.dup2(silent, number)
         yield
     finally:
-        # What the library has printed waits in C's own buffer where the output is no terminal.
+        # If the output is not a terminal, C buffers it: flush before the output is restored.
         ctypes.CDLL(None).fflush(None)
         for number, original in zip((1, 2), saved, strict=True):
             os.dup2(original, number)

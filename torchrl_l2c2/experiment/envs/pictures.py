@@ -1,4 +1,4 @@
-"""Pictures of an environment while it is played."""
+"""Rendered pictures of an environment."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ import gymnasium
 
 from torchrl_l2c2.experiment.envs.spaces import Env
 
-QUICK_SIZE = 320  # pixels of a side
-USUAL_RATE = 30.0  # steps per second, if the simulator does not tell its rate
+QUICK_SIZE = 320  # Width and height in pixels.
+USUAL_RATE = 30.0  # Steps per second for simulators whose rate is unknown.
 
 
 class Drawing(NamedTuple):
-    """A choice of the states of an episode that are drawn, and how.
+    """States of an episode to render, and their quality.
 
     Attributes:
-        rate: most pictures per second of simulated time.
-        seconds: simulated time that is drawn, from the start of the episode.
-        quick: whether MuJoCo draws small pictures, without shadows and smooth edges: about ten
+        rate: Maximum pictures per second of simulated time.
+        seconds: Simulated time to render, from the start of the episode.
+        quick: Whether MuJoCo renders small pictures without shadows and antialiasing: about ten
             times faster without a graphics card.
     """
 
@@ -28,7 +28,7 @@ class Drawing(NamedTuple):
     quick: bool = False
 
     def options(self, env_id: str) -> dict[str, Any]:
-        """Keyword arguments of ``gymnasium.make``."""
+        """Returns the keyword arguments of ``gymnasium.make``."""
         module, _, name = env_id.rpartition(":")
         entry = "" if module else str(gymnasium.spec(name).entry_point)
         small = self.quick and entry.startswith("gymnasium.envs.mujoco")
@@ -36,14 +36,14 @@ class Drawing(NamedTuple):
 
 
 class PictureRecorder(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Keeps pictures of the states from a reset on.
+    """Wrapper that records pictures of an episode.
 
     Args:
-        env (gymnasium.Env): draws with ``render_mode="rgb_array"``.
-        drawing (Drawing): which states are drawn.
+        env (gymnasium.Env): Environment with ``render_mode="rgb_array"``.
+        drawing (Drawing): States to render.
 
     Attributes:
-        every: steps from one picture to the next.
+        every: Number of steps between pictures.
     """
 
     def __init__(self, env: Env, drawing: Drawing) -> None:
@@ -57,12 +57,12 @@ class PictureRecorder(gymnasium.Wrapper[Any, Any, Any, Any]):
             quality.quality.shadowsize = quality.quality.offsamples = 0
 
     def reset(self, **options: Any) -> Any:
-        begun = self.env.reset(**options)
+        result = self.env.reset(**options)
         rate = control_rate(self.env) or USUAL_RATE
         self.every = max(1, round(rate / self._drawing.rate))
         self._last = rate * self._drawing.seconds
         self._steps, self._pictures = 0, [self.env.render()]
-        return begun
+        return result
 
     def step(self, action: Any) -> Any:
         result = self.env.step(action)
@@ -72,15 +72,15 @@ class PictureRecorder(gymnasium.Wrapper[Any, Any, Any, Any]):
         return result
 
     def pictures(self) -> list[Any]:
-        """The pictures ``[H, W, 3]`` of bytes of the current episode."""
+        """Returns the pictures of the current episode, arrays ``[H, W, 3]`` of uint8."""
         return list(self._pictures)
 
 
 def control_rate(env: Any) -> float | None:
-    """Actions per second of simulated time; ``None`` if the simulator does not tell it.
+    """Returns the actions per second of simulated time, or ``None`` if unknown.
 
     Args:
-        env: a Gymnasium environment, or a TorchRL one around it, reset at least once.
+        env: Gymnasium environment, or a TorchRL environment around it, after its first reset.
 
     Examples:
         >>> from torchrl.envs import GymEnv
@@ -88,7 +88,7 @@ def control_rate(env: Any) -> float | None:
         20.0
     """
     simulator = getattr(env, "base_env", env).unwrapped
-    # MuJoCo's and the classic tasks; Bullet's; the cart pole.
+    # MuJoCo and classic tasks; Bullet; the cart pole.
     for owner, name in (
         (simulator, "dt"),
         (getattr(simulator, "scene", None), "dt"),

@@ -20,29 +20,32 @@ from torchrl_l2c2.experiment.errors import UserError
 Env = gymnasium.Env[Any, Any]
 
 
-def observing_vector(env: Env, *, flatten: bool) -> Env:
-    """The same task, observing one vector of float32; the task itself where it does so already.
+def with_vector_observation(env: Env, *, flatten: bool) -> Env:
+    """Wraps a task to observe one float32 vector; returns the task itself if it already does.
 
-    Integers and other floats are cast. Several vectors, a ``Dict``, become one in the order of
-    their names.
+    Integers and other floats are cast. The vectors of a ``Dict`` are joined in the order of their
+    names.
 
     Args:
-        env (gymnasium.Env): the task.
+        env (gymnasium.Env): Task.
 
     Keyword Args:
-        flatten (bool): whether to make a vector of matrices, nested entries and, one-hot, labels.
+        flatten (bool): Whether to convert matrices, nested entries and labels (one-hot) as well.
+
+    Returns:
+        gymnasium.Env: The wrapped task.
 
     Raises:
-        ValueError: an observation that does not become a vector so.
+        ValueError: If the observation cannot be converted to a vector.
 
     Examples:
         >>> import gymnasium
         >>> env = gymnasium.make("Taxi-v4")
-        >>> observing_vector(env, flatten=True).observation_space.shape
+        >>> with_vector_observation(env, flatten=True).observation_space.shape
         (500,)
-        >>> observing_vector(env, flatten=False)
+        >>> with_vector_observation(env, flatten=False)
         Traceback (most recent call last):
-        torchrl_l2c2.experiment.errors.UserError: the task observes a Discrete, not a vector of numbers: task.flatten=true makes one of it.
+        torchrl_l2c2.experiment.errors.UserError: the task observes a Discrete, not a vector of numbers: set task.flatten=true to convert it.
     """  # noqa: E501
     space: Any = env.observation_space
     entries = list(space.spaces.values()) if isinstance(space, spaces.Dict) else [space]
@@ -57,36 +60,36 @@ def observing_vector(env: Env, *, flatten: bool) -> Env:
     vector: Any = env.observation_space
     if vector.dtype == np.float32:
         return env
-    # DtypeObservation does the same, and warns of every float64.
+    # DtypeObservation does the same, but warns about every float64.
     return TransformObservation(env, lambda seen: np.asarray(seen, np.float32), _float32(vector))
 
 
-def taking_vector(env: Env) -> Env:
-    """The same task, taking a vector of float32 or a number from 0 up; itself where it does so.
+def with_vector_action(env: Env) -> Env:
+    """Wraps a task to take a float32 vector or an index from 0; returns the task if it does.
 
     Raises:
-        ValueError: an action of another kind.
+        ValueError: If the actions have another type.
     """
     space: Any = env.action_space
     if isinstance(space, spaces.Discrete):
-        return CountedFromZero(env) if space.start else env
+        return ZeroBasedActions(env) if space.start else env
     vector = isinstance(space, spaces.Box) and len(space.shape) == 1
     if not vector or not np.issubdtype(space.dtype, np.floating):
         raise UserError(
-            f"the task takes a {_kind(space)}; actions must be one vector of floats or one "
-            "Discrete number: wrap the task in a gymnasium.ActionWrapper, and register that."
+            f"the task's actions are a {_kind(space)}; they must be one vector of floats or "
+            "Discrete: wrap the task in a gymnasium.ActionWrapper, and register the result."
         )
     if space.dtype == np.float32:
         return env
     low, high, dtype = space.low, space.high, space.dtype
-    # Rounding may lead out of the bounds.
+    # Rounding may exceed the bounds.
     return TransformAction(
         env, lambda action: np.clip(action.astype(dtype), low, high), _float32(space)
     )
 
 
-class CountedFromZero(TransformAction[Any, Any, Any]):
-    """The same task, its Discrete actions counted from 0, where it counts them from ``first``."""
+class ZeroBasedActions(TransformAction[Any, Any, Any]):
+    """Wrapper with Discrete actions from 0 for a task whose actions start at ``first``."""
 
     def __init__(self, env: Env) -> None:
         space: Any = env.action_space
@@ -110,33 +113,33 @@ def _check_entry(space: Any, *, flatten: bool) -> None:
     if (numbers and (flatten or len(space.shape) <= 1)) or (labels and flatten):
         return
     if numbers or labels or isinstance(space, spaces.Dict):
-        todo = "task.flatten=true makes one of it."
+        todo = "set task.flatten=true to convert it."
     else:
-        todo = "make one of it in a gymnasium.ObservationWrapper, and register that."
+        todo = "convert it in a gymnasium.ObservationWrapper, and register the result."
     raise UserError(f"the task observes a {_kind(space)}, not a vector of numbers: {todo}")
 
 
 def _kind(space: Any) -> str:
-    """Gymnasium's own representation of bounds takes many lines."""
+    """Describes a space in one line; Gymnasium's representation lists all bounds."""
     name = type(space).__name__
     return f"{name} of {space.dtype} {space.shape}" if isinstance(space, spaces.Box) else name
 
 
 def unknown_task(env_id: str, cause: Exception) -> UserError:
-    """The error for an id that Gymnasium cannot make."""
+    """Returns the error for an id that Gymnasium cannot create."""
     return UserError(
-        f"task.env_id={env_id!r} is not a task that Gymnasium can make here ({cause}). "
-        "Use one of this package's (train.py --help names them), or task=gymnasium with a "
+        f"task.env_id={env_id!r} is not a task that Gymnasium can create here ({cause}). "
+        "Use one of this package's tasks (see train.py --help), or task=gymnasium with a "
         "registered id; `module:id` imports the module that registers it, from the current "
         "folder or PYTHONPATH."
     )
 
 
-def check_known(env_id: str) -> None:
-    """Refuses an id that Gymnasium does not know, without importing the simulator.
+def check_env_id(env_id: str) -> None:
+    """Checks that Gymnasium knows an id, without importing the simulator.
 
     Raises:
-        UserError: with what to write instead.
+        UserError: If Gymnasium does not know the id.
     """
     module, _, name = env_id.rpartition(":")
     try:

@@ -1,1 +1,1 @@
-"""Replay, one gradient step, and its compilation."""
+"""Replay buffers, gradient steps, and their compilation."""

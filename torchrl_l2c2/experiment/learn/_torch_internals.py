@@ -1,7 +1,7 @@
-"""Private names of torch that the experiment uses. No other file of it may use one.
+"""Private torch names that the experiment uses. No other file of it may use any.
 
-:mod:`~torchrl_l2c2.experiment.learn.compilation` puts parts of torch's compiler together, which
-has no public way to compile a graph that was traced by itself.
+:mod:`~torchrl_l2c2.experiment.learn.compilation` needs them: torch has no public function that
+compiles an already traced graph.
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_mod
 from torch.utils._pytree import tree_flatten, tree_map_only, tree_unflatten
 
 __all__ = [
-    "CustomGraphPass",  # changes the graph before its kernels are made
-    "FakeTensor",  # a tensor without contents, with which a function is traced
-    "FakeTensorMode",  # makes them
-    "TorchDispatchMode",  # sees every operation, and the tensors that it reaches
+    "CustomGraphPass",  # Changes a graph before code generation.
+    "FakeTensor",  # Tensor without data, for tracing.
+    "FakeTensorMode",  # Creates fake tensors.
+    "TorchDispatchMode",  # Intercepts every operation.
     "compile_graph",
     "disable_current_modes",
-    "get_hash_for_files",  # the compiler's cache knows a pass by it
+    "get_hash_for_files",  # Identifies a pass in the compiler's cache.
     "marked_as_compiling",
-    "tree_flatten",  # arguments and results are nested
+    "tree_flatten",  # Arguments and results are nested.
     "tree_map_only",
     "tree_unflatten",
 ]
 
-# Makes a stand-in of a tensor without tracing how it is made.
+# Creates a fake tensor without tracing its creation.
 disable_current_modes = _disable_current_modes
 
 
 @contextmanager
 def marked_as_compiling() -> Iterator[None]:
-    """Has ``torch.compiler.is_compiling()`` be true, which nothing public sets."""
+    """Makes ``torch.compiler.is_compiling()`` return true; there is no public setter."""
     before = torch.compiler._is_compiling_flag
     torch.compiler._is_compiling_flag = True
     try:
@@ -52,8 +52,8 @@ def marked_as_compiling() -> Iterator[None]:
 def compile_graph(
     module: GraphModule, inputs: list[Any], mode: FakeTensorMode, options: Mapping[str, Any]
 ) -> Callable[..., Sequence[Tensor]]:
-    """Compiles a traced graph by inductor; ``torch.compile`` takes only functions."""
-    # Takes a second to import, which those who compile nothing need not wait.
+    """Compiles a traced graph with Inductor; ``torch.compile`` supports only functions."""
+    # A slow import of about a second, only needed for compilation.
     from torch._inductor.compile_fx import compile_fx
 
     with tracing(TracingContext(mode)), inductor_config.patch(dict(options)):

@@ -1,9 +1,8 @@
-"""Compiling the experiment's hot functions, where a compiler is at hand.
+"""Compilation of the experiment's hot functions.
 
-A function runs once with tensors that have no contents, and what it does to them is a graph;
-tensors that it reached by itself become inputs of that; torch's compiler makes a program of it.
-``torch.compile`` would read the Python instead, instruction by instruction, which takes several
-times as long at the start of every run, and it checks more at every call.
+A function is traced once with fake tensors, and Inductor compiles the graph. Tensors that are not
+arguments, such as parameters, become inputs of the graph. ``torch.compile`` analyzes Python
+bytecode instead: it takes several times longer at the start of a run and checks more at every call.
 """
 
 from __future__ import annotations
@@ -37,21 +36,20 @@ from torchrl_l2c2.experiment.learn._torch_internals import (
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compiles a function into one graph, with the gradients that it takes.
+    """Compiles a function, including its calls of ``torch.autograd.grad``, into one graph.
 
-    Random numbers are drawn as without compilation. What comes out has no gradient.
+    Random numbers are the same as without compilation. Outputs have no gradient.
 
-    Whatever the function reaches other than by its arguments has to stay as it is at the first
-    call, but for what is written *into* tensors: a setting changed or a tensor replaced later is
-    overlooked. Arguments of other shapes, and other values of those that are no tensors, have
-    graphs of their own.
+    The first call fixes everything except for the arguments and the contents of tensors: in-place
+    changes of tensors take effect, but later changes of settings and replaced tensors are ignored.
+    Other shapes of tensor arguments, and other values of other arguments, are compiled separately.
 
     Args:
-        function (Callable): what is compiled, at its first call. What it does may not depend on
-            what its tensors hold, and it may keep none of them.
+        function (Callable): Function to compile, traced at its first call. Its control flow must
+            not depend on tensor values, and it must not store its tensors.
 
     Returns:
-        Callable: the compiled function. It raises :class:`CompilerError` where there is none.
+        Callable: The compiled function. It raises :class:`CompilerError` if compilation fails.
     """
     programs: dict[tuple[Any, ...], _Program] = {}
 
@@ -67,76 +65,76 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class _Program:
-    """A function compiled for arguments like these.
+    """A function compiled for arguments of the given shapes and values.
 
     Args:
-        function (Callable): what is compiled.
-        args (tuple): the arguments.
+        function (Callable): Function to compile.
+        args (tuple): Example arguments.
 
     Attributes:
-        spec: how the arguments are nested.
+        spec: Nesting of the arguments.
     """
 
     def __init__(self, function: Callable[..., Any], args: tuple[Any, ...]) -> None:
         tensors, rest, self.spec = _split(args)
-        # The compiler's cache wants to know that no size is unknown.
+        # The compiler's cache needs a ShapeEnv, even if all sizes are static.
         mode = FakeTensorMode(allow_non_fake_inputs=True, shape_env=ShapeEnv())
-        inputs = [_without_contents(mode, tensor) for tensor in tensors]
-        reached = _Reached(mode)
+        inputs = [_to_fake(mode, tensor) for tensor in tensors]
+        captured = _CapturedTensors(mode)
 
         def on_tensors(*tensors: Tensor) -> list[Tensor]:
-            with reached:
+            with captured:
                 returned = function(*_join(tensors, rest, self.spec))
             written, *self._returned = _split(returned)
             return written
 
         with _compiling(), mode:
             module = make_fx(on_tensors)(*inputs)
-        self._reached = reached.tensors
-        self._run = _compile(module, [*inputs, *reached.inputs], mode)
+        self._captured = captured.tensors
+        self._run = _compile(module, [*inputs, *captured.inputs], mode)
 
     def __call__(self, tensors: list[Tensor]) -> Any:
         with torch.no_grad():
-            written = self._run(*tensors, *self._reached)
+            written = self._run(*tensors, *self._captured)
         return _join(written, *self._returned)
 
 
 def _split(tree: Any) -> tuple[list[Tensor], list[Any], Any]:
-    """The tensors of nested values, the others with marks in their places, and the nesting."""
+    """Splits nested values into tensors, all values without tensors, and the nesting."""
     leaves, spec = tree_flatten(tree)
     tensors = [leaf for leaf in leaves if isinstance(leaf, Tensor)]
     return tensors, [Tensor if isinstance(leaf, Tensor) else leaf for leaf in leaves], spec
 
 
 def _join(tensors: Iterable[Tensor], rest: list[Any], spec: Any) -> Any:
-    """What :func:`_split` took apart."""
+    """Rebuilds the nested values of :func:`_split`."""
     given = iter(tensors)
     return tree_unflatten([next(given) if leaf is Tensor else leaf for leaf in rest], spec)
 
 
-def _without_contents(mode: FakeTensorMode, tensor: Tensor) -> Tensor:
+def _to_fake(mode: FakeTensorMode, tensor: Tensor) -> Tensor:
     return mode.from_tensor(tensor, static_shapes=True)
 
 
 @contextmanager
 def _compiling() -> Iterator[None]:
-    """Tells losses and distributions that they are traced: they then ask nothing of contents."""
+    """Marks the block as compiling: losses and distributions then skip checks of tensor values."""
     with marked_as_compiling(), warnings.catch_warnings():
-        # That locks are not watched meanwhile, and of a setting of torch's that it reads.
+        # TensorDict warns about locks and about a setting of torch.
         warnings.filterwarnings("ignore", module="tensordict")
         yield
 
 
-class _Reached(TorchDispatchMode):
-    """Makes inputs of a graph of the tensors that the traced function reaches by itself.
+class _CapturedTensors(TorchDispatchMode):
+    """Turns tensors that a traced function uses without being arguments into graph inputs.
 
     Args:
-        mode (FakeTensorMode): which gives them stand-ins without contents.
+        mode (FakeTensorMode): Mode that creates their fake tensors.
 
     Attributes:
-        tensors: that were reached, each piece of memory once for every form: a parameter and its
-            ``data`` are one.
-        inputs: their stand-ins, in that order.
+        tensors: Captured tensors. Tensors with the same memory, shape and strides, such as a
+            parameter and its ``data``, are captured once.
+        inputs: Fake tensors of ``tensors``, in the same order.
     """
 
     def __init__(self, mode: FakeTensorMode) -> None:
@@ -153,7 +151,7 @@ class _Reached(TorchDispatchMode):
         args: tuple[Any, ...] = (),
         kwargs: dict[str, Any] | None = None,
     ) -> Any:
-        # Numbers that become tensors are a part of the graph.
+        # Constants are part of the graph.
         if func is not torch.ops.aten.lift_fresh.default:
             args, kwargs = tree_map_only(Tensor, self._input, (args, kwargs))
         return func(*args, **(kwargs or {}))
@@ -162,8 +160,8 @@ class _Reached(TorchDispatchMode):
         if isinstance(tensor, FakeTensor):
             if tensor.fake_mode is not self._mode:
                 raise RuntimeError(
-                    f"a tensor of shape {tuple(tensor.shape)} without contents was kept when an "
-                    "earlier graph was made: what is compiled may keep none of its tensors."
+                    f"the function uses a fake tensor of shape {tuple(tensor.shape)} of an earlier "
+                    "trace: a compiled function must not store its tensors."
                 )
             return tensor
         where = (tensor.data_ptr() or id(tensor), tensor.shape, tensor.stride(), tensor.dtype)
@@ -176,8 +174,8 @@ class _Reached(TorchDispatchMode):
         assert proxies is not None
         with disable_current_modes():
             self.tensors.append(tensor.detach())
-            self.inputs.append(_without_contents(self._mode, self.tensors[-1]))
-        proxy = proxies.tracer.create_proxy("placeholder", f"reached_{len(self.inputs)}", (), {})
+            self.inputs.append(_to_fake(self._mode, self.tensors[-1]))
+        proxy = proxies.tracer.create_proxy("placeholder", f"captured_{len(self.inputs)}", (), {})
         track_tensor_tree(self.inputs[-1], proxy, constant=None, tracer=proxies.tracer)
         return self.inputs[-1]
 
@@ -187,47 +185,47 @@ def _compile(
 ) -> Callable[..., Sequence[Tensor]]:
     graph = module.graph
     first, *others = graph.find_nodes(op="placeholder")
-    for placeholder in reversed(others):  # Some were reached in the midst of it.
+    for placeholder in reversed(others):  # Placeholders of captured tensors are between the nodes.
         first.append(placeholder)
     for node in reversed(graph.nodes):
-        # Marks for the profiler, which torch's optimizers set.
+        # Profiler marks of torch's optimizers cannot be compiled.
         if getattr(node.target, "namespace", None) == "profiler":
             graph.erase_node(node)
     module.recompile()
     options = {
         "fallback_random": True,
-        # The sizes of the inputs are checked before the program is chosen: once is enough.
+        # compiled() has already checked the sizes to choose the program.
         "size_asserts": False,
-        "post_grad_custom_post_pass": _BiasesApart(),
+        "post_grad_custom_post_pass": _SeparateBiases(),
     }
     try:
         with torch.no_grad():
             return compile_graph(module, inputs, mode, options)
-    # Of any kind: inductor's own mistakes are such as any program makes.
+    # Inductor's own bugs raise errors of any class.
     except Exception as error:
         raise CompilerError(_failure(str(error).splitlines())) from error
 
 
 def _failure(lines: Sequence[str]) -> str:
-    wrong = [line.strip() for line in lines if "error:" in line]
+    errors = [line.strip() for line in lines if "error:" in line]
     return (
-        f"the compiler failed ({(wrong or lines or ['it says nothing'])[0]}): compile=false trains "
-        "without it, several times slower."
+        f"the compiler failed ({(errors or lines or ['no message'])[0]}): set compile=false to "
+        "train without it, several times slower."
     )
 
 
-class _BiasesApart(CustomGraphPass):
-    """Takes biases out of matrix products, into the kernels of what follows.
+class _SeparateBiases(CustomGraphPass):
+    """Graph pass that moves biases from matrix products into the next kernels.
 
-    A product with a bias begins with a copy of the bias into every row of its result: a call and a
-    pass over memory that the kernel after it, which reads the result anyway, makes superfluous.
-    Torch's own pass of this kind is for GPUs alone.
+    ``addmm`` first copies the bias to every row of its result. The next kernel reads the result
+    anyway and can add the bias without this extra call and memory pass. Torch's own pass of this
+    kind supports only GPUs.
     """
 
     def __call__(self, graph: Graph) -> None:
         aten = torch.ops.aten
         for node in graph.find_nodes(op="call_function", target=aten.addmm.default):
-            if node.kwargs:  # factors other than 1
+            if node.kwargs:  # Factors other than 1.
                 continue
             bias, left, right = node.args
             with graph.inserting_before(node):
@@ -239,10 +237,10 @@ class _BiasesApart(CustomGraphPass):
             graph.erase_node(node)
 
     def uuid(self) -> bytes:
-        """What the compiler's cache knows the pass by: the contents of this file."""
+        """Identifies the pass in the compiler's cache by the contents of this file."""
         return get_hash_for_files((__file__,))
 
 
 def compiler_available() -> bool:
-    """Whether the C++ compiler is there that ``torch.compile`` needs on the CPU."""
+    """Checks whether a C++ compiler is installed, which ``torch.compile`` needs on the CPU."""
     return any(shutil.which(name) for name in ("g++", "clang++", "c++"))

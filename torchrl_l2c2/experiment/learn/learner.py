@@ -1,4 +1,4 @@
-"""What is learned from: transitions are remembered, and updates made of them."""
+"""Storage of transitions, and updates of an agent from them."""
 
 from __future__ import annotations
 
@@ -18,53 +18,56 @@ from torchrl_l2c2.experiment.envs.frames import Frame
 from torchrl_l2c2.experiment.learn.update import ReplayUpdate
 from torchrl_l2c2.gains import gradient_shares, is_loss
 
-# Updates after which the regularizer's gradients are measured, and the share of the loss's own
-# below which they are told to be too small. It is far below what changes a result: the share of
-# a policy that begins flat, as PPO's with orthogonal weights, grows while the policy forms.
-MEASURED_AFTER = 100
-TOLD_BELOW = 1e-4
-# Skipped updates in a row after which a run stops.
-MOST_SKIPPED = 100
+# Number of updates before the regularizer's gradients are measured, and the share of the loss's
+# own gradients below which a warning is logged. The limit is low: for an initially flat policy,
+# such as PPO's with orthogonal weights, the share grows during training.
+MEASURE_AFTER = 100
+WARN_BELOW = 1e-4
+# Maximum number of skipped updates in a row; the run then stops.
+MAX_SKIPPED = 100
 
 
-def untrained(frames: int, updates: int, random_frames: int) -> str | None:
-    """Why a training of so many frames and updates has no policy to show; ``None`` if it has.
+def untrained_reason(frames: int, updates: int, random_frames: int) -> str | None:
+    """Returns why a training left the policy practically untrained, or ``None`` if it did not.
 
     Args:
-        frames (int): that were played.
-        updates (int): that were made.
-        random_frames (int): first frames whose actions were random.
+        frames (int): Number of frames.
+        updates (int): Number of updates.
+        random_frames (int): Number of first frames with random actions.
     """
     if updates and frames > random_frames:
         return None
     what = "no update was made" if not updates else "the policy never acted"
     return (
-        f"{what} in {frames} frames, the first {random_frames} of which were random "
-        "(algorithm.random_frames): the policy is as good as untrained. Train for longer, or need "
-        "fewer frames before the first update (also by replay.batch_size and algorithm.frames)."
+        f"{what} in {frames} frames, of which the first {random_frames} were random "
+        "(algorithm.random_frames): the policy is practically untrained. Train longer, or reduce "
+        "the frames before the first update (algorithm.random_frames, replay.batch_size, "
+        "algorithm.frames)."
     )
 
 
 class Learner:
-    """Remembers transitions and updates an agent from them.
+    """Stores transitions and updates an agent from them.
 
     Args:
-        agent (Agent): what is updated, in place.
-        replay (TensorDictReplayBuffer): where transitions are kept.
+        agent (Agent): Agent, updated in place.
+        replay (TensorDictReplayBuffer): Replay buffer of the transitions.
 
     Keyword Args:
-        reward_factor (float): what rewards are multiplied with when they are remembered.
-        compile (bool): as for :func:`~.update.make_update`.
-        skip_nonfinite (bool): as for :func:`~.update.make_update`.
+        reward_factor (float): Factor on the stored rewards.
+        compile (bool): Whether to compile the update, as for :func:`~.update.make_update`.
+        skip_nonfinite (bool): Whether to skip batches with a NaN or infinite loss or gradient, as
+            for :func:`~.update.make_update`.
 
     Attributes:
-        compiles: whether the update is compiled.
-        updates: gradient steps so far.
-        skipped_updates: batches that were not finite and changed nothing.
-        unreported: the loss's entries in every update since the last report.
-        first_update_seconds: how long the first took, compilation included; ``None`` before it.
-        tells_faint_regularizer: whether to warn of a regularizer whose gradients are too small.
-        at_full_gain: within it the regularizer has the gain that it is to end with.
+        compiles: Whether the update is compiled.
+        updates: Number of gradient steps so far.
+        skipped_updates: Number of skipped batches.
+        unreported: Values of the loss's entries in each update since the last report.
+        first_update_seconds: Duration of the first update, including compilation; ``None`` before
+            it.
+        warns_weak_regularizer: Whether to warn if the regularizer's gradients are too small.
+        at_full_gain: Context manager in which the regularizer has its final gain.
     """
 
     def __init__(
@@ -82,7 +85,7 @@ class Learner:
         self.skipped_updates = 0
         self._skipped_in_a_row = 0
         self.first_update_seconds: float | None = None
-        self.tells_faint_regularizer = True
+        self.warns_weak_regularizer = True
         self.at_full_gain: Callable[[], AbstractContextManager[None]] = nullcontext
         self._reward_factor = reward_factor
         self.compiles = compile
@@ -92,13 +95,13 @@ class Learner:
         self._rows = RowWriter(replay)
         self._read_keys = list(agent.loss.in_keys)
         if agent.advantage is not None:
-            # Where they are missing, TorchRL's loss estimates them anew, along a minibatch, whose
-            # rows do not follow each other in time.
+            # Otherwise TorchRL's loss would estimate them from a minibatch, whose rows are not
+            # consecutive.
             self._read_keys += [agent.advantage.advantage_key, agent.advantage.value_target_key]
-        self.renew()
+        self.rebuild_update()
 
-    def renew(self) -> None:
-        """Makes the update anew: a compiled one is made for the tensors that were there."""
+    def rebuild_update(self) -> None:
+        """Rebuilds the update, which is necessary after tensors or settings were replaced."""
         self.agent.refresh_policy()
         self.update = ReplayUpdate(
             self.agent, self.replay, compile=self.compiles, skip_nonfinite=self._skip_nonfinite
@@ -106,19 +109,23 @@ class Learner:
 
     @torch.no_grad()
     def remember(self, transitions: TensorDictBase) -> None:
-        """Keeps the entries that the loss reads, and no others: sampling copies every one."""
-        transitions = self.agent.as_learned(transitions, self._reward_factor)
+        """Stores the entries that the loss reads. Others would only make sampling slower."""
+        transitions = self.agent.prepare_for_loss(transitions, self._reward_factor)
         self.replay.extend(transitions.select(*self._read_keys, strict=False))
 
     @torch.no_grad()
     def remember_frame(self, frame: Frame) -> None:
-        """As :meth:`remember` of the one frame; for algorithms that learn after each."""
+        """Stores one frame as :meth:`remember` does, for algorithms with an update per step."""
         row = frame.row()
         row["next", "reward"] *= self._reward_factor
         self._rows.write({key: row[key] for key in self._read_keys if key in row})
 
     def learn(self, updates: int) -> None:
-        """Makes so many updates with batches from the replay buffer, once it holds one."""
+        """Makes updates from the replay buffer, or none while it has less than one batch.
+
+        Args:
+            updates (int): Number of updates.
+        """
         if len(self.replay) < self.replay.batch_size:
             return
         for _ in range(updates):
@@ -126,20 +133,24 @@ class Learner:
         self.agent.refresh_policy()
 
     def learn_rollout(self, epochs: int) -> None:
-        """Goes so many times through all that is remembered, and forgets it."""
+        """Makes updates from the stored rollout and empties the buffer.
+
+        Args:
+            epochs (int): Number of passes over the rollout.
+        """
         skipped = self._skipped_in_a_row
         for _ in range(epochs):
             self.replay.sampler.ran_out = False
             while not self.replay.sampler.ran_out:
                 self._update()
-        if skipped < MOST_SKIPPED // 2:  # A rollout is forgotten: a single one stops no run.
-            self._skipped_in_a_row = min(self._skipped_in_a_row, MOST_SKIPPED // 2)
+        if skipped < MAX_SKIPPED // 2:  # One bad rollout must not stop the run: it is not reused.
+            self._skipped_in_a_row = min(self._skipped_in_a_row, MAX_SKIPPED // 2)
         self._learned_from = self.update.example()
         self.replay.empty()
         self.agent.refresh_policy()
 
     def example(self) -> TensorDictBase:
-        """A batch from all over what was last learned from, also once that is forgotten."""
+        """Returns a batch from the whole buffer, or from the last rollout if it was emptied."""
         return self.update.example() if self._learned_from is None else self._learned_from
 
     def _update(self) -> None:
@@ -155,41 +166,45 @@ class Learner:
         self._skipped_in_a_row = 0
         self.updates += 1
         self.unreported.append(result[0])
-        if self.updates == MEASURED_AFTER and self.tells_faint_regularizer:
-            self._tell_faint_regularizer()
+        if self.updates == MEASURE_AFTER and self.warns_weak_regularizer:
+            self._warn_weak_regularizer()
 
-    def _tell_faint_regularizer(self) -> None:
+    def _warn_weak_regularizer(self) -> None:
         with self.at_full_gain():
             shares = self.shares(self.update.example())
-        if shares and max(shares.values()) < TOLD_BELOW:
+        if shares and max(shares.values()) < WARN_BELOW:
             each = ", ".join(f"{key}: {share:.1g}" for key, share in shares.items())
             warnings.warn(
-                f"after {self.updates} updates the gradients of the regularizer's terms are less "
-                f"than {TOLD_BELOW:g} of the loss's own ({each}), which is likely to change "
-                "nothing: raise the gains of the regularizer, or lower algorithm.reward_scale.",
+                f"after {self.updates} updates, the gradients of the regularizer's terms are below "
+                f"{WARN_BELOW:g} of the loss's own gradients ({each}), which is probably too small "
+                "for any effect: raise the gains of the regularizer, or lower "
+                "algorithm.reward_scale.",
                 stacklevel=2,
             )
 
     def shares(self, batch: TensorDictBase) -> dict[str, float]:
-        """The finite :func:`~.gradient_shares` of the regularizer's terms.
+        """Returns the finite :func:`~.gradient_shares` of the regularizer's terms.
 
-        Terms of networks that the loss itself does not train, such as a predictor, have none.
+        Terms of networks that only the regularizer trains, such as a predictor, have none.
+
+        Args:
+            batch (TensorDictBase): Batch of the loss.
         """
         shares = gradient_shares(self.agent.loss, batch)
         return {key: share for key, share in shares.items() if math.isfinite(share)}
 
     def report(self, last_frame: int) -> dict[str, float]:
-        """Means of every entry of the loss over the updates since the last report.
+        """Returns the means of the loss's entries over the updates since the last report.
 
-        A ``share_*`` is the part that a term has of the sum of all terms' sizes: it says at a
-        glance whether a regularizer is on, and how much of the loss it is.
+        ``share_*`` is the absolute value of a term relative to the sum over all terms: the weight
+        of the regularizer in the loss.
 
         Args:
-            last_frame (int): frames that were played, for errors.
+            last_frame (int): Number of frames of the run, for errors.
 
         Raises:
-            FloatingPointError: an entry was NaN or infinite, or a parameter is now; names it, the
-                update and the frame. Or too many updates in a row were skipped.
+            FloatingPointError: If an entry or a parameter is NaN or infinite, or too many updates
+                in a row were skipped.
         """
         self._check_skipped(last_frame)
         keys, terms = self.agent.loss.out_keys, self.unreported
@@ -210,26 +225,27 @@ class Learner:
         return {**means, **shares}
 
     def _check_skipped(self, last_frame: int) -> None:
-        if self._skipped_in_a_row < MOST_SKIPPED:
+        if self._skipped_in_a_row < MAX_SKIPPED:
             return
-        row, reward = self.update.culprit
+        row, reward = self.update.bad_row
         raise FloatingPointError(
             f"{self._skipped_in_a_row} updates in a row were skipped after update {self.updates} "
-            f"(frame {last_frame}), as a loss or gradient was not finite. Row {row} of the replay "
-            f"buffer has the reward {reward / self._reward_factor:g}: give smaller rewards, or "
-            "lower algorithm.reward_scale."
+            f"(frame {last_frame}), because a loss or gradient was not finite. Row {row} of the "
+            f"replay buffer has the reward {reward / self._reward_factor:g}: use smaller rewards, "
+            "or lower algorithm.reward_scale."
         )
 
     def check_parameters(self) -> None:
-        """Stops at a parameter that is not finite.
+        """Checks that all parameters are finite.
 
         Raises:
-            FloatingPointError: names the parameter and the update.
+            FloatingPointError: If a parameter has a NaN or infinite value.
         """
         for name, parameter in self.agent.loss.named_parameters():
             if not parameter.isfinite().all():
                 raise FloatingPointError(
-                    f"{name} is not finite after update {self.updates}: a gradient was not."
+                    f"{name} is not finite after update {self.updates}, because a gradient was not "
+                    "finite."
                 )
 
     def _check_finite(self, values: torch.Tensor, last_frame: int) -> None:

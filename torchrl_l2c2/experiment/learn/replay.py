@@ -21,22 +21,25 @@ from torchrl_l2c2.experiment.settings.replay import (
     RolloutReplayConfig,
 )
 
-# Added to a run's seed for its neighbors, as others are for tests and noise: far from all of them.
+# Added to the run's seed for its neighbors, to differ from the seeds of tests and noise.
 NEIGHBOR_SEED = 32_452_843
 
 
 def make_replay(config: ExperimentConfig) -> TensorDictReplayBuffer:
-    """Builds the replay buffer of a run; its batches have what the regularizer needs.
+    """Builds the replay buffer of a run, including the transform that samples neighbors.
+
+    Args:
+        config (ExperimentConfig): Settings of the run.
 
     Raises:
-        SettingError: prioritized replay needs TorchRL's compiled trees, which are not loaded with
-            this version of torch.
+        SettingError: If replay is prioritized, and TorchRL's compiled trees do not support the
+            installed version of torch.
     """
     # The last episode may exceed the rollout's frames.
     longest = config.algorithm.frames + time_limit(config.task)
     buffer = make_buffer(config.replay, config.seed, longest, config.device)
-    # Another seed than the sampler's: with one number for a neighbor both draw as many at a
-    # time, and where a transition lies would say which neighbor it gets.
+    # A different seed from the sampler's: otherwise both would sample the same numbers, and a
+    # transition's row would determine its neighbor.
     generator = torch.Generator(config.device).manual_seed(config.seed + NEIGHBOR_SEED)
     if (transform := make_neighbors(config.regularizer, generator)) is not None:
         buffer.append_transform(transform)
@@ -49,13 +52,14 @@ def make_buffer(
     """Builds a replay buffer without transforms.
 
     Args:
-        config (PrioritizedReplayConfig, UniformReplayConfig or RolloutReplayConfig): the settings.
-        seed (int): seed of the sampling.
-        longest_rollout (int): capacity, in frames, for a rollout's buffer.
-        device (str): device of the storage. Default ``"cpu"``.
+        config (PrioritizedReplayConfig, UniformReplayConfig or RolloutReplayConfig): Settings of
+            the buffer.
+        seed (int): Random seed of the sampler.
+        longest_rollout (int): Capacity in frames, for ``RolloutReplayConfig``.
+        device (str): Device of the storage. Default ``"cpu"``.
 
     Raises:
-        SettingError: as :func:`make_replay`.
+        SettingError: As :func:`make_replay`.
     """
     if isinstance(config, PrioritizedReplayConfig):
         if SumSegmentTreeFp32 is None:
@@ -70,7 +74,7 @@ def make_buffer(
             beta=config.beta,
             priority_key="td_error",
             storage=LazyTensorStorage(config.capacity, device=device),
-            # replay_state reads the trees there; with a storage on a GPU they would lie there.
+            # replay_state reads the trees on the CPU, also if the storage is on a GPU.
             sampler_device="cpu",
             batch_size=config.batch_size,
             generator=torch.Generator().manual_seed(seed),

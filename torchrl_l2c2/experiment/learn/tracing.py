@@ -1,4 +1,4 @@
-"""The steps of optimizers and target networks as parts of a compiled function."""
+"""Steps of optimizers and target networks inside compiled functions."""
 
 from __future__ import annotations
 
@@ -17,37 +17,40 @@ from torchrl_l2c2.updaters import TSoftUpdate
 
 
 def traceable_step(optimizer: Optimizer) -> Callable[[], object] | None:
-    """The optimizer's step as a function that compiles; ``None`` where there is none.
+    """Returns the optimizer's step as a function that compiles, or ``None`` if it does not.
 
-    Learning rates become tensors, so that a compiled step follows what is written into them, as
-    torch's schedulers do.
+    Learning rates become tensors: in-place changes, such as by torch's schedulers, also affect
+    the compiled step.
 
     Args:
         optimizer (Optimizer): :class:`~torchrl_l2c2.AdaTerm` or ``torch.optim.Adam``.
     """
-    if type(optimizer) not in (AdaTerm, Adam):  # A kind of Adam may step otherwise.
+    if type(optimizer) not in (AdaTerm, Adam):  # A subclass may have another step.
         return None
     for group in optimizer.param_groups:
         if not isinstance(group["lr"], Tensor):
-            # As precise as the number: a run that is continued uncompiled goes on with the same.
+            # float64 keeps the exact number, in case the run continues without compilation.
             group["lr"] = torch.tensor(group["lr"], dtype=torch.float64)
     if isinstance(optimizer, Adam):
-        _begin(optimizer)
+        _initialize_state(optimizer)
         return partial(adam_step, optimizer)
     return optimizer.step
 
 
 def traceable_targets(updater: TargetNetUpdater | None) -> bool:
-    """Whether the target networks' step compiles: it may not count in Python."""
+    """Checks whether the target networks' step compiles: it must not count in Python."""
     return updater is None or type(updater) in (SoftUpdate, TSoftUpdate)
 
 
 @torch.no_grad()
 def adam_step(optimizer: Adam) -> None:
-    """``optimizer.step()`` with gradients that are given in the same compiled function.
+    """Does ``optimizer.step()`` with gradients that the same compiled function computes.
 
-    The optimizer's own reads those that were there before, when it is traced. The state is the
-    same, and has to be there.
+    When traced, Adam's own step would read the earlier gradients. Both use the same state, which
+    must exist.
+
+    Args:
+        optimizer (Adam): Optimizer with an initialized state.
     """
     for group in optimizer.param_groups:
         params = [p for p in group["params"] if p.grad is not None]
@@ -74,8 +77,8 @@ def adam_step(optimizer: Adam) -> None:
         )
 
 
-def _begin(optimizer: Adam) -> None:
-    """Gives every parameter the state that Adam's first step would give it."""
+def _initialize_state(optimizer: Adam) -> None:
+    """Initializes the state of each parameter as in Adam's first step."""
     for group in optimizer.param_groups:
         for p in group["params"]:
             if optimizer.state[p]:

@@ -1,7 +1,7 @@
-"""One gradient step: rows, batch, loss, gradients, optimizer, targets; eager or compiled.
+"""Gradient steps from a replay buffer, eager or compiled.
 
-Read from below: a :class:`ReplayUpdate` draws the rows of a batch, :func:`make_update` makes the
-step that learns from them, and the rows get their new priorities.
+:class:`ReplayUpdate` samples the rows of a batch, calls the step of :func:`make_update`, and sets
+the rows' new priorities.
 """
 
 from __future__ import annotations
@@ -15,7 +15,10 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import TensorDictPrioritizedReplayBuffer, TensorDictReplayBuffer
 
-from torchrl_l2c2.experiment.agents._torchrl_internals import forget_traced, stored_tensors
+from torchrl_l2c2.experiment.agents._torchrl_internals import (
+    clear_detached_parameters,
+    stored_tensors,
+)
 from torchrl_l2c2.experiment.agents.agent import Agent
 from torchrl_l2c2.experiment.learn.compilation import compiled
 from torchrl_l2c2.experiment.learn.tracing import traceable_step, traceable_targets
@@ -23,7 +26,7 @@ from torchrl_l2c2.gains import is_loss
 from torchrl_l2c2.transforms import NeighborTransform
 
 Step = Callable[..., tuple[Tensor | None, Tensor | None]]
-"""A gradient step: the means of the loss's entries, ``None`` if skipped, and new priorities."""
+"""Gradient step that returns the means of the loss's entries (``None``: skipped) and priorities."""
 
 
 def make_update(
@@ -33,23 +36,27 @@ def make_update(
     skip_nonfinite: bool = False,
     read: Callable[..., TensorDictBase] | None = None,
 ) -> Step:
-    """One gradient step as a function of a batch: loss, gradients, optimizer, target networks.
+    """Returns one gradient step as a function: loss, gradients, optimizer and target networks.
 
     Args:
-        agent (Agent): what is updated, in place. Compiled, the step is made for the agent's tensors
-            and settings as they are at its first call: make another after replacing any. Learning
-            rates become tensors, and what is written into them is followed.
-        compile (bool): whether to compile. The whole step is one graph where the optimizer's and
-            the target networks' steps are :mod:`~.tracing`'s; with others, loss and gradients are.
-        skip_nonfinite (bool): whether a batch with a loss or gradient that is NaN or infinite
-            changes nothing and gives no means. The step is two graphs then.
-        read (Callable, optional): makes the batch of other things, as the first part of the graph.
+        agent (Agent): Agent, updated in place. A compiled step uses the agent's tensors and
+            settings at its first call: call :func:`make_update` again after replacing any.
+            Learning rates become tensors, which may be changed in place.
+
+    Keyword Args:
+        compile (bool): Whether to compile the step. If the steps of the optimizer and the target
+            networks compile (:mod:`~.tracing`), the whole step is one graph, otherwise only loss
+            and gradients.
+        skip_nonfinite (bool): Whether to skip batches with a NaN or infinite loss or gradient. The
+            step is then two graphs. Default ``False``.
+        read (Callable, optional): Function that creates the batch, compiled with the step. Default:
+            the step's argument is the batch.
 
     Returns:
-        Callable: takes whether the policy is updated too, and the target networks with it, then the
-        batch or what ``read`` makes it of. Returns the means of ``agent.loss.out_keys``, in their
-        order, as one tensor, and the new priorities of the batch, if the loss gives any. Parameters
-        have no ``grad`` after it.
+        Callable: Function of a bool, whether to also update the policy and the target networks, and
+        the batch or the arguments of ``read``. It returns the means of ``agent.loss.out_keys`` as
+        one tensor, ``None`` if the batch is skipped, and the batch's new priorities, or ``None``.
+        It clears the parameters' ``grad``.
     """
     parameters = [p for group in agent.optimizer.param_groups for p in group["params"]]
     keys = agent.loss.out_keys
@@ -62,11 +69,11 @@ def make_update(
     def differentiate(
         with_policy: bool, *drawn: Any
     ) -> tuple[Tensor, Tensor | None, tuple[Tensor | None, ...]]:
-        # A copy, as losses write into what they are given, some of it with a gradient.
+        # A copy: losses write into their argument, partly with gradients.
         batch = drawn[0].copy() if read is None else read(*drawn)
         terms = agent.loss(batch)
         if torch.compiler.is_compiling():
-            forget_traced(agent.loss)
+            clear_detached_parameters(agent.loss)
         priority = batch.get("td_error", None)
         total = sum(
             terms[key]
@@ -85,7 +92,7 @@ def make_update(
         step()
         if agent.target_updater is not None and with_policy:
             agent.target_updater.step()
-        # Kept, they would be outputs of the graph, and each output takes time.
+        # Remaining gradients would be outputs of the graph, which take time.
         for parameter in parameters:
             parameter.grad = None
 
@@ -102,16 +109,16 @@ def make_update(
     if not skip_nonfinite:
         return update
 
-    # What a loss itself keeps of the batches it has seen, such as PPO-RPE's threshold.
-    kept = list(agent.loss.buffers())
+    # State of the loss that depends on batches, such as PPO-RPE's threshold.
+    buffers = list(agent.loss.buffers())
 
     def checked_update(with_policy: bool, *drawn: Any) -> tuple[Tensor | None, Tensor | None]:
-        before = [buffer.clone() for buffer in kept]
+        before = [buffer.clone() for buffer in buffers]
         values, priority, gradients = differentiate(with_policy, *drawn)
         tensors = (values, *(g for g in gradients if g is not None))
         if not all(bool(tensor.isfinite().all()) for tensor in tensors):
-            for buffer, was in zip(kept, before, strict=True):
-                buffer.copy_(was)
+            for buffer, old in zip(buffers, before, strict=True):
+                buffer.copy_(old)
             return None, priority
         apply(with_policy, gradients)
         return values, priority
@@ -120,13 +127,13 @@ def make_update(
 
 
 class Draw(NamedTuple):
-    """What was drawn for one update: everything that tells its batch from others.
+    """Sampled rows and random numbers of one update.
 
     Attributes:
-        stored: the storage's tensors, ``[capacity, ...]`` each.
-        rows: of the batch, ``[B]``.
-        weight: importance weights, ``[B]``; ``None`` without priorities.
-        uniform: random numbers of the neighbors; ``None`` without these.
+        stored: Tensors ``[capacity, ...]`` of the storage.
+        rows: Rows ``[B]`` of the batch.
+        weight: Importance weights ``[B]``; ``None`` without priorities.
+        uniform: Random numbers of the neighbors; ``None`` without neighbors.
     """
 
     stored: tuple[Tensor, ...]
@@ -136,28 +143,27 @@ class Draw(NamedTuple):
 
 
 class ReplayUpdate:
-    """Updates from a replay buffer: as ``sample``, update and ``update_tensordict_priority``.
+    """Updates an agent from a replay buffer.
 
-    A buffer that is gone through without repetition is drawn from in that order.
-
-    The numbers are the same, to rounding where the update is compiled. But the batch is gathered
-    from the storage, and its neighbors are placed, within the update: compiled, they are a part of
-    its graph, which then costs next to nothing, whereas making the batch's TensorDicts takes about
-    as long as the rest of the update.
+    Equivalent to ``replay.sample``, an update and ``replay.update_tensordict_priority``, with the
+    same numbers (up to rounding if compiled). The batch and its neighbors are gathered inside the
+    compiled update, which takes almost no time. Creating the batch's TensorDicts outside would take
+    about as long as the rest of the update.
 
     Args:
-        agent (Agent): what is updated, in place.
-        replay (TensorDictReplayBuffer): as :meth:`ExperimentConfig.make_replay` makes it.
+        agent (Agent): Agent, updated in place.
+        replay (TensorDictReplayBuffer): Buffer of :func:`~.replay.make_replay`.
 
     Keyword Args:
-        compile (bool): as for :func:`make_update`.
-        skip_nonfinite (bool): as for :func:`make_update`.
+        compile (bool): Whether to compile the update, as for :func:`make_update`.
+        skip_nonfinite (bool): Whether to skip batches with a NaN or infinite loss or gradient, as
+            for :func:`make_update`. Default ``False``.
 
     Attributes:
-        culprit: the row that probably had the last batch skipped, and its reward as stored.
+        bad_row: Row that probably caused the last skipped batch, and its stored reward.
     """
 
-    culprit: tuple[int, float]
+    bad_row: tuple[int, float]
 
     def __init__(
         self,
@@ -167,7 +173,7 @@ class ReplayUpdate:
         compile: bool,
         skip_nonfinite: bool = False,
     ) -> None:
-        # TorchRL's properties of a buffer take long.
+        # The buffer's properties are slow.
         self._storage, self._sampler = replay.storage, replay.sampler
         self._batch_size = replay.batch_size
         self._prioritized = isinstance(replay, TensorDictPrioritizedReplayBuffer)
@@ -179,32 +185,32 @@ class ReplayUpdate:
         self._stored: tuple[Tensor, ...] = ()
         make = partial(make_update, agent, skip_nonfinite=skip_nonfinite, read=self.read)
         self.update = make(compile=compile)
-        # Of the last of a rollout's batches, which may have any size: none is worth a graph.
+        # The last batch of a rollout may have any size: compiling it does not pay off.
         self._smaller_update = make(compile=False)
 
     def __call__(self, with_policy: bool) -> tuple[Tensor, Tensor | None] | None:
-        """One update, which sets the batch's priorities as well.
+        """Makes one update and sets the batch's priorities.
 
-        If it is skipped, a row that probably made it so is not drawn again by priority.
+        If the batch is skipped, the row that probably caused it is replaced in the buffer.
 
         Args:
-            with_policy (bool): whether the policy is updated too, and the target networks with it.
+            with_policy (bool): Whether to also update the policy and the target networks.
 
         Returns:
-            tuple: as the function that :func:`make_update` returns; ``None`` if it is skipped.
+            tuple: Means and priorities as from :func:`make_update`; ``None`` if skipped.
         """
         draw = self.draw()
         smaller = len(draw.rows) < self._batch_size
         update = self._smaller_update if smaller else self.update
         values, priority = update(with_policy, *draw)
         if values is None:
-            self._leave_out(draw.rows, priority)
+            self._replace_bad_rows(draw.rows, priority)
             return None
         self.prioritize(draw.rows, priority)
         return values, priority
 
     def draw(self) -> Draw:
-        """Draws the rows of a batch, and the random numbers for their neighbors."""
+        """Samples the rows of a batch and the random numbers of their neighbors."""
         source = stored_tensors(self._storage)
         if source is not None and source is not self._source:
             self._source = source
@@ -217,13 +223,13 @@ class ReplayUpdate:
         return Draw(self._stored, rows, weight, uniform)
 
     def _rows(self) -> tuple[Tensor, Tensor | None]:
-        """What the buffer's sampler draws: rows, and their weights where they have priorities."""
+        """Returns rows from the buffer's sampler, and their importance weights if prioritized."""
         rows, info = self._sampler.sample(self._storage, self._batch_size)
         return rows, info.get("priority_weight")
 
     def example(self) -> TensorDictBase:
-        """A batch from all over the storage, for which nothing that runs depend on is drawn."""
-        # All of it where a rollout is shorter than a batch.
+        """Returns a batch from the whole storage, without changing the run's random numbers."""
+        # A rollout may be shorter than a batch.
         size, device = min(self._batch_size, len(self._storage)), self._device
         rows = torch.linspace(0, len(self._storage) - 1, size, device=device).long()
         weight = torch.ones(size, device=device) if self._prioritized else None
@@ -231,39 +237,39 @@ class ReplayUpdate:
         return self.read(self._stored, rows, weight, uniform)
 
     def _uniform(self, size: int, generator: torch.Generator | None) -> Tensor | None:
-        """Random numbers for the neighbors of so many rows."""
+        """Returns random numbers for the neighbors of ``size`` rows, or ``None``."""
         if self._neighbors is None or self._source is None:
             return None
         near, count = self._neighbors.neighborhood, self._neighbors.num_samples
-        # Only the shape of the states counts: any rows will do.
+        # Only the states' shape matters: any rows work.
         return near.draw(self._source.get("observation")[:size], count, generator)
 
     def prioritize(self, index: Tensor, priority: Tensor | None) -> None:
-        """Sets the priorities of rows, where the buffer has any."""
+        """Sets the priorities of rows, if the buffer is prioritized."""
         if self._prioritized and priority is not None:
             self._sampler.update_priority(index, priority)
 
-    def _leave_out(self, rows: Tensor, priority: Tensor | None) -> None:
-        """Finds the rows that made a batch not finite, and stores a copy of another in their place.
+    def _replace_bad_rows(self, rows: Tensor, priority: Tensor | None) -> None:
+        """Finds the rows that caused a skipped batch, and overwrites them with another row.
 
-        Without that they would keep their priority, and be drawn again and again.
+        Otherwise they would keep their priority and be sampled again and again.
         """
         assert self._source is not None
         rewards = self._source.get(("next", "reward"))[rows].flatten()
         sizes = (rewards.abs() if priority is None else priority.flatten()).nan_to_num(torch.inf)
         largest = sizes.argmax()
-        self.culprit = int(rows[largest]), float(rewards[largest])
+        self.bad_row = int(rows[largest]), float(rewards[largest])
         if not self._prioritized or priority is None:
             return
         bad = sizes.isinf()
-        if not bad.any() or bad.all():  # If all are infinite, not all of them are to blame.
+        if not bad.any() or bad.all():  # If all are infinite, probably one row is the cause.
             bad = torch.arange(len(rows), device=rows.device) == largest
         bad_rows, good_rows = rows[bad].cpu(), rows[~bad].cpu()
         if len(good_rows):
             copies = good_rows[torch.zeros_like(bad_rows)]
             self._storage.set(bad_rows, self._storage.get(copies))
-            usual = sizes[~bad].nan_to_num(posinf=0.0).median()
-            self._sampler.update_priority(bad_rows, usual.expand(len(bad_rows)).cpu())
+            median = sizes[~bad].nan_to_num(posinf=0.0).median()
+            self._sampler.update_priority(bad_rows, median.expand(len(bad_rows)).cpu())
 
     def read(
         self,
@@ -272,7 +278,7 @@ class ReplayUpdate:
         weight: Tensor | None,
         uniform: Tensor | None,
     ) -> TensorDictBase:
-        """The batch that ``replay.sample`` would have given."""
+        """Returns the batch that ``replay.sample`` would return."""
         batch = TensorDict(batch_size=index.shape)
         for name, tensor in zip(self._names, stored, strict=True):
             batch.set(name, tensor[index])

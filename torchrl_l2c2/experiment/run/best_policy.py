@@ -1,4 +1,4 @@
-"""Tests during training, and the best policy that they found."""
+"""Evaluations during training, and the policy with the best evaluation."""
 
 from __future__ import annotations
 
@@ -19,18 +19,22 @@ EPISODES = 10
 
 
 class BestPolicy:
-    """Ten test episodes with the policy's mean, every so many of training; the best one is kept.
+    """Tests the policy at intervals and keeps the policy with the highest mean return.
 
-    Every test plays the same episodes, in an environment of its own, and does not change the
-    training. The test at the end plays other episodes: the best policy was not chosen on them.
+    A test has 10 episodes with mean actions, the same episodes every time. It uses its own
+    environment and does not affect training. The final test plays other episodes, on which the best
+    policy was not selected.
 
     Args:
-        config (ExperimentConfig): of the run; its ``evaluate_every`` says how often, 0 never.
-        policy (TensorDictModule): acts deterministically under ``ExplorationType.DETERMINISTIC``.
-        folder (Path, optional): where ``evaluations.json`` and ``policy_best.pt`` go.
+        config (ExperimentConfig): Settings of the run. ``evaluate_every`` is the number of training
+            episodes between tests; 0: no tests.
+        policy (TensorDictModule): Policy that is deterministic under
+            ``ExplorationType.DETERMINISTIC``.
+        folder (Path, optional): Folder of ``evaluations.json`` and ``policy_best.pt``. ``None``:
+            nothing is written.
 
     Attributes:
-        tests: summaries, each with its ``episode``.
+        tests: Summaries of the tests, each with its training ``episode``.
     """
 
     def __init__(
@@ -41,7 +45,7 @@ class BestPolicy:
         self.tests: list[dict[str, float]] = []
 
     def after(self, episode: int) -> None:
-        """Tests the policy where it is time to."""
+        """Tests the policy if a test is due after this training episode."""
         if not self._every or episode % self._every:
             return
         seed, threads = self._seed + 2 * TEST_SEED, torch.get_num_threads()
@@ -54,13 +58,13 @@ class BestPolicy:
         write_json(self._folder / "evaluations.json", self.tests)
 
     def best(self) -> dict[str, float]:
-        """The first test with the highest mean return."""
+        """Returns the first test with the highest mean return."""
         return max(self.tests, key=lambda test: test["return_mean"])
 
     def state_dict(self) -> dict[str, Any]:
-        """What was tested, as text."""
+        """Returns the summaries of the tests as JSON."""
         return {"tests": json.dumps(self.tests)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores what :meth:`state_dict` gave."""
+        """Restores a state of :meth:`state_dict`."""
         self.tests = json.loads(state["tests"])

@@ -1,13 +1,12 @@
-"""Checkpoints: whole, noticing damage, and read back without running code.
+"""Checkpoints that are written atomically, detect damage, and are loaded without executing code.
 
-A short header (magic, format version, SHA-256 of the rest) and then a ``torch.save`` of tensors and
-plain values, which ``torch.load(weights_only=True)`` reads back.
+A checkpoint has a short header (magic, format version, SHA-256 of the rest), followed by a
+``torch.save`` of tensors and plain values for ``torch.load(weights_only=True)``.
 """
 
-# torchrl.checkpoint (0.14) was tried in their place, on every damage of the tests. Its archives
-# load no wrong numbers, but let changed bytes of the ZIP's headers pass and fail in many ways; its
-# folders load wrong numbers silently. Entries that are no tensors are unpickled, which executes
-# what a forged file says. Writing over a file leaves a moment without one, and flushes nothing.
+# Not torchrl.checkpoint (0.14), which was tested with the same damaged files: its archives miss
+# changed bytes in ZIP headers, its folders silently load wrong numbers, entries other than tensors
+# are unpickled, which may execute code, and overwriting a file is neither atomic nor flushed.
 
 from __future__ import annotations
 
@@ -29,20 +28,24 @@ PATTERN = "checkpoint_*.pt"
 
 
 class CheckpointError(UserError):
-    """A checkpoint that cannot be used, and why."""
+    """A checkpoint is missing, damaged, or of another format."""
 
 
 def save_checkpoint(folder: str | Path, episode: int, state: Mapping[str, Any], keep: int) -> Path:
-    """Writes a checkpoint, proves it readable, and only then removes the oldest ones.
+    """Writes a checkpoint, checks that it can be read, and then removes the oldest checkpoints.
 
     Args:
-        folder (str or Path): where checkpoints lie.
-        episode (int): the number in the file's name; larger is newer.
-        state (Mapping): tensors and plain values, nested.
-        keep (int): how many of the newest stay, at least 1. Two survive a disk that damages one.
+        folder (str or Path): Folder of the checkpoints.
+        episode (int): Number in the file's name. Larger numbers are newer.
+        state (Mapping): Nested tensors and plain values.
+        keep (int): Number of latest checkpoints to keep, at least 1. With 2, one may be damaged.
+
+    Returns:
+        Path: Path of the checkpoint.
 
     Raises:
-        OSError: it could not be written, or reads back differently; older ones are untouched.
+        OSError: If the checkpoint could not be written or is damaged on the disk. Older checkpoints
+            remain.
     """
     import torch
 
@@ -56,18 +59,19 @@ def save_checkpoint(folder: str | Path, episode: int, state: Mapping[str, Any], 
         _payload(path)
     except CheckpointError as error:
         path.unlink()
-        raise OSError(f"the checkpoint did not survive being written: {error}") from error
-    # One with a larger number is damaged, or it would have been gone on from: it counts as none.
+        raise OSError(f"the checkpoint was damaged while it was written: {error}") from error
+    # Checkpoints with larger numbers are damaged, otherwise the run would have continued from them.
     for old in [each for each in list_checkpoints(folder) if each.name <= path.name][keep:]:
         old.unlink()
     return path
 
 
 def load_checkpoint(path: str | Path) -> dict[str, Any]:
-    """Reads one checkpoint.
+    """Loads a checkpoint.
 
     Raises:
-        CheckpointError: missing, empty, cut short, changed, or of another format version.
+        CheckpointError: If the checkpoint is missing, incomplete, damaged or of another format
+            version.
     """
     import torch
 
@@ -80,19 +84,19 @@ def load_checkpoint(path: str | Path) -> dict[str, Any]:
 
 
 def list_checkpoints(folder: str | Path) -> list[Path]:
-    """A folder's checkpoints, the newest first."""
+    """Returns a folder's checkpoints, the latest first."""
     return sorted(Path(folder).glob(PATTERN), reverse=True)
 
 
 def load_newest(folder: str | Path) -> tuple[Path, dict[str, Any], list[str]] | None:
-    """Reads the newest checkpoint that is whole.
+    """Loads the latest intact checkpoint.
 
     Returns:
-        Its path, its state and a message for every newer one that was damaged; ``None`` where
-        the folder holds no checkpoint at all.
+        tuple: Path, state, and a message for each newer, damaged checkpoint; ``None`` if the folder
+        has no checkpoints.
 
     Raises:
-        CheckpointError: there are checkpoints, and all of them are damaged.
+        CheckpointError: If all checkpoints are damaged.
     """
     damaged: list[str] = []
     for path in list_checkpoints(folder):
@@ -101,7 +105,7 @@ def load_newest(folder: str | Path) -> tuple[Path, dict[str, Any], list[str]] | 
         except CheckpointError as error:
             damaged.append(str(error))
     if damaged:
-        raise CheckpointError("no checkpoint can be read: " + " ".join(damaged))
+        raise CheckpointError("all checkpoints are damaged: " + " ".join(damaged))
     return None
 
 
@@ -111,14 +115,14 @@ def _payload(path: Path) -> bytes:
     except OSError as error:
         raise CheckpointError(f"{path}: cannot be read ({error.strerror}).") from error
     if len(content) < HEADER.size:
-        raise CheckpointError(f"{path}: is cut short, {len(content)} bytes are left.")
+        raise CheckpointError(f"{path}: is incomplete, with only {len(content)} bytes.")
     magic, found, digest = HEADER.unpack_from(content)
     if magic != MAGIC:
         raise CheckpointError(f"{path}: is not a checkpoint of torchrl_l2c2.")
     if found != FORMAT_VERSION:
         raise CheckpointError(
-            f"{path}: has format version {found}, this version of torchrl_l2c2 reads "
-            f"{FORMAT_VERSION}; use the version that wrote it (see versions.json in the folder)."
+            f"{path}: has format version {found}, but this version of torchrl_l2c2 reads only "
+            f"version {FORMAT_VERSION}: use the version that wrote it (see versions.json)."
         )
     payload = content[HEADER.size :]
     if hashlib.sha256(payload).digest() != digest:

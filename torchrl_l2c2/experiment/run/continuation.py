@@ -13,79 +13,90 @@ from torchrl_l2c2.experiment.errors import OtherRunError, SimulatorError
 from torchrl_l2c2.experiment.run.checkpoints import CheckpointError, list_checkpoints, load_newest
 from torchrl_l2c2.experiment.run.folder import versions
 from torchrl_l2c2.experiment.settings.config import ExperimentConfig
-from torchrl_l2c2.experiment.settings.identity import differing, of_length
+from torchrl_l2c2.experiment.settings.identity import changed_settings, length_dependent_settings
 from torchrl_l2c2.experiment.settings.tasks import Budget, TaskConfig
 
-# Free settings that only episodes of training read.
-OF_TRAINING = ("evaluate_every", "late_share")
+# Settings that may change, but have an effect only during training.
+TRAINING_ONLY = ("evaluate_every", "late_share")
 
 
 def check_same_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Refuses to continue a run with settings that would change its numbers.
+    """Checks that no setting that changes a run's numbers has changed.
+
+    Args:
+        saved (Mapping): Settings in the checkpoint.
+        now (Mapping): Current settings.
 
     Raises:
-        OtherRunError: names the first setting that differs, with both values.
+        OtherRunError: If a setting has changed; states the first one with both values.
     """
-    for name, (was, is_now) in differing(saved, now).items():
+    for name, (was, is_now) in changed_settings(saved, now).items():
         raise OtherRunError(
-            f"the checkpoint was made with {name.removesuffix('.name')}={was}, not {is_now}: "
-            "give the same settings, or begin in another folder (in a shell, outputs=FOLDER). "
+            f"the checkpoint was made with {name.removesuffix('.name')}={was}, not {is_now}: use "
+            "the same settings, or start in another folder (on the command line, outputs=FOLDER). "
             "Nothing was changed."
         )
 
 
 def check_same_versions(saved: Mapping[str, str], now: Mapping[str, str]) -> None:
-    """Refuses to continue a run with versions of packages that may give other numbers.
+    """Checks that the versions of packages are the same: other versions may change the numbers.
 
-    A package that is there only now or was there only then is passed over: what a run needs of it
-    fails without it.
+    Packages that were or are not installed are ignored. A run that needs them fails anyway.
+
+    Args:
+        saved (Mapping): Versions in the checkpoint.
+        now (Mapping): Installed versions.
 
     Raises:
-        OtherRunError: names all that differ, with both versions.
+        OtherRunError: If versions differ; states all of them.
     """
     differing = [f"{n} {saved[n]}, now {now[n]}" for n in now if saved.get(n, now[n]) != now[n]]
     if differing:
         raise OtherRunError(
-            f"the checkpoint was made with {'; '.join(differing)}: the numbers may "
-            "differ from a run in one go. allow_other_versions=True continues "
-            "anyway. Nothing was changed."
+            f"the checkpoint was made with {'; '.join(differing)}: the numbers may differ from an "
+            "uninterrupted run. Set allow_other_versions=True to continue anyway. Nothing was "
+            "changed."
         )
 
 
 def check_length(asked: Budget, before: Budget, played: int) -> None:
-    """Refuses a length that is shorter than the run already is.
+    """Checks that a new length of training is not below the run's current length.
 
-    A training ends with the episode, or the round of episodes, that reaches its length. The frames
-    beyond it may be asked for again.
+    The last episode or round of episodes may have exceeded the old length. The same length may be
+    requested again.
 
     Args:
-        asked (Budget): The new length of the training.
-        before (Budget): The old length of the training.
-        played (int): The part that was played, in the unit of the new length.
+        asked (Budget): New length of training.
+        before (Budget): Old length of training.
+        played (int): Number of episodes or frames so far, in the unit of the new length.
 
     Raises:
-        OtherRunError: with both numbers.
+        OtherRunError: If the new length is too short.
     """
     least = min(played, before.total) if asked.unit == before.unit else played
     if asked.total < least:
         raise OtherRunError(
-            f"{asked.unit}s={asked.total} is fewer than the {least} that this run already has: ask "
-            "for as many or more, or begin in another folder (in a shell, outputs=FOLDER). Nothing "
-            "was changed."
+            f"{asked.unit}s={asked.total} is fewer than the {least} that this run already has: "
+            "use at least as many, or start in another folder (on the command line, "
+            "outputs=FOLDER). Nothing was changed."
         )
 
 
-def tell_past(saved: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Warns about changed settings that have no effect, because the training is over.
+def warn_ignored_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Warns about changed settings that have no effect, because training is over.
+
+    Args:
+        saved (Mapping): Settings of the finished training.
+        now (Mapping): Current settings.
 
     Warns:
-        UserWarning: Names each setting that differs.
+        UserWarning: For each changed setting.
     """
-    for name in OF_TRAINING:
+    for name in TRAINING_ONLY:
         if saved[name] != now[name]:
             warnings.warn(
-                f"{name}={now[name]} changes nothing: it is of training, which is over in this "
-                f"folder, with {name}={saved[name]}. Choose another folder to train with it.",
+                f"{name}={now[name]} has no effect: training is over in this folder, with "
+                f"{name}={saved[name]}. Choose another folder to train with {name}={now[name]}.",
                 stacklevel=2,
             )
 
@@ -93,61 +104,82 @@ def tell_past(saved: Mapping[str, Any], now: Mapping[str, Any]) -> None:
 def find_checkpoint(
     folder: str | Path, config: ExperimentConfig, *, allow_other_versions: bool
 ) -> tuple[Path, dict[str, Any]] | None:
-    """Finds the newest intact checkpoint in a folder, with its path.
+    """Finds the latest intact checkpoint in a folder.
+
+    Args:
+        folder (str or Path): Run folder.
+        config (ExperimentConfig): Current settings.
+
+    Keyword Args:
+        allow_other_versions (bool): Whether versions of packages may differ, with a warning.
+
+    Returns:
+        tuple: Path and state; ``None`` if the folder has no checkpoints.
 
     Raises:
-        CheckpointError: No checkpoint can be read, or the run has ended and has none any more: a
-            new run would replace its results.
-        OtherRunError: as :func:`check_continuable`.
+        CheckpointError: If all checkpoints are damaged, or the folder has the results of a run
+            whose checkpoints were removed: a new run would replace the results.
+        OtherRunError: As :func:`check_continuable`.
 
     Warns:
-        UserWarning: a newer one is damaged; and as :func:`check_continuable`.
+        UserWarning: If a newer checkpoint is damaged, and as :func:`check_continuable`.
     """
     if (found := load_newest(folder)) is None:
         if any((Path(folder) / name).exists() for name in ("evaluation.json", "policy.pt")):
             raise CheckpointError(
-                f"{str(folder)!r} holds a run that has ended, and no checkpoint_*.pt any more to "
-                "continue from: restore one, or begin in another folder (in a shell, "
+                f"{str(folder)!r} has the results of a run, but no checkpoint_*.pt to continue "
+                "from: restore a checkpoint, or start in another folder (on the command line, "
                 "outputs=FOLDER). Nothing was changed."
             )
         return None
     path, state, damaged = found
     for message in damaged:
-        warnings.warn(f"{message} The one before it is used.", stacklevel=4)
+        warnings.warn(f"{message} The previous checkpoint is used.", stacklevel=4)
     check_continuable(state, config, allow_other_versions=allow_other_versions)
     return path, state
 
 
-def check_elsewhere(folder: str | Path | None) -> None:
-    """Refuses a folder without a checkpoint.
+def check_resume_folder(folder: str | Path | None) -> None:
+    """Checks that the folder of ``resume`` has a checkpoint.
 
     Raises:
-        CheckpointError: names the folder.
+        CheckpointError: If it has none.
     """
     if folder is not None and not list_checkpoints(folder):
         raise CheckpointError(
-            f"resume={str(folder)!r} holds no checkpoint_*.pt: name another run's folder, or leave "
-            "resume out; a run that has begun needs none."
+            f"resume={str(folder)!r} has no checkpoint_*.pt: choose the folder of another run, or "
+            "leave resume out. To continue a run in its own folder, no resume is necessary."
         )
 
 
-def find_elsewhere(
+def find_resume_checkpoint(
     folder: str | Path | None,
     own: Path | None,
     config: ExperimentConfig,
     *,
     allow_other_versions: bool,
 ) -> tuple[Path, dict[str, Any]] | None:
-    """Finds the checkpoint in another folder, unless the run has its own checkpoint.
+    """Finds the checkpoint in the folder of ``resume``, unless the run has its own checkpoint.
 
-    The same command again continues the run. The run's own folder need not exist yet, and
-    does not after a refusal.
+    The run's own checkpoint has priority, so the same command continues the run. The run's own
+    folder need not exist, and is not created.
+
+    Args:
+        folder (str or Path, optional): Folder of ``resume``.
+        own (Path, optional): The run's own folder.
+        config (ExperimentConfig): Current settings.
+
+    Keyword Args:
+        allow_other_versions (bool): Whether versions of packages may differ, with a warning.
+
+    Returns:
+        tuple: Path and state; ``None`` without ``resume`` or if the run has its own checkpoint.
 
     Raises:
-        CheckpointError: The folder has none; and as :func:`find_checkpoint`.
-        OtherRunError: as :func:`find_checkpoint`, which has the same options.
+        CheckpointError: If the folder has no checkpoint, and as :func:`find_checkpoint`.
+        OtherRunError: As :func:`check_continuable`.
     """
-    check_elsewhere(folder)
+    check_resume_folder(folder)
     if folder is None or (own is not None and list_checkpoints(own)):
         return None
     return find_checkpoint(folder, config, allow_other_versions=allow_other_versions)
@@ -156,14 +188,21 @@ def find_elsewhere(
 def check_continuable(
     state: Mapping[str, Any], config: ExperimentConfig, *, allow_other_versions: bool
 ) -> None:
-    """Refuses a checkpoint that a run with these settings and versions cannot continue from.
+    """Checks that a run with these settings and versions can continue from a checkpoint.
+
+    Args:
+        state (Mapping): State in the checkpoint.
+        config (ExperimentConfig): Current settings.
+
+    Keyword Args:
+        allow_other_versions (bool): Whether versions of packages may differ, with a warning.
 
     Raises:
-        OtherRunError: other settings, a shorter training than it is, or other versions.
+        OtherRunError: If settings or versions differ, or the new length is too short.
 
     Warns:
-        UserWarning: another length, by which the learning rate falls or a gain rises; settings of a
-            training that is over.
+        UserWarning: If a schedule depends on a changed length of training, or changed settings have
+            no effect because training is over.
     """
     saved, asked = json.loads(state["config"]), config.task.budget
     check_same_settings(saved, config.to_dict())
@@ -171,12 +210,12 @@ def check_continuable(
     played = asked.spent(len(json.loads(state["metrics"])), state["counters"][0])
     check_length(asked, before, played)
     if played >= asked.total:
-        tell_past(saved, config.to_dict())
-    for setting in of_length(config):
+        warn_ignored_settings(saved, config.to_dict())
+    for setting in length_dependent_settings(config):
         if asked != before:
             warnings.warn(
-                f"{setting} has been till now as in a training of {before.total} {before.unit}s; "
-                f"{asked.total} {asked.unit}s in one go would give other numbers.",
+                f"{setting} has followed the schedule of {before.total} {before.unit}s so far; an "
+                f"uninterrupted training of {asked.total} {asked.unit}s would give other numbers.",
                 stacklevel=5,
             )
     try:
@@ -188,8 +227,8 @@ def check_continuable(
 
 
 @contextlib.contextmanager
-def checkpoint_named(folder: Path | None) -> Iterator[None]:
-    """Adds the last checkpoint to the text of errors that end a training."""
+def add_checkpoint_to_errors(folder: Path | None) -> Iterator[None]:
+    """Adds the path of the last checkpoint to errors that end a training."""
     try:
         yield
     except FloatingPointError as error:
@@ -204,4 +243,4 @@ def checkpoint_named(folder: Path | None) -> Iterator[None]:
 
 def _last_checkpoint(folder: Path | None) -> str:
     paths = list_checkpoints(folder) if folder is not None else []
-    return f"Last good checkpoint: {paths[0] if paths else 'none was written yet'}."
+    return f"Last good checkpoint: {paths[0] if paths else 'none has been written yet'}."

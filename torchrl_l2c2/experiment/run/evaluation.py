@@ -1,4 +1,4 @@
-"""Test episodes with mean actions, and the measures of smoothness on them."""
+"""Test episodes of a policy, and the smoothness of its actions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,12 @@ from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 from tqdm import tqdm
 
 from torchrl_l2c2.experiment.collect.episodes import EpisodeCollector, play_episodes
-from torchrl_l2c2.experiment.envs.environments import TEST_SEED, make_env, simulating, time_limit
+from torchrl_l2c2.experiment.envs.environments import (
+    TEST_SEED,
+    make_env,
+    simulator_errors,
+    time_limit,
+)
 from torchrl_l2c2.experiment.envs.frames import check_finite
 from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.run.process import ProcessState
@@ -35,7 +40,7 @@ from torchrl_l2c2.metrics import (
     spectral_smoothness,
 )
 
-# Further measures of smoothness, of the actions [T, A] of an episode.
+# Additional measures of the smoothness of actions [T, A].
 ACTION_MEASURES: dict[str, Callable[[Tensor], Tensor]] = {
     "action_rate": action_rate,
     "action_fluctuation_ratio": action_fluctuation_ratio,
@@ -45,25 +50,25 @@ ACTION_MEASURES: dict[str, Callable[[Tensor], Tensor]] = {
     "sm_asap": partial(spectral_smoothness, form="asap"),
     "previous_action_gain": previous_action_gain,
 }
-# Columns of metrics.csv with the test episode of a late policy.
-TESTED = ("test_return", "test_action_variation")
-LEAST_STEPS = 4  # shortest episode that all of these measures accept
-NOISE = 0.01  # standard deviation for noise_sensitivity, as in the paper's tasks
+# Columns of metrics.csv for the test episodes of LateTests.
+TEST_COLUMNS = ("test_return", "test_action_variation")
+LEAST_STEPS = 4  # Minimum length of an episode for all these measures.
+NOISE = 0.01  # Standard deviation for noise_sensitivity, as in the paper's tasks.
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Results of test episodes; one entry per episode in every list.
+    """Results of test episodes. All lists have one entry per episode.
 
     Attributes:
-        returns: sums of rewards. Larger is better.
-        action_variations: mean L2 norm of the change of the mean action from step to step, the
-            paper's "L2 norm of temporal actions". Smaller is smoother.
-        lengths: steps of the episodes.
-        measures: other measures of the mean action's smoothness (``torchrl_l2c2.metrics``), with
-            ``saturation`` where actions have bounds and ``noise_sensitivity``, to noise of 0.01,
-            where they are numbers. An episode with sampled actions also has the measures of the
-            samples, as ``sampled_...``. NaN where an episode is too short.
+        returns: Sums of rewards. Larger is better.
+        action_variations: Mean L2 norm of the change of the mean action per step, the paper's "L2
+            norm of temporal actions". Smaller is smoother.
+        lengths: Numbers of steps.
+        measures: Other measures of the mean actions (``torchrl_l2c2.metrics``) by name, including
+            ``saturation`` for bounded actions and ``noise_sensitivity`` (noise of 0.01) for
+            continuous actions. With sampled actions, ``sampled_*`` are the measures of the samples.
+            NaN if an episode is too short.
     """
 
     returns: list[float]
@@ -72,7 +77,7 @@ class Evaluation:
     measures: dict[str, list[float]] = field(default_factory=dict)
 
     def summary(self) -> dict[str, float | int]:
-        """Means and standard deviations over the episodes."""
+        """Returns means and standard deviations over the episodes."""
         return {
             "episodes": len(self.returns),
             "return_mean": statistics.fmean(self.returns),
@@ -83,7 +88,7 @@ class Evaluation:
         }
 
     def to_dict(self) -> dict[str, Any]:
-        """As ``evaluation.json`` has it."""
+        """Returns the summary and all episodes, as in ``evaluation.json``."""
         return {"summary": self.summary(), "episodes": asdict(self)}
 
 
@@ -97,24 +102,30 @@ def evaluate_policy(
     compile_policy: bool = False,
     progress: bool = False,
 ) -> Evaluation:
-    """Plays episodes with the policy's mean action, or with samples.
+    """Plays test episodes and measures returns and the smoothness of actions.
 
     Args:
-        policy (TensorDictModule): acts deterministically under ``ExplorationType.DETERMINISTIC``,
-            for one observation and for a batch of them.
-        env (EnvBase): one Gymnasium environment, as :class:`EpisodeCollector` takes it.
-        episodes (int): how many, at least 1. More give a surer mean.
-        max_steps (int): longest episode. Default 1000.
-        sampled (bool): whether the policy samples actions, as in training. The action variation is
-            still measured on the mean actions, at the visited states. Default ``False``.
-        compile_policy (bool): whether to compile the policy. Default ``False``.
-        progress (bool): whether to show a progress bar.
+        policy (TensorDictModule): Policy that is deterministic under
+            ``ExplorationType.DETERMINISTIC``, for single observations and for batches.
+        env (EnvBase): One Gymnasium environment, as for :class:`EpisodeCollector`.
+        episodes (int): Number of episodes, at least 1. More episodes give a more precise mean.
+
+    Keyword Args:
+        max_steps (int): Maximum steps per episode. Default 1000.
+        sampled (bool): Whether the policy samples actions, as in training. The action variation is
+            still measured on the mean actions at the visited states. Default ``False``: mean
+            actions.
+        compile_policy (bool): Whether to compile the policy. Default ``False``.
+        progress (bool): Whether to show a progress bar. Default ``False``.
+
+    Returns:
+        Evaluation: Results of all episodes.
 
     Raises:
-        FloatingPointError: NaN or infinity in what the environment or the policy gave; names the
+        FloatingPointError: If the environment or the policy returns NaN or infinity; states the
             key and the frame.
-        SimulatorError: the environment or the policy raised an error; names the episode.
-        ValueError: fewer than one episode.
+        SimulatorError: If the environment or the policy raises an error; states the episode.
+        ValueError: If ``episodes`` is below 1.
 
     Examples:
         >>> from torchrl.envs import GymEnv
@@ -150,8 +161,8 @@ def evaluate_policy(
         actions = mean_actions(policy, episode) if sampled else episode["action"]
         returns.append(_return(episode))
         variations.append(_variation(actions))
-        taken = getattr(policy, "taken", lambda samples: samples)(episode["action"])
-        played = {"": actions, "sampled_": taken} if sampled else {"": actions}
+        clipped = getattr(policy, "clip_action", lambda samples: samples)(episode["action"])
+        played = {"": actions, "sampled_": clipped} if sampled else {"": actions}
         for prefix, kind in played.items():
             for name, value in measure(kind, env.action_spec).items():
                 measures.setdefault(prefix + name, []).append(value)
@@ -171,11 +182,24 @@ def evaluate_task(
     threads: int,
     **options: bool,
 ) -> Evaluation:
-    """As :func:`evaluate_policy`, which has the options, in an environment of its own.
+    """Evaluates a policy in a new environment of a task.
 
-    The process's random generators and number of threads are left as they are found.
+    The process's random generators and number of threads are restored afterwards.
+
+    Args:
+        policy (TensorDictModule): Policy, as for :func:`evaluate_policy`.
+        task (TaskConfig): Settings of the task. Its action-rate penalty is ignored.
+        seed (int): Seed of the environment and the policy's samples.
+        episodes (int): Number of episodes.
+
+    Keyword Args:
+        threads (int): Number of PyTorch threads.
+        **options: Other options of :func:`evaluate_policy`.
+
+    Returns:
+        Evaluation: Results of all episodes.
     """
-    with ProcessState(seed, threads):  # Seeding an environment seeds the process, too.
+    with ProcessState(seed, threads):  # Seeding an environment also seeds the process.
         env = make_env(task.for_test(), seed)
         result = evaluate_policy(policy, env, episodes, max_steps=time_limit(task), **options)
         env.close()
@@ -186,14 +210,14 @@ def _return(episode: TensorDictBase) -> float:
     total: float = episode["next", "reward"].sum().item()
     if not math.isfinite(total):
         raise FloatingPointError(
-            f"the return of a test episode is {total}, a sum of {len(episode)} finite rewards: "
-            "have the task give smaller ones."
+            f"the return of a test episode is {total}, the sum of {len(episode)} finite rewards: "
+            "scale the task's rewards down."
         )
     return total
 
 
 def measure(actions: Tensor, spec: TensorSpec) -> dict[str, float]:
-    """The field's measures of an episode's actions ``[T, A]``; NaN where it is too short."""
+    """Returns the measures of actions ``[T, A]`` by name; NaN if the episode is too short."""
     actions = actions.float()
     long_enough = len(actions) >= LEAST_STEPS
     found = {
@@ -207,14 +231,14 @@ def measure(actions: Tensor, spec: TensorSpec) -> dict[str, float]:
 
 @torch.no_grad()
 def mean_actions(policy: TensorDictModule, episode: TensorDictBase) -> Tensor:
-    """The policy's mean actions ``[T, A]`` at the states of an episode."""
+    """Returns the policy's mean actions ``[T, A]`` at the states of an episode."""
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         actions: Tensor = policy(episode.select("observation"))["action"]
     return actions
 
 
 def _sensitivity(policy: TensorDictModule, episode: TensorDictBase) -> float:
-    """To noise that is the same at every call."""
+    """Returns the sensitivity to noise, with the same noise at every call."""
 
     def act(observation: Tensor) -> Tensor:
         return mean_actions(policy, TensorDict({"observation": observation}, observation.shape[:1]))
@@ -224,16 +248,17 @@ def _sensitivity(policy: TensorDictModule, episode: TensorDictBase) -> float:
 
 
 class LateTests:
-    """Plays one test episode with every policy late in training.
+    """Test episodes during the last part of training, one per policy.
 
-    The mean over these policies varies less than tests of only the last policy. An episode is
-    seeded by its number, and does not depend on other episodes.
+    Their mean varies less than the mean of a test of only the last policy. An episode depends on
+    its number, not on earlier episodes.
 
     Args:
-        task (TaskConfig): The task.
-        seed (int): The run's seed.
-        policy (TensorDictModule): acts deterministically under ``ExplorationType.DETERMINISTIC``.
-        compile_policy (bool): whether to compile it.
+        task (TaskConfig): Settings of the task.
+        seed (int): Random seed of the run.
+        policy (TensorDictModule): Policy that is deterministic under
+            ``ExplorationType.DETERMINISTIC``.
+        compile_policy (bool): Whether to compile the policy.
     """
 
     def __init__(
@@ -244,26 +269,29 @@ class LateTests:
         self._collector: EpisodeCollector | None = None
 
     def play(self, number: int) -> dict[str, float]:
-        """The figures of the test episode that belongs to a training episode's number.
+        """Plays the test episode after a training episode and returns its metrics.
+
+        Args:
+            number (int): Number of the training episode.
 
         Raises:
-            FloatingPointError: as in :func:`evaluate_policy`.
-            SimulatorError: as in :func:`evaluate_policy`.
+            FloatingPointError: As :func:`evaluate_policy`.
+            SimulatorError: As :func:`evaluate_policy`.
         """
         with ProcessState(self._seed, torch.get_num_threads()):
-            # Late, as most calls of a short training need none.
+            # Created here: many short trainings play no test episode.
             if self._collector is None:
                 self._collector = self._make_collector()
             self._collector.set_seed(self._seed + number)
-            with simulating(f"{self._task.env_id} failed in the test after episode {number}"):
+            with simulator_errors(f"{self._task.env_id} failed in the test after episode {number}"):
                 episode = self._collector.rollout()
         check_finite(episode, 0, test=True)
-        figures = _return(episode), _variation(episode["action"])
-        return dict(zip(TESTED, figures, strict=True))
+        values = _return(episode), _variation(episode["action"])
+        return dict(zip(TEST_COLUMNS, values, strict=True))
 
     def none(self) -> dict[str, float]:
-        """The same entries where no episode is played."""
-        return dict.fromkeys(TESTED, math.nan)
+        """Returns the same metrics as NaN, for episodes without a test."""
+        return dict.fromkeys(TEST_COLUMNS, math.nan)
 
     def close(self) -> None:
         """Closes the environment."""
@@ -281,5 +309,5 @@ class LateTests:
 
 
 def _variation(actions: Tensor) -> float:
-    """Zero for an episode of a single step, which has no change of action."""
+    """Returns the action variation; 0 for an episode of one step."""
     return action_variation(actions.float()).item() if actions.shape[-2] > 1 else 0.0

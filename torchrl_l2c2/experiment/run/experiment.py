@@ -1,4 +1,4 @@
-"""One run of the experiment: it is assembled, trained, saved, tested."""
+"""A run of the experiment: training, checkpoints and tests."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from torchrl_l2c2.experiment.agents.optimizers import anneal
 from torchrl_l2c2.experiment.collect.player import Episode, Player, make_collector
 from torchrl_l2c2.experiment.envs.environments import TEST_SEED, make_env
 from torchrl_l2c2.experiment.learn.compilation import compiler_available
-from torchrl_l2c2.experiment.learn.learner import Learner, untrained
+from torchrl_l2c2.experiment.learn.learner import Learner, untrained_reason
 from torchrl_l2c2.experiment.learn.replay import make_replay
 from torchrl_l2c2.experiment.run.best_policy import BestPolicy
 from torchrl_l2c2.experiment.run.checkpoints import save_checkpoint
 from torchrl_l2c2.experiment.run.continuation import (
+    add_checkpoint_to_errors,
     check_length,
     check_same_settings,
-    checkpoint_named,
     find_checkpoint,
-    find_elsewhere,
+    find_resume_checkpoint,
 )
 from torchrl_l2c2.experiment.run.evaluation import Evaluation, LateTests, evaluate_task
 from torchrl_l2c2.experiment.run.files import make_folder
 from torchrl_l2c2.experiment.run.finished import FinishedRun, write_evaluation
-from torchrl_l2c2.experiment.run.folder import begin_folder, bring_files, versions
+from torchrl_l2c2.experiment.run.folder import copy_training_files, prepare_folder, versions
 from torchrl_l2c2.experiment.run.gain_schedule import GainControl
 from torchrl_l2c2.experiment.run.lock import lock_folder
 from torchrl_l2c2.experiment.run.metrics_log import MetricsLog, check_installed
 from torchrl_l2c2.experiment.run.policies import save_policy
 from torchrl_l2c2.experiment.run.process import ProcessState
-from torchrl_l2c2.experiment.run.progress import Progress, say
+from torchrl_l2c2.experiment.run.progress import Progress, show_and_log
 from torchrl_l2c2.experiment.run.schedules import SCHEDULES
 from torchrl_l2c2.experiment.run.signals import Interrupted, stop_on_signals
 from torchrl_l2c2.experiment.settings.config import ExperimentConfig
@@ -43,33 +43,35 @@ from torchrl_l2c2.experiment.settings.tasks import Budget
 
 
 class Experiment:
-    """One run of the paper's experiment.
+    """A run of the paper's experiment.
 
-    The process's random generators and its number of threads are left as they are found: a run has
-    its own while it trains and tests.
+    Training and tests use their own random generators and number of threads. The state of the
+    process is restored afterwards.
 
     Args:
-        config (ExperimentConfig): every setting. Default: the paper's L2C2 on Swingup.
-        folder (str or Path, optional): where results are written; ``None`` writes nothing. Where
-            it holds a checkpoint of the same run, the run continues from it.
+        config (ExperimentConfig, optional): Settings of the run. Default: the paper's L2C2 on
+            Swingup.
+        folder (str or Path, optional): Run folder. If it has a checkpoint of the same run, the run
+            continues from it. Default: nothing is written.
 
     Keyword Args:
-        resume (str or Path, optional): another run's folder to continue from, in ``folder``.
-        allow_other_versions (bool): whether to continue, with a warning, a run of other versions of
-            PyTorch, TorchRL or a simulator; the numbers may then differ from a run in one go.
+        resume (str or Path, optional): Folder of another run to continue from; results are written
+            to ``folder``.
+        allow_other_versions (bool): Whether to continue runs of other versions of PyTorch, TorchRL
+            or a simulator, with a warning. The numbers may then differ from an uninterrupted run.
             Default ``False``.
 
     Attributes:
-        agent: The agent that learns.
-        player: plays episodes, and counts frames.
-        learner: remembers transitions and updates the agent, and counts updates.
-        metrics: a dictionary of metrics per episode.
+        agent: Agent that is trained.
+        player: Player of the episodes, which counts frames.
+        learner: Learner, which stores transitions, updates the agent and counts updates.
+        metrics: List with a dictionary of metrics per episode.
 
     Raises:
-        ValueError: a setting that cannot be, or that differs from the checkpoint's.
-        CheckpointError: there are checkpoints, but none can be read.
-        OSError: a folder that cannot be written to.
-        FolderInUseError: another process writes the folder.
+        ValueError: If a setting is invalid or differs from the checkpoint.
+        CheckpointError: If all checkpoints are damaged.
+        OSError: If the folder cannot be written to.
+        FolderInUseError: If another process uses the folder.
 
     Examples:
         >>> from torchrl_l2c2.experiment import Experiment, ExperimentConfig, TaskConfig
@@ -93,7 +95,7 @@ class Experiment:
         self.config = config = config or ExperimentConfig()
         self.folder = None if folder is None else Path(folder)
         check_installed(config.logger.name)
-        self._log, self._unlock = MetricsLog(None), lambda: None  # till the folder is there
+        self._log, self._unlock = MetricsLog(None), lambda: None  # Until the folder exists.
         self._compile = config.compile and compiler_available()
         self._process = ProcessState(config.seed, config.threads)
         with self._process:
@@ -113,7 +115,7 @@ class Experiment:
         try:
             self._best_policy = BestPolicy(config, self.agent.policy, self.folder)
             self._gain = GainControl(config, self.learner)
-            self._begin(resume, allow_other_versions)
+            self._start(resume, allow_other_versions)
         except BaseException:
             self.close()
             raise
@@ -121,35 +123,40 @@ class Experiment:
     def train(
         self, episodes: int | None = None, *, progress: bool | str = False
     ) -> list[dict[str, float]]:
-        """Trains from where it left off, or where a checkpoint did.
+        """Trains, or continues the training.
 
-        SIGTERM and SIGINT end the training after the episode, or rollout, that is being played,
-        with a checkpoint; a second one ends it at once.
+        SIGTERM and SIGINT end the training with a checkpoint after the current episode or rollout.
+        A second signal ends it at once.
 
         Args:
-            episodes (int, optional): Length of the whole training, also written to
+            episodes (int, optional): Total length of training in episodes, also written to
                 ``config.json``. Default: the task's episodes or frames.
-            progress (bool or str): whether to show a progress bar; a text goes before it.
+
+        Keyword Args:
+            progress (bool or str): Whether to show a progress bar; a text is shown before it.
+                Default ``False``.
 
         Returns:
-            list: a dictionary of metrics per episode.
+            list: A dictionary of metrics per episode.
 
         Raises:
-            FloatingPointError: NaN or infinity in what the environment or the policy gave, in a
-                loss or in a parameter; names the key and the step, and the last good checkpoint.
-            SimulatorError: the environment failed; names the frame and the last good checkpoint.
-            OSError: the disk is full, for example; names the file and the last good checkpoint.
-            OtherRunError: fewer episodes than there are, or another Experiment wrote here.
-            Interrupted: a signal ended the training.
+            FloatingPointError: If the environment, the policy, a loss or a parameter has NaN or
+                infinity; states where, and the last good checkpoint.
+            SimulatorError: If the environment fails; states the frame and the last good checkpoint.
+            OSError: If a file cannot be written, for example on a full disk; states the file and
+                the last good checkpoint.
+            OtherRunError: If the run already has more episodes, or another Experiment has written
+                to the folder.
+            Interrupted: If a signal ended the training.
 
         Warns:
-            UserWarning: no update was made, or every action was random: there is no trained policy;
-                or a regularizer's terms are too small to matter.
+            UserWarning: If no update was made or all actions were random, or the regularizer's
+                gradients are too small for any effect.
         """
         task = self.config.task if episodes is None else self.config.task.for_episodes(episodes)
         full, budget = self.config.task.budget, task.budget
         check_length(budget, full, self._spent(budget))
-        full = full.at_least(budget)  # A part of it is trained now.
+        full = full.at_least(budget)  # This call may train only a part of it.
         algorithm, saved = self.config.algorithm, time.monotonic()
         schedule = SCHEDULES[algorithm.schedule](self.player, self.learner, algorithm)
         bar = Progress(
@@ -165,9 +172,14 @@ class Experiment:
         if self.folder is not None:
             settings = replace(self.config, task=task).to_dict()
             self._log.check_unchanged()
-            begin_folder(self.folder, settings, begun=True, ended=ended)
-        with self._process, bar, stop_on_signals() as signals, checkpoint_named(self.folder):
-            # A longer training begins at another rate than the shorter one ended with.
+            prepare_folder(self.folder, settings, resumed=True, ended=ended)
+        with (
+            self._process,
+            bar,
+            stop_on_signals() as signals,
+            add_checkpoint_to_errors(self.folder),
+        ):
+            # If the length has changed, the learning rate differs from its last value.
             anneal(self.config.optimizer, self.agent.optimizer, self._spent(full) / full.total)
             while not ended:
                 episode = next(schedule)
@@ -191,7 +203,11 @@ class Experiment:
         return self.metrics
 
     def save(self) -> Path | None:
-        """Writes a checkpoint of everything that the rest of the run depends on."""
+        """Writes a checkpoint of :meth:`state_dict`.
+
+        Returns:
+            Path: Path of the checkpoint; ``None`` without a folder.
+        """
         if self.folder is None:
             return None
         self.learner.check_parameters()
@@ -199,7 +215,7 @@ class Experiment:
         return save_checkpoint(self.folder, len(self.metrics), self.state_dict(), keep)
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that the rest of the run depends on, between two episodes or rollouts."""
+        """Returns the complete state of the run between two episodes or rollouts."""
         return {
             "config": json.dumps(self.config.to_dict()),
             "versions": json.dumps(versions()),
@@ -213,10 +229,10 @@ class Experiment:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores what :meth:`state_dict` gave.
+        """Restores a state of :meth:`state_dict`.
 
         Raises:
-            OtherRunError: the state is of a run with other settings.
+            OtherRunError: If the state belongs to a run with other settings.
         """
         learner = self.learner
         check_same_settings(json.loads(state["config"]), self.config.to_dict())
@@ -227,22 +243,25 @@ class Experiment:
         self.player.frames, learner.updates, learner.skipped_updates = state["counters"]
         learner.unreported = list(state["unreported"])
         self.metrics = json.loads(state["metrics"])
-        # Some of the tensors that a compiled update was made for are others now.
-        learner.renew()
+        # Loading replaced some tensors of the compiled update.
+        learner.rebuild_update()
         self._process.load_state_dict(state["global_rng"])
 
     def test(
         self, episodes: int | None = None, *, sampled: bool = False, progress: bool = False
     ) -> Evaluation:
-        """Plays test episodes with the policy's mean, with environment and seed of their own.
+        """Plays test episodes in a new environment with its own seed.
 
         Args:
-            episodes (int, optional): how many. Default: the settings' ``test_episodes``.
-            sampled (bool): whether the policy acts as in training instead. Default ``False``.
-            progress (bool): whether to show a progress bar.
+            episodes (int, optional): Number of episodes. Default: the settings' ``test_episodes``.
+
+        Keyword Args:
+            sampled (bool): Whether to sample actions, as in training. Default ``False``: mean
+                actions.
+            progress (bool): Whether to show a progress bar. Default ``False``.
 
         Returns:
-            Evaluation: give it to :meth:`finish` to have it written.
+            Evaluation: Results of all episodes, which :meth:`finish` writes.
         """
         return evaluate_task(
             self.agent.policy,
@@ -256,20 +275,22 @@ class Experiment:
         )
 
     def finish(self, result: Evaluation, sampled: Evaluation | None = None) -> FinishedRun:
-        """Writes the policy and the test episodes, which mark the run as finished.
+        """Writes the policy and the test results, and marks the run as finished.
 
         Args:
             result (Evaluation): Result of :meth:`test`.
-            sampled (Evaluation, optional): Result of :meth:`test` with samples.
+            sampled (Evaluation, optional): Result of :meth:`test` with ``sampled=True``.
 
         Returns:
-            FinishedRun: the folder, read back.
+            FinishedRun: The finished run, read from the folder.
 
         Raises:
-            ValueError: the experiment was made without a folder.
+            ValueError: If the experiment has no folder.
         """
         if self.folder is None:
-            raise ValueError("this experiment has no folder to write to; give it one when made.")
+            raise ValueError(
+                "this experiment has no folder: create it with Experiment(..., folder)."
+            )
         save_policy(self.agent.policy, self.folder / "policy.pt")
         tests = {"mean": result, "sampled": sampled}
         written = {name: test.to_dict() for name, test in tests.items() if test is not None}
@@ -285,28 +306,30 @@ class Experiment:
         self._log.close()
         self._unlock()
 
-    def _begin(self, elsewhere: str | Path | None, allow_other_versions: bool) -> None:
+    def _start(self, elsewhere: str | Path | None, allow_other_versions: bool) -> None:
         options = {"allow_other_versions": allow_other_versions}
-        found = find_elsewhere(elsewhere, self.folder, self.config, **options)
+        found = find_resume_checkpoint(elsewhere, self.folder, self.config, **options)
         if self.folder is not None:
-            # Only now, as what was refused above leaves no folder.
+            # After the checks: refused settings do not create a folder.
             self._unlock = lock_folder(make_folder(self.folder), self)
             found = find_checkpoint(self.folder, self.config, **options) or found
         self._log = MetricsLog(self.folder, logger=self.config.logger.name)
         if found is not None:
-            self._go_on(*found)
+            self._continue_from(*found)
         if self.folder is not None:
             ended = self._ended(self.config.task.budget)
-            begin_folder(self.folder, self.config.to_dict(), begun=found is not None, ended=ended)
+            prepare_folder(
+                self.folder, self.config.to_dict(), resumed=found is not None, ended=ended
+            )
 
-    def _go_on(self, path: Path, state: dict[str, Any]) -> None:
+    def _continue_from(self, path: Path, state: dict[str, Any]) -> None:
         if self.folder is not None and path.parent != self.folder:
-            bring_files(path.parent, self.folder)
+            copy_training_files(path.parent, self.folder)
         self.load_state_dict(state)
-        say(self.folder, f"continuing after episode {len(self.metrics)} from {path}")
+        show_and_log(self.folder, f"continuing after episode {len(self.metrics)} from {path}")
 
     def _parts(self) -> dict[str, Any]:
-        """Objects with a state, by their names in checkpoints."""
+        """Returns the objects with a state by their names in checkpoints."""
         named = ("loss", "optimizer", "target_updater", "exploration", "normalization")
         parts = {name: getattr(self.agent, name) for name in named}
         parts |= {"best_policy": self._best_policy, "gain": self._gain, "metrics_log": self._log}
@@ -314,18 +337,19 @@ class Experiment:
 
     def _untrained(self) -> str | None:
         random_frames = self.config.algorithm.random_frames
-        return untrained(self.player.frames, self.learner.updates, random_frames)
+        return untrained_reason(self.player.frames, self.learner.updates, random_frames)
 
     def _spent(self, budget: Budget) -> int:
         return budget.spent(len(self.metrics), self.player.frames)
 
     def _ended(self, budget: Budget) -> bool:
-        # Rollouts may have used up the frames before an episode ended, which results are of.
+        # Results need an episode, but rollouts may use up all frames before the first one ends.
         least = bool(self.metrics) or budget.unit == "episode"
         return least and self._spent(budget) >= budget.total
 
     def _record(self, episode: Episode, full: Budget, bar: Progress) -> None:
-        report = self.learner.report(episode.last_frame)  # Before tests, which blame the task.
+        # Before the test, which would attribute NaN in the policy to the task.
+        report = self.learner.report(episode.last_frame)
         number = len(self.metrics) + 1
         late = full.is_late(full.spent(number, episode.last_frame), self.config.late_share)
         row = {

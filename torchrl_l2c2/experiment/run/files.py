@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all, and read back with errors that name them."""
+"""Functions that write files atomically, and read them with errors that state the file."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from typing import Any
 
 from torchrl_l2c2.experiment.errors import UserError
 
-REMEDY = "it was changed or cut since it was written; restore it."
-ANEW = " Or delete it: the command that made the run tests its policy again."
+REMEDY = "it was changed or truncated after it was written; restore it."
+RETEST_HINT = " Or delete it: the run's command then tests the policy again."
 
 
 def make_folder(path: str | Path) -> Path:
-    """Makes a folder that can be written to.
+    """Creates a folder and checks that it is writable.
 
     Raises:
-        OSError: where it cannot be made or written to; says which and what to do.
+        OSError: If the folder cannot be created or is not writable.
     """
     folder = Path(path)
     try:
@@ -38,22 +38,22 @@ def make_folder(path: str | Path) -> Path:
     return folder
 
 
-def make_folder_of(path: str | Path) -> None:
-    """Makes the folder of a file, before there is anything that could be lost with it.
+def make_parent_folder(path: str | Path) -> None:
+    """Creates the folder of an output file. Call it before a long computation of its content.
 
     Raises:
-        OSError: As :func:`make_folder`, or the path is a folder.
+        OSError: If the path is a folder, and as :func:`make_folder`.
     """
     if Path(path).is_dir():
-        raise OSError(f"{str(path)!r} is a folder; name a file.")
+        raise OSError(f"expected a file, got the folder {str(path)!r}.")
     make_folder(Path(path).parent)
 
 
 def write_atomically(path: str | Path, content: bytes) -> None:
-    """Writes a file in one step: a temporary file, flushed to the disk, then renamed.
+    """Writes a file atomically, by renaming a temporary file that was flushed to the disk.
 
     Raises:
-        OSError: Names the file; the old file is unchanged.
+        OSError: If the file cannot be written. The old file is then unchanged.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.partial")
@@ -69,12 +69,12 @@ def write_atomically(path: str | Path, content: bytes) -> None:
 
 
 def append_line(path: Path, line: str) -> None:
-    """Adds a line to a file; a killed process leaves no half of it.
+    """Appends a line to a file, as a whole even if the process is killed.
 
     Raises:
-        OSError: names the file.
+        OSError: If the line cannot be written.
     """
-    # Unbuffered: one call of the system writes the whole line.
+    # Unbuffered: one system call writes the whole line.
     with _named(path), open(path, "ab", buffering=0) as file:
         content, before = line.encode(), file.tell()
         if file.write(content) != len(content):
@@ -84,17 +84,17 @@ def append_line(path: Path, line: str) -> None:
 
 @contextlib.contextmanager
 def _named(path: Path) -> Iterator[None]:
-    """A full disk says no name by itself."""
+    """Adds the file's name to errors: a full disk raises one without a name."""
     try:
         yield
     except OSError as error:
         raise OSError(
-            error.errno, f"{error.strerror or error}: this could not be written", str(path)
+            error.errno, f"{error.strerror or error}: the file could not be written", str(path)
         ) from error
 
 
 def write_json(path: str | Path, value: Any) -> None:
-    """Writes a value as indented JSON in one step; NaN and infinity become ``null``."""
+    """Writes a value atomically as indented JSON; NaN and infinity become ``null``."""
     write_atomically(path, (to_json(value) + "\n").encode())
 
 
@@ -104,7 +104,7 @@ def to_json(value: Any) -> str:
 
 
 def _strict(value: Any) -> Any:
-    """Replaces NaN and infinity, which JSON does not know, by ``None``."""
+    """Replaces NaN and infinity, which JSON does not support, by ``None``."""
     if isinstance(value, Mapping):
         return {key: _strict(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
@@ -114,10 +114,10 @@ def _strict(value: Any) -> Any:
 
 @contextlib.contextmanager
 def read_back(run: str | Path) -> Iterator[None]:
-    """Turns errors in reading a run's files into an error that names the folder.
+    """Converts errors about the content of a run's files to an error that states the folder.
 
     Raises:
-        ValueError: names the folder, instead of the original error.
+        ValueError: If the block raises an error because of damaged content.
     """
     try:
         yield
@@ -129,28 +129,28 @@ def read_back(run: str | Path) -> Iterator[None]:
 
 
 def read_json(path: str | Path) -> dict[str, Any]:
-    """Reads a JSON object.
+    """Reads a JSON object from a file.
 
     Raises:
-        ValueError: names the file, which is no JSON or no object.
+        ValueError: If the file has no JSON object.
     """
     try:
         value = json.loads(_read_text(path))
     except json.JSONDecodeError as error:
-        again = ANEW if Path(path).name == "evaluation.json" else ""
-        raise UserError(f"{path} is no JSON ({error}): {REMEDY}{again}") from None
+        again = RETEST_HINT if Path(path).name == "evaluation.json" else ""
+        raise UserError(f"{path} is not valid JSON ({error}): {REMEDY}{again}") from None
     except RecursionError:
-        raise UserError(f"{path} has brackets within brackets without end: {REMEDY}") from None
+        raise UserError(f"{path} has too many nested brackets: {REMEDY}") from None
     if not isinstance(value, dict):
-        raise UserError(f"{path} must hold an object, {{...}}, got {value!r:.40}: {REMEDY}")
+        raise UserError(f"{path} must contain an object, {{...}}, got {value!r:.40}: {REMEDY}")
     return value
 
 
 def read_rows(path: str | Path) -> tuple[list[str], list[dict[str, str]]]:
-    """Reads the header of a CSV file, and its lines by the names in it.
+    """Reads a CSV file: its header, and its rows as dictionaries.
 
     Raises:
-        ValueError: names the file, and the line that has fewer or more cells than the header.
+        ValueError: If a line has another number of cells than the header, or cannot be parsed.
     """
     lines = csv.reader(io.StringIO(_read_text(path)))
     rows = []
@@ -158,8 +158,8 @@ def read_rows(path: str | Path) -> tuple[list[str], list[dict[str, str]]]:
         header = next(lines, [])
         for cells in filter(None, lines):
             if len(cells) != len(header):
-                many = f"{len(cells)} cells, where the header has {len(header)}"
-                raise UserError(f"{path}, line {lines.line_num}: {many}: {REMEDY}")
+                counts = f"{len(cells)} cells, but the header has {len(header)}"
+                raise UserError(f"{path}, line {lines.line_num}: {counts}: {REMEDY}")
             rows.append(dict(zip(header, cells, strict=True)))
     except csv.Error as error:
         raise UserError(f"{path}, line {lines.line_num}: {error}: {REMEDY}") from None
@@ -170,14 +170,14 @@ def read_config(run: str | Path) -> dict[str, Any]:
     """Reads a run's ``config.json``.
 
     Raises:
-        ValueError: As :func:`read_json`, or the file lacks the task, algorithm or regularizer.
+        ValueError: If the task, algorithm or regularizer is missing, and as :func:`read_json`.
     """
     path = Path(run) / "config.json"
     config = read_json(path)
     for group in ("task", "algorithm", "regularizer"):
         chosen = config.get(group)
         if not isinstance(chosen, dict) or "name" not in chosen:
-            raise UserError(f"{path} does not name its {group}: {REMEDY}")
+            raise UserError(f"{path} has no {group}.name: {REMEDY}")
     return config
 
 
@@ -185,20 +185,20 @@ def read_evaluation(run: str | Path) -> dict[str, Any]:
     """Reads a run's ``evaluation.json``.
 
     Raises:
-        ValueError: as :func:`read_json`; or its tests have other than numbers in their summaries.
+        ValueError: If a summary has other values than numbers, and as :func:`read_json`.
     """
     path = Path(run) / "evaluation.json"
     evaluation = read_json(path)
     for test in (evaluation, evaluation.get("sampled") or {}):
         summary = test.get("summary", {}) if isinstance(test, dict) else None
-        # Values that could not be measured are null.
+        # Unknown values are null.
         numbers = isinstance(summary, dict) and all(
             value is None or isinstance(value, int | float) for value in summary.values()
         )
         if not numbers:
-            raise UserError(f"{path} has no numbers where it must, but {test!r:.40}: {REMEDY}")
+            raise UserError(f"{path} must contain numbers, got {test!r:.40}: {REMEDY}")
     if not isinstance(evaluation.get("training", {}), dict):
-        raise UserError(f"{path} must say of training what is known: {REMEDY}")
+        raise UserError(f"{path} must contain an object 'training': {REMEDY}")
     return evaluation
 
 
@@ -206,8 +206,6 @@ def _read_text(path: str | Path) -> str:
     try:
         return Path(path).read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise FileNotFoundError(
-            f"{path} is not there, which a run's folder has: restore it."
-        ) from None
+        raise FileNotFoundError(f"{path} is missing from the run's folder: restore it.") from None
     except UnicodeDecodeError as error:
-        raise UserError(f"{path} is no text in UTF-8 ({error.reason}): {REMEDY}") from None
+        raise UserError(f"{path} is not valid UTF-8 ({error.reason}): {REMEDY}") from None

@@ -1,4 +1,4 @@
-"""A finished run: its folder, read back, and a record of it in one line."""
+"""Finished runs, read from their folders, and their one-line records."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from torchrl_l2c2.experiment.run.files import (
 from torchrl_l2c2.experiment.settings.config import ExperimentConfig
 from torchrl_l2c2.experiment.settings.identity import (
     BUDGETS,
-    by_name,
+    changed_settings,
     differences,
-    differing,
     fingerprint,
+    flatten_settings,
     read_differences,
     write_differences,
 )
 
-# Which policies act: the last one in its test episodes, or each one late in training in an episode.
-# And how: with mean actions, as a trained policy is used, or with sampled ones, as in training.
+# The last policy in its test episodes, or the policies of the last part of training with an episode
+# each ("late"); with mean actions, or with sampled actions as in training.
 TESTS = {
     "last_mean": "last policy, mean actions",
     "late_mean": "late policies, mean actions",
@@ -40,27 +40,28 @@ TESTS = {
     "late_sampled": "late policies, sampled actions",
 }
 QUANTITIES = {"return": "return", "action_variation": "action variation"}
-LATE = 0.1  # of training, if late_share is 0
+LATE = 0.1  # Share of training for the late policies if late_share is 0.
 
 
 @dataclass(frozen=True)
 class Record:
-    """One line about a finished run; an unknown number is NaN, in the file an empty cell.
+    """Results of a finished run, one line of a CSV file. Unknown numbers are NaN or empty cells.
 
     Attributes:
-        method: the regularizer's name.
-        length: how long it was trained, such as ``"400 episodes"``.
-        settings: :func:`~.differences.fingerprint` of the others.
-        differences: what differs from the defaults, such as ``"algorithm.replay_ratio=10"``.
-        late_mean_return: mean over the late policies (see ``late_share``) of a test episode with
+        method: Name of the regularizer.
+        length: Length of training, such as ``"400 episodes"``.
+        settings: Hash of the other settings, :func:`~..settings.identity.fingerprint`.
+        differences: Settings that differ from the defaults, such as
+            ``"algorithm.replay_ratio=10"``.
+        late_mean_return: Mean over the late policies (see ``late_share``) of a test episode with
             mean actions.
-        late_sampled_return: mean over the training episodes of the same policies.
-        last_mean_return: mean over the last policy's test episodes with mean actions.
-        last_mean_sm_asap: of the same, as :func:`~torchrl_l2c2.metrics.spectral_smoothness` has it.
-        last_sampled_return: the same with sampled actions.
-        policy_scale: of the late policies.
-        seconds: of training: frames over the frames a second of the last call.
-        commit: of the code, where it lay in a git checkout.
+        late_sampled_return: Mean over the training episodes of the same policies.
+        last_mean_return: Mean over the last policy's test episodes with mean actions.
+        last_mean_sm_asap: :func:`~torchrl_l2c2.metrics.spectral_smoothness` in these test episodes.
+        last_sampled_return: Mean over the last policy's test episodes with sampled actions.
+        policy_scale: Mean scale of the late policies.
+        seconds: Duration of training: all frames divided by the last call's frames per second.
+        commit: Commit of the code, empty outside of a git checkout.
     """
 
     task: str
@@ -90,14 +91,16 @@ class Record:
 
     @property
     def identity(self) -> tuple[str | int, ...]:
-        """Two records with the same are the same run, made twice; the seed is the last of it."""
+        """Identity of the run, with the seed last. Records of repeated runs have the same."""
         return (self.task, self.algorithm, self.method, self.settings, self.length, self.seed)
 
     def value(self, test: str, quantity: str) -> float:
-        """A quantity of a test, by their names in ``TESTS`` and ``QUANTITIES``; NaN if unknown.
+        """Returns a quantity of a test, or NaN if unknown.
 
-        ``sm_asap`` is known of ``last_mean`` only. ``policy_scale`` is of the late policies,
-        whatever the test.
+        Args:
+            test (str): Name of the test, a key of ``TESTS``.
+            quantity (str): A key of ``QUANTITIES``, ``"sm_asap"`` (known only for ``last_mean``),
+                or ``"policy_scale"`` (of the late policies for every test).
         """
         if quantity == "sm_asap" and test != "last_mean":
             return math.nan
@@ -107,24 +110,24 @@ class Record:
 
     @property
     def is_tested(self) -> bool:
-        """Tells if the last policy was tested, with mean or with sampled actions."""
+        """Checks whether the last policy was tested, with mean or sampled actions."""
         tests = (self.last_mean_return, self.last_sampled_return)
         return not all(map(math.isnan, tests))
 
     @cached_property
     def other_settings(self) -> dict[str, str]:
-        """The settings that differ from the defaults, by name."""
+        """Settings that differ from the defaults, by name."""
         return read_differences(self.differences)
 
     @cached_property
-    def settings_of_any_length(self) -> dict[str, str]:
-        """Of these all but how long is trained, which :attr:`length` says."""
+    def settings_without_length(self) -> dict[str, str]:
+        """Settings that differ from the defaults, without the length of training."""
         return {k: v for k, v in self.other_settings.items() if k not in BUDGETS}
 
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """One run's folder, read back: its settings, its learning curve and its test episodes."""
+    """Settings, learning curve and test episodes of a finished run, read from its folder."""
 
     folder: Path
     config: dict[str, Any]
@@ -134,14 +137,15 @@ class FinishedRun:
 
     @classmethod
     def read(cls, folder: Path, evaluation: dict[str, Any] | None = None) -> FinishedRun:
-        """Reads a run's folder; ``evaluation.json`` marks it as finished.
+        """Reads a run's folder. ``evaluation.json`` marks a run as finished.
 
         Args:
-            folder (Path): The run's folder.
-            evaluation (dict, optional): The content of ``evaluation.json``. Default: the file's.
+            folder (Path): Run folder.
+            evaluation (dict, optional): Content of ``evaluation.json``. Default: read from the
+                file.
 
         Raises:
-            ValueError: names the file that is damaged, or cut short since the test.
+            ValueError: If a file is damaged, or was truncated after the test.
         """
         config = read_config(folder)
         evaluation = read_evaluation(folder) if evaluation is None else evaluation
@@ -152,8 +156,8 @@ class FinishedRun:
         _check_numbers(folder / "metrics.csv", metrics)
         if len(metrics) < least:
             raise UserError(
-                f"{folder / 'metrics.csv'} has {len(metrics)} episodes, fewer than the {least} "
-                f"that were tested after: {REMEDY}"
+                f"{folder / 'metrics.csv'} has {len(metrics)} episodes, fewer than the {least} at "
+                f"the time of the test: {REMEDY}"
             )
         return cls(folder, config, evaluation, metrics, {n: str(v) for n, v in known.items()})
 
@@ -180,24 +184,24 @@ class FinishedRun:
 
     @property
     def test_episodes(self) -> int:
-        """Of the test with mean actions."""
+        """Number of test episodes with mean actions."""
         return int(self.evaluation.get("summary", {}).get("episodes", 0))
 
     @property
     def is_untrained(self) -> bool:
-        """Tells if no update was made, or every action was random."""
+        """Checks whether no update was made or every action was random."""
         return bool((self.evaluation.get("training") or {}).get("untrained"))
 
     def column(self, name: str) -> list[float]:
-        """A column of the metrics, a number per episode; NaN where it was not measured."""
+        """Returns a column of the metrics, one number per episode; NaN if not measured."""
         return [float(row.get(name) or "nan") for row in self.metrics]
 
     @cached_property
     def record(self) -> Record:
-        """The run in one line, its numbers to six digits, as the file has them.
+        """Record of the run, with numbers rounded to six digits as in CSV files.
 
         Raises:
-            SettingError: a setting that is not known.
+            SettingError: If a setting is unknown.
         """
         end = self.metrics[-1]
         frames, speed = int(end["frames"]), self.column("frames_per_second")[-1]
@@ -225,7 +229,7 @@ class FinishedRun:
         )
 
     def _length(self) -> str:
-        """The requested length: a training ends with the round of episodes that reaches it."""
+        """Returns the requested length of training, which the last round may have exceeded."""
         task = self.config["task"]
         if task.get("frames") is not None:
             return f"{task['frames']:.0f} frames"
@@ -234,17 +238,14 @@ class FinishedRun:
     def _last(self, acting: str, test: dict[str, Any], *quantities: str) -> dict[str, float]:
         summary = test.get("summary", {})
         found = {name: summary.get(f"{name}_mean") for name in quantities}
-        # JSON has null where there is no number, as of episodes that are too short.
+        # Unknown numbers are null in JSON, for example if episodes are too short.
         return {f"last_{acting}_{k}": math.nan if v is None else v for k, v in found.items()}
 
     def _late(self) -> dict[str, float]:
-        """Of the late policies, with their test episodes where these were played.
-
-        Without ``late_share`` of training's last tenth.
-        """
+        """Returns the means over the late policies; without ``late_share``, over the last 10%."""
         config = ExperimentConfig.from_dict(self.config)
         budget, tests = config.task.budget, self.column("test_return")
-        # A longer run has tests of the shorter one's end, too.
+        # An extended run also has tests from the end of the shorter run.
         late = [
             row
             for row, frames in enumerate(self.column("frames"))
@@ -268,19 +269,25 @@ class FinishedRun:
 
 
 def is_tested(run: str | Path, settings: Mapping[str, Any]) -> bool:
-    """Checks whether a folder has the test of a run with these settings.
+    """Checks whether a folder has test results of a run with these settings.
 
-    Settings that change none of the numbers may differ, but for how long the training is.
+    Settings that change no numbers may differ, except for the length of training.
+
+    Args:
+        run (str or Path): Run folder.
+        settings (Mapping): Settings, as in ``config.json``.
 
     Raises:
-        ValueError: as :func:`read_config` and :func:`read_back`.
+        ValueError: If ``config.json`` is damaged.
     """
     if not (Path(run) / "evaluation.json").exists():
         return False
     with read_back(run):
         saved = read_config(run)
-        before, after = ([by_name(s).get(name) for name in BUDGETS] for s in (saved, settings))
-        return before == after and not differing(saved, settings)
+        before, after = (
+            [flatten_settings(s).get(name) for name in BUDGETS] for s in (saved, settings)
+        )
+        return before == after and not changed_settings(saved, settings)
 
 
 def write_evaluation(
@@ -289,30 +296,37 @@ def write_evaluation(
     """Writes ``evaluation.json``, which marks a run as finished.
 
     Args:
-        folder (Path): The run's folder.
-        config (ExperimentConfig): The run's settings.
-        tests (dict): ``"mean"`` and optionally ``"sampled"``: ``"summary"`` and ``"episodes"`` of
-            the test with mean actions and with sampled actions.
+        folder (Path): Run folder.
+        config (ExperimentConfig): Settings of the run.
+        tests (dict): Test results, each with ``"summary"`` and ``"episodes"``: ``"mean"`` with mean
+            actions and optionally ``"sampled"`` with sampled actions.
 
     Returns:
-        FinishedRun: the folder, read back.
+        FinishedRun: The finished run, read from the folder.
     """
     named = {group: getattr(config, group).name for group in ("task", "algorithm", "regularizer")}
     run = {**named, "seed": config.seed, "solved_at": config.task.solved_at}
     rest = {name: test for name, test in tests.items() if name != "mean"}
     evaluation = {"run": run, **tests["mean"], **rest}
-    FinishedRun.read(folder, evaluation)  # Refused before it marks the run as finished.
+    FinishedRun.read(folder, evaluation)  # Check before the run is marked as finished.
     write_json(folder / "evaluation.json", evaluation)
     return FinishedRun.read(folder)
 
 
 def finished_run(folder: str | Path, settings: dict[str, Any]) -> FinishedRun | None:
-    """The run in a folder whose test is of these settings, and has as many episodes as they ask.
+    """Reads the finished run in a folder if it matches the settings.
 
-    ``None`` where there is none; any number of episodes is enough for settings that want none.
+    Args:
+        folder (str or Path): Run folder.
+        settings (dict): Settings, as in ``config.json``. With ``test_episodes=0``, the test may
+            have any number of episodes.
+
+    Returns:
+        FinishedRun: The run; ``None`` if it is not finished, its settings differ, or its test has
+        another number of episodes.
 
     Raises:
-        UserError: it is damaged.
+        UserError: If a file is damaged.
     """
     if not is_tested(folder, settings):
         return None
@@ -329,5 +343,5 @@ def _check_numbers(path: Path, metrics: Sequence[dict[str, str]]) -> None:
                 float(cell or "nan")
             except ValueError:
                 raise UserError(
-                    f"{path}, line {line}: {name} is no number, but {cell!r:.40}: {REMEDY}"
+                    f"{path}, line {line}: {name} must be a number, got {cell!r:.40}: {REMEDY}"
                 ) from None

@@ -1,4 +1,4 @@
-"""A run's folder: its files, its beginning, and the files that a continued run copies."""
+"""Files of a run's folder."""
 
 from __future__ import annotations
 
@@ -19,59 +19,58 @@ VERSIONED = (
 README = """\
 A run of torchrl_l2c2.
 
-config.json           every setting
-versions.json         of the packages that decide the numbers
-metrics.csv           a line per training episode
-train.log             what the run said
-checkpoint_*.pt       to continue: run the same command again, or use resume=FOLDER
-policy.pt             the acting policy at the end of training, a state_dict
-policy_best.pt        the best policy of evaluations.json (evaluate_every)
+config.json           all settings
+versions.json         versions of the packages that affect the numbers
+metrics.csv           one line per training episode
+train.log             messages of the run
+checkpoint_*.pt       to continue, run the same command again, or use resume=FOLDER
+policy.pt             state_dict of the acting policy after training
+policy_best.pt        best policy of evaluations.json (evaluate_every)
 evaluations.json      tests during training (evaluate_every)
-evaluation.json       test episodes at the end
-learning_curves.png   a picture of metrics.csv
-diagnosis.html        why the policy shakes (experiment.diagnose)
-video.mp4             a test episode (record)
-export/               the policy as ONNX and torch.export program (experiment.export)
+evaluation.json       test episodes after training
+learning_curves.png   plot of metrics.csv
+diagnosis.html        why the policy shakes (command diagnose)
+video.mp4             test episode (record)
+export/               policy as ONNX and as a torch.export program (command export)
 
-To load the policy, a TorchRL actor, with an environment of its task:
+Load the policy, a TorchRL actor, and an environment of its task:
 
     from torchrl.envs import set_exploration_type
     from torchrl_l2c2.experiment import load_policy
     policy, env, max_steps = load_policy("path of this folder")
-    with set_exploration_type("deterministic"):  # the mean; without it, samples as in training
+    with set_exploration_type("deterministic"):  # Mean actions; otherwise samples, as in training.
         rollout = env.rollout(max_steps, policy)
 
-To play test episodes with it:
+Play test episodes:
 
     python -m torchrl_l2c2 evaluate FOLDER --episodes 100
 """
-# Files of a training's end, in addition to the test that marks a run as finished.
-OF_THE_END = ("video.mp4", "policy.pt", "learning_curves.png", "diagnosis.html")
-EXPORTED = tuple(f"export/{name}" for name in ("policy.onnx", "policy.pt2", "contract.json"))
-# Files that are written during training; a run that begins anew does not keep them.
-OF_THE_WAY = ("metrics.csv", "evaluations.json", "policy_best.pt")
+# Files written after training, in addition to evaluation.json.
+FINAL_FILES = ("video.mp4", "policy.pt", "learning_curves.png", "diagnosis.html")
+EXPORT_FILES = tuple(f"export/{name}" for name in ("policy.onnx", "policy.pt2", "contract.json"))
+# Files written during training; a new run removes them.
+TRAINING_FILES = ("metrics.csv", "evaluations.json", "policy_best.pt")
 
 
-def begin_folder(folder: Path, settings: dict[str, Any], *, begun: bool, ended: bool) -> None:
-    """Writes the first files of a run.
+def prepare_folder(folder: Path, settings: dict[str, Any], *, resumed: bool, ended: bool) -> None:
+    """Removes outdated files from a run's folder, and writes settings, versions and README.
 
-    A test with other settings is removed first, and so are the last files of a shorter run that is
-    continued. Killed at any moment, the folder holds the older run or an unfinished run, and never
-    the settings of a longer run with an older policy. A test of the same policy stays until another
-    one replaces it.
+    Outdated results are removed first: a test with other settings, and the final files of a shorter
+    run that is extended. If the process is killed, the folder has the old run or an unfinished run,
+    never new settings with an old policy.
 
     Args:
-        folder (Path): The run's folder.
-        settings (dict): The run's settings, as in ``config.json``.
+        folder (Path): Run folder.
+        settings (dict): Settings of the run, as in ``config.json``.
 
     Keyword Args:
-        begun (bool): whether it continues from a checkpoint.
-        ended (bool): whether its training is over.
+        resumed (bool): Whether the run continues from a checkpoint.
+        ended (bool): Whether training is over.
     """
     if not ended or not is_tested(folder, settings):
         (folder / "evaluation.json").unlink(missing_ok=True)
     if not ended:
-        names = (*OF_THE_END, *EXPORTED, *(() if begun else OF_THE_WAY))
+        names = (*FINAL_FILES, *EXPORT_FILES, *(() if resumed else TRAINING_FILES))
         for path in filter(Path.exists, (folder / name for name in names)):
             path.unlink()
     write_json(folder / "config.json", settings)
@@ -79,14 +78,14 @@ def begin_folder(folder: Path, settings: dict[str, Any], *, begun: bool, ended: 
     write_atomically(folder / "README.txt", README.encode())
 
 
-def bring_files(old: Path, new: Path) -> None:
-    """Copies the files that a run in another folder continues to write."""
-    for path in filter(Path.exists, (old / name for name in OF_THE_WAY)):
+def copy_training_files(old: Path, new: Path) -> None:
+    """Copies the files that a resumed run continues to write in its new folder."""
+    for path in filter(Path.exists, (old / name for name in TRAINING_FILES)):
         write_atomically(new / path.name, path.read_bytes())
 
 
 def versions() -> dict[str, str]:
-    """Versions of the packages that decide the numbers, as far as they are installed."""
+    """Returns the versions of installed packages that affect the numbers."""
     found = {}
     for name in VERSIONED:
         with contextlib.suppress(PackageNotFoundError):
@@ -95,7 +94,7 @@ def versions() -> dict[str, str]:
 
 
 def code_commit() -> str:
-    """The commit of this code, ``-dirty`` if changed since; empty outside of a git checkout."""
+    """Returns the code's commit, ``-dirty`` if changed; empty outside of a git checkout."""
     root = Path(__file__).parents[3]
     if not (root / ".git").exists():
         return ""

@@ -1,4 +1,4 @@
-"""The schedule of the regularizer's gain in a run: a ramp, or a gain that follows a metric."""
+"""Schedules of the regularizer's gain: a ramp, or a target for a metric."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 from torchrl_l2c2.experiment.collect.player import EPISODE_COLUMNS
 from torchrl_l2c2.experiment.learn.learner import Learner
-from torchrl_l2c2.experiment.run.evaluation import TESTED
+from torchrl_l2c2.experiment.run.evaluation import TEST_COLUMNS
 from torchrl_l2c2.experiment.settings.config import ExperimentConfig
 from torchrl_l2c2.experiment.settings.fields import SettingError
 from torchrl_l2c2.experiment.settings.regularizers import GainConfig
@@ -20,24 +20,24 @@ from torchrl_l2c2.gains import ConstantGain, RampGain, TargetGain
 
 
 class GainControl:
-    """Sets the regularizer's gain after episodes, and logs it.
+    """Sets the regularizer's gain after episodes.
 
     Args:
-        config (ExperimentConfig): the settings.
-        learner (Learner): the learner with the loss.
-
-    Raises:
-        SettingError: the gain follows a column that the run does not have.
+        config (ExperimentConfig): Settings of the run.
+        learner (Learner): Learner with the regularized loss.
 
     Attributes:
-        gain: schedule of the gain; ``None`` for a constant gain.
+        gain: Schedule of the gain; ``None`` for a constant gain.
+
+    Raises:
+        SettingError: If the run does not have the metric of the target.
     """
 
     def __init__(self, config: ExperimentConfig, learner: Learner) -> None:
         self._learner = learner
         self._updates = 0
         self._warns_of_measure = True
-        # Values since the last step: a rollout may end several episodes, and each is noisy.
+        # Values since the last step: several episodes may end in a rollout.
         self._seen: list[float] = []
         self.gain: ConstantGain | None = None
         if not isinstance(config.regularizer, GainConfig):
@@ -52,31 +52,31 @@ class GainControl:
             self.gain = TargetGain(
                 self._config.gain_target, self._config.gain_rate, self._config.gain_limit
             )
-            # This gain rises by itself until it has an effect.
-            learner.tells_faint_regularizer = False
+            # This gain increases until it has an effect.
+            learner.warns_weak_regularizer = False
         self._apply()
 
     def after(
         self, row: Mapping[str, float], training: Budget, *, ends_round: bool = True
     ) -> dict[str, float]:
-        """Sets the gain after an episode, and returns the entries to log.
+        """Sets the gain after an episode, and returns metrics of the gain.
 
         The gain changes only if there was an update since its last change. A target uses the mean
-        of its metric over the episodes since then, which with rollouts are the episodes that ended
-        in the last rollout. Without such an episode the gain stays.
+        of its metric over the episodes since then. With rollouts, these are the episodes that ended
+        in the last rollout; without any, the gain does not change.
 
         Args:
-            row (Mapping): the episode's metrics; without an episode, ``"episode"`` and
-                ``"frames"``.
-            training (Budget): the whole training, over which a ramp rises.
+            row (Mapping): Metrics of the episode. After a rollout without a finished episode, only
+                ``"episode"`` and ``"frames"``.
+            training (Budget): Total length of training, for a ramp.
 
         Keyword Args:
-            ends_round (bool): whether this is the last episode with the current policy. The gain
+            ends_round (bool): Whether this is the last episode with the current policy. The gain
                 changes only then. Default ``True``.
 
         Returns:
-            dict: the gain that was applied, the measured value and the target; empty for a constant
-            gain.
+            dict: The gain during the episode, the measured value and the target; empty for a
+            constant gain.
         """
         if self.gain is None or (self._config.gain == "target" and self._config.gain_of not in row):
             return {}
@@ -93,12 +93,12 @@ class GainControl:
         return logged
 
     def state_dict(self) -> dict[str, Any]:
-        """The gain, the update of its last change, and the values measured since."""
+        """Returns the gain, the update of its last change, and the values measured since."""
         gains = {} if self.gain is None else {"all": self.gain.state_dict()}
         return {"gains": gains, "updates": self._updates, "seen": list(self._seen)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restores what :meth:`state_dict` returned, and sets the loss's gain."""
+        """Restores a state of :meth:`state_dict`, and sets the loss's gain."""
         if self.gain is None:
             return
         self.gain.load_state_dict(state["gains"]["all"])
@@ -126,26 +126,26 @@ class GainControl:
         return fmean(numbers) if numbers else self._seen[-1]
 
     def _check_column(self, name: str, *, tested: bool) -> None:
-        """Refuses a column that the run will not have, before the run begins."""
-        columns = {*EPISODE_COLUMNS, *self._learner.report(0), *(TESTED if tested else ())}
+        """Checks that the run will have a metric."""
+        columns = {*EPISODE_COLUMNS, *self._learner.report(0), *(TEST_COLUMNS if tested else ())}
         if "scale" not in self._learner.agent.policy.out_keys:
             columns.remove("policy_scale")
         if name not in columns:
             raise SettingError(
                 "regularizer.gain_of",
-                f"must be one of {sorted(columns)}, got {name!r} (test_* need a late_share, and "
-                "policy_scale a policy that has a scale).",
+                f"must be one of {sorted(columns)}, got {name!r} (test_* need late_share > 0, and "
+                "policy_scale needs a stochastic policy).",
             )
 
     def _warn_of_measure(self, column: str, measured: float) -> None:
-        """Warns once if the column of a target is negative or not finite."""
+        """Warns once if the metric of a target is negative or not finite."""
         if 0.0 <= measured < math.inf or not self._warns_of_measure:
             return
         self._warns_of_measure = False
         warnings.warn(
             f"regularizer.gain_of={column} is {measured:g} after update {self._updates}: the gain "
-            "stays if this is not a number, and falls if it is below 0, for any gain_target. "
-            "Choose a column of numbers of at least 0. test_* columns have numbers only in the "
-            "last late_share of training.",
+            "does not change if this is NaN, and decreases for every gain_target if it is "
+            "negative. Choose a nonnegative metric. test_* metrics exist only in the last "
+            "late_share of training.",
             stacklevel=4,
         )

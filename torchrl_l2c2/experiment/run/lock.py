@@ -1,4 +1,4 @@
-"""One process at a time writes a run's folder."""
+"""Lock of a run's folder, for one process at a time."""
 
 from __future__ import annotations
 
@@ -17,25 +17,26 @@ from torchrl_l2c2.experiment.errors import UserError
 
 
 class FolderInUseError(UserError):
-    """Another process writes this folder."""
+    """Another process uses the folder."""
 
 
 def lock_folder(folder: Path, holder: Any) -> weakref.finalize[..., Any]:
-    """Takes a folder for this process until the holder is gone, or the process is.
+    """Locks a folder until the holder is garbage-collected or the process ends.
 
-    The operating system holds the lock (``flock``) and frees it when the process ends, however it
-    ends; on a shared file system that passes such locks on it holds for all machines. Within one
-    process a folder can be taken several times.
+    The operating system holds the lock (``flock``) and releases it when the process ends, also if
+    it is killed. On shared file systems that support such locks, it applies to all machines. The
+    same process may lock a folder several times.
 
     Args:
-        folder (Path): exists; gets the files ``.lock`` and, for the time being, ``.lock_owner``.
-        holder (object): the folder is free again when it is collected.
+        folder (Path): Existing folder. It gets the files ``.lock`` and, while locked,
+            ``.lock_owner``.
+        holder (object): Object whose garbage collection releases the lock.
 
     Returns:
-        weakref.finalize: called, it gives the folder back before that; a second call does nothing.
+        weakref.finalize: Function that releases the lock earlier. Later calls do nothing.
 
     Raises:
-        FolderInUseError: another process has it; says which, since when, and changes nothing.
+        FolderInUseError: If another process has the lock; states the process and the time.
 
     Examples:
         >>> import tempfile
@@ -43,8 +44,8 @@ def lock_folder(folder: Path, holder: Any) -> weakref.finalize[..., Any]:
         ...     pass
         >>> run = Run()
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     give_back = lock_folder(Path(folder), run)
-        ...     _ = give_back()
+        ...     release = lock_folder(Path(folder), run)
+        ...     _ = release()
     """
     lock = FileLock(folder / ".lock", timeout=0, is_singleton=True)
     owner = folder / ".lock_owner"
@@ -52,22 +53,25 @@ def lock_folder(folder: Path, holder: Any) -> weakref.finalize[..., Any]:
         lock.acquire()
     except Timeout:
         raise FolderInUseError(
-            f"the folder {str(folder)!r} is in use by {_described(owner)}: wait for it or end it, "
-            "or choose another folder. Nothing was changed."
+            f"the folder {str(folder)!r} is in use by {_describe_owner(owner)}: wait for it, end "
+            "it, or choose another folder. Nothing was changed."
         ) from None
-    # Not write_atomically: this file is for people, and not worth a flush of the disk.
+    # Not write_atomically: this file is only for messages, not worth a flush of the disk.
     since = time.strftime("%Y-%m-%d %H:%M:%S")
     who = {"pid": os.getpid(), "host": socket.gethostname(), "since": since}
-    with contextlib.suppress(OSError):  # A full disk is told with what is worth something.
+    with contextlib.suppress(OSError):  # A full disk is reported with a more important file.
         owner.write_text(json.dumps(who))
     return weakref.finalize(holder, _release, lock, owner)
 
 
 def wait_for_folder(folder: Path, seconds: float) -> None:
-    """Waits until no process has a folder, for so long at most; takes nothing.
+    """Waits until a folder is unlocked, without locking it.
 
-    A file server holds the lock of a machine that was lost until it notices: NFS after 90 seconds,
-    as it is usually set.
+    File servers release the lock of a crashed machine with a delay, NFS usually after 90 seconds.
+
+    Args:
+        folder (Path): Folder.
+        seconds (float): Maximum waiting time in seconds.
     """
     if seconds > 0 and (folder / ".lock").exists():
         lock = FileLock(folder / ".lock", timeout=0, is_singleton=True)
@@ -81,8 +85,8 @@ def _release(lock: FileLock, owner: Path) -> None:
     lock.release()
 
 
-def _described(owner: Path) -> str:
-    time.sleep(0.1)  # Who has just taken the lock writes its name a moment later.
+def _describe_owner(owner: Path) -> str:
+    time.sleep(0.1)  # The owner's file is written shortly after the lock is acquired.
     try:
         known = json.loads(owner.read_text())
         return f"process {known['pid']} on {known['host']} since {known['since']}"

@@ -1,4 +1,4 @@
-"""A run's metrics while it is trained: metrics.csv, and what a logger writes."""
+"""Logging of training metrics to metrics.csv and other loggers."""
 
 from __future__ import annotations
 
@@ -19,39 +19,45 @@ if TYPE_CHECKING:
     from torchrl.record.loggers import Logger
 
 PROJECT = "torchrl_l2c2"
-# The user's value: MLflow itself changes the variable later.
+# The user's value, read early: MLflow changes the variable later.
 TRACKING_URI = os.environ.get("MLFLOW_TRACKING_URI")
 # Packages that are not part of the experiment extra.
 PACKAGES = {"wandb": "wandb", "mlflow": "mlflow"}
 
 
 class MetricsLog:
-    """Writes rows of numbers; a killed process leaves no half of a line.
+    """Writes metrics to ``metrics.csv`` and another logger. Lines are complete if killed.
 
     Args:
-        folder (Path, optional): where ``metrics.csv`` goes, and what the logger writes; ``None``
-            writes nothing.
-        logger (str): one of :func:`~torchrl_l2c2.experiment.run.metrics_log.make_logger`.
+        folder (Path, optional): Folder of ``metrics.csv`` and the logger's files. ``None``: nothing
+            is written.
+
+    Keyword Args:
+        logger (str): Name of the logger, as for
+            :func:`~torchrl_l2c2.experiment.run.metrics_log.make_logger`. Default ``"csv"``.
     """
 
     def __init__(self, folder: Path | None, *, logger: str = "csv") -> None:
         self.path = None if folder is None else folder / "metrics.csv"
         self.columns: list[str] | None = None
-        self._size = 0  # of the file, as it was left here
+        self._size = 0  # Size of the file after the last write.
         self._name = logger
         self._logger = None if folder is None else make_logger(logger, folder)
 
     def close(self) -> None:
-        """Ends what the logger has open."""
+        """Closes the logger."""
         if self._logger is not None:
             self._logger = None
             close_logger(self._name)
 
     def write(self, row: Mapping[str, float]) -> None:
-        """Adds one line; the first line fixes the columns.
+        """Appends a row. The first row determines the columns.
+
+        Args:
+            row (Mapping): Metrics by name, including ``"frames"``, the step of other loggers.
 
         Raises:
-            ValueError: the row's names differ from the first row's.
+            ValueError: If the names differ from the first row's.
         """
         if self.path is None:
             return
@@ -60,7 +66,7 @@ class MetricsLog:
             write_atomically(self.path, _line(self.columns).encode())
             self._size = self.path.stat().st_size
         if list(row) != self.columns:
-            raise ValueError(f"the metrics changed from {self.columns} to {list(row)}.")
+            raise ValueError(f"expected the metrics {self.columns}, got {list(row)}.")
         append_line(self.path, _line(row.values()))
         self._size = self.path.stat().st_size
         if self._logger is not None:
@@ -68,41 +74,40 @@ class MetricsLog:
                 self._logger.log_scalar(name, value, step=int(row["frames"]))
 
     def check_unchanged(self) -> None:
-        """Refuses to continue if another object has written to the file.
+        """Checks that no other object has written to the file.
 
         Raises:
-            OtherRunError: the file is not as long as it was left.
+            OtherRunError: If the file's size has changed.
         """
         size = self.path.stat().st_size if self.path is not None and self.path.exists() else 0
         if size != self._size:
             raise OtherRunError(
-                f"{self.path} has {size} bytes, and had {self._size} when this run last wrote to "
-                "it: another Experiment has written to its folder. Make a new one, which "
+                f"{self.path} has {size} bytes, but {self._size} after this run's last write: "
+                "another Experiment has written to the folder. Create a new Experiment, which "
                 "continues from there."
             )
 
     def state_dict(self) -> dict[str, Any]:
-        """Columns and size of the file."""
+        """Returns the columns and the size of the file."""
         return {"columns": self.columns, "size": self._size}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Removes lines that were written after the state was taken; no line appears twice.
+        """Restores a state and removes later lines from the file.
 
         Raises:
-            ValueError: the file is shorter than it was, or another.
+            ValueError: If the file is shorter than in the state, or its content has changed.
         """
         self.columns = state["columns"]
         if self.path is None or self.columns is None:
             return
         content = self.path.read_bytes() if self.path.exists() else b""
         written = content[: state["size"]]
-        # Programs for tables write the lines' ends, or the numbers, in a way of their own.
+        # Spreadsheet programs may change line ends or the format of numbers.
         whole = written.startswith(_line(self.columns).encode()) and written.endswith(b"\n")
         if len(written) < state["size"] or not whole:
             raise UserError(
-                f"{self.path} has {len(content)} bytes and is not what the checkpoint was taken "
-                f"with, of {state['size']}: it was changed since. Restore it, or choose another "
-                "folder."
+                f"{self.path} was changed after the checkpoint, when it had {state['size']} bytes; "
+                f"it now has {len(content)} bytes. Restore it, or choose another folder."
             )
         os.truncate(self.path, state["size"])
         self._size = state["size"]
@@ -115,10 +120,10 @@ def _line(cells: Iterable[object]) -> str:
 
 
 def check_installed(name: str) -> None:
-    """Refuses a logger whose package is missing.
+    """Checks that the package of a logger is installed.
 
     Raises:
-        SettingError: says how to install it.
+        SettingError: If the package is missing.
     """
     package = PACKAGES.get(name)
     if package is not None and find_spec(package) is None:
@@ -130,14 +135,17 @@ def check_installed(name: str) -> None:
 
 
 def make_logger(name: str, folder: Path) -> Logger | None:
-    """TorchRL's logger of a name; ``None`` for ``csv``, which every run writes by itself.
+    """Creates a TorchRL logger.
 
-    Weights & Biases and MLflow read their own environment variables, such as ``WANDB_MODE=offline``
-    and ``MLFLOW_TRACKING_URI``. Without one, MLflow writes into the folder.
+    Weights & Biases and MLflow read environment variables such as ``WANDB_MODE=offline`` and
+    ``MLFLOW_TRACKING_URI``. Without the latter, MLflow writes to the run folder.
 
     Args:
         name (str): ``"csv"``, ``"tensorboard"``, ``"wandb"`` or ``"mlflow"``.
-        folder (Path): The run's folder; its last parts are the run's name in the logger.
+        folder (Path): Run folder. The last five parts of its path are the run's name.
+
+    Returns:
+        Logger: TorchRL's logger; ``None`` for ``"csv"``, which every run writes anyway.
     """
     run = "/".join(folder.absolute().parts[-5:])
     if name == "tensorboard":
@@ -147,7 +155,7 @@ def make_logger(name: str, folder: Path) -> Logger | None:
     if name == "wandb":
         from torchrl.record.loggers.wandb import WandbLogger
 
-        # The same for the same folder: a continued run is continued there.
+        # The same id for the same folder: a continued run also continues in W&B.
         identity = hashlib.sha256(str(folder.absolute()).encode()).hexdigest()[:16]
         return WandbLogger(
             run, project=PROJECT, save_dir=str(folder), id=identity, log_env_packages=False
@@ -155,15 +163,15 @@ def make_logger(name: str, folder: Path) -> Logger | None:
     if name == "mlflow":
         from torchrl.record.loggers.mlflow import MLFlowLogger
 
-        # MLflow asks for this before it writes files that need no database.
+        # MLflow requires this for files without a database.
         os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")
-        inside = (folder.absolute() / "mlruns").as_uri()
-        return MLFlowLogger(run, TRACKING_URI or inside)
+        local = (folder.absolute() / "mlruns").as_uri()
+        return MLFlowLogger(run, TRACKING_URI or local)
     return None
 
 
 def close_logger(name: str) -> None:
-    """Closes the logger's package in this process, for the next run."""
+    """Ends the logger's run in this process, before the next run."""
     if name == "wandb":
         import wandb
 

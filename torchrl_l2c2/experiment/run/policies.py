@@ -1,4 +1,4 @@
-"""A run's policy: written to the run's folder, and read back from it."""
+"""Saving and loading of policies."""
 
 from __future__ import annotations
 
@@ -31,34 +31,36 @@ def load_policy(
     best: bool = False,
     render: Drawing | None = None,
 ) -> tuple[TensorDictModule, EnvBase, int]:
-    """Loads a run's acting policy and makes an environment of its task.
+    """Loads a run's acting policy and creates an environment of its task.
 
-    The policy is a TorchRL actor: it reads ``"observation"`` and writes ``"action"``, the mean
-    under ``set_exploration_type(ExplorationType.DETERMINISTIC)`` and a sample otherwise. Torch's
-    global generator is left as it was.
+    The policy is a TorchRL actor that reads ``"observation"`` and writes ``"action"``: the mean
+    action under ``set_exploration_type(ExplorationType.DETERMINISTIC)``, otherwise a sample.
+    Torch's global random generator does not change.
 
     Args:
-        folder (str or Path): The run's folder, finished or not.
+        folder (str or Path): Run folder, finished or not.
 
     Keyword Args:
-        seed (int, optional): Seed of the environment and its noise. Default: the test's seed.
-        noise_scale (float, optional): Scale of the environment's noise; larger values are harder.
-            Default: the task's.
-        best (bool): whether to take the best policy of the tests during training, where
-            ``evaluate_every`` had some, instead of the last. Default ``False``.
-        render (Drawing, optional): which states the simulator draws, as for
-            :func:`~.environments.make_env`. Default: none.
+        seed (int, optional): Seed of the environment and its noise. Default: the seed of the run's
+            test.
+        noise_scale (float, optional): Standard deviation of the noise on observations. Larger
+            values are more difficult. Default: the task's noise.
+        best (bool): Whether to load the best policy of the tests during training
+            (``evaluate_every``) instead of the last policy. Default ``False``.
+        render (Drawing, optional): States to render, as for
+            :func:`~torchrl_l2c2.experiment.make_env`. Default: none.
 
     Returns:
-        The policy, the environment and the longest episode.
+        tuple: Policy, environment, and maximum steps per episode.
 
     Raises:
-        FileNotFoundError: the folder is not a run's, or holds no such policy nor a checkpoint.
-        CheckpointError: its policy, or all of its checkpoints, are damaged.
-        ValueError: its ``config.json`` is damaged, or names a task module inside the folder
-            itself, which would execute code of whoever trained the policy.
-        SettingError: a scale of noise that is negative or not finite, or a seed that NumPy does
-            not take.
+        FileNotFoundError: If the folder is not a run folder, or has neither the policy nor a
+            checkpoint.
+        CheckpointError: If the policy or all checkpoints are damaged.
+        ValueError: If ``config.json`` is damaged, or its task's module is inside the folder: the
+            import would execute code that comes with the run.
+        SettingError: If ``noise_scale`` is negative or not finite, or NumPy does not accept
+            ``seed``.
 
     Examples:
         >>> import tempfile
@@ -80,7 +82,7 @@ def load_policy(
     _check_origin(config.task.env_id, folder)
     noise = config.task.noise_scale if noise_scale is None else noise_scale
     task = replace(config.task.for_test(), noise_scale=noise)
-    with torch.random.fork_rng(devices=[]):  # Weights are drawn, before they are read.
+    with torch.random.fork_rng(devices=[]):  # New networks use random numbers.
         env = make_env(task, seed, render=render)
         agent = make_agent(config, env)
     saved = folder / ("policy_best.pt" if best else "policy.pt")
@@ -88,53 +90,53 @@ def load_policy(
         _load_weights(agent.policy, saved)
     elif best:
         raise FileNotFoundError(
-            f"{str(saved)!r} does not exist; evaluate_every=N makes it "
-            "while a run is trained: of one that has ended, train it in another folder."
+            f"{str(saved)!r} does not exist: train the run with evaluate_every=N, in another "
+            "folder if its training is over."
         )
     elif newest := load_newest(folder):
         agent.load_networks(newest[1])
     else:
-        raise FileNotFoundError(f"{str(folder)!r} holds neither policy.pt nor a checkpoint yet.")
+        raise FileNotFoundError(f"{str(folder)!r} has neither policy.pt nor a checkpoint yet.")
     return agent.policy, env, time_limit(config.task)
 
 
 def seed_of_test(folder: str | Path, seed: int | None = None) -> int:
-    """Returns the seed of a run's test, or checks another seed.
+    """Returns the seed of a run's test, or another seed after a check.
 
     Args:
-        folder (str or Path): The run's folder.
-        seed (int, optional): Another seed.
+        folder (str or Path): Run folder.
+        seed (int, optional): Another seed. Default: the seed of the run's test.
 
     Raises:
-        FileNotFoundError: the folder is not a run's.
-        ValueError: its ``config.json`` is damaged.
-        SettingError: a seed that NumPy does not take.
+        FileNotFoundError: If the folder is not a run folder.
+        ValueError: If ``config.json`` is damaged.
+        SettingError: If NumPy does not accept ``seed``.
     """
     if seed is not None and not 0 <= seed < 2**32:
         raise SettingError("seed", f"must be at least 0 and below 2 ** 32, got {seed}.")
     if not (Path(folder) / "config.json").exists():
-        raise FileNotFoundError(f"{str(folder)!r} is not the folder of a run: no config.json.")
+        raise FileNotFoundError(f"{str(folder)!r} is not a run folder: it has no config.json.")
     return int(read_config(folder)["seed"]) + TEST_SEED if seed is None else seed
 
 
 def _check_origin(env_id: str, folder: Path) -> None:
-    """Refuses a task whose module is in the run's folder, or in a package around it.
+    """Refuses a task whose module is in the run's folder, or in a package around the folder.
 
-    A run's settings may come from somebody else, and an import executes code. Modules that are
-    already imported, such as a script's own task, are accepted.
+    Runs may come from other people, and an import executes code. Already imported modules, such as
+    a script's own task, are accepted.
     """
     module = env_id.rpartition(":")[0]
     name = "" if module in sys.modules else module.partition(".")[0]
-    # Of what is not within another no finder imports anything.
+    # The top-level package is enough: submodules are found inside it.
     spec = importlib.util.find_spec(name) if name else None
     places = spec and (spec.submodule_search_locations or filter(None, [spec.origin]))
     run = folder.resolve()
     for place in [Path(place).resolve() for place in places or ()]:
         if place in (run, *run.parents) or run in place.parents:
             raise UserError(
-                f"{folder / 'config.json'}: task.env_id={env_id!r} would execute {place}, which is "
-                "no module of yours but comes with the run. If you trust it, install it or "
-                "move it to your own code."
+                f"{folder / 'config.json'}: task.env_id={env_id!r} would execute {place}, which "
+                "comes with the run. If you trust this code, install it or move it to your own "
+                "code."
             )
 
 
@@ -143,14 +145,14 @@ def _load_weights(policy: TensorDictModule, path: Path) -> None:
         policy.load_state_dict(torch.load(path, "cpu", weights_only=True))
     except OSError:
         raise
-    # With damaged bytes torch raises errors of many kinds, on many lines.
+    # For damaged files, torch raises many different errors with long messages.
     except Exception as error:
-        what = f"{path} does not hold this run's policy ({type(error).__name__})"
-        raise CheckpointError(f"{what}: {REMEDY}") from error
+        problem = f"{path} does not contain this run's policy ({type(error).__name__})"
+        raise CheckpointError(f"{problem}: {REMEDY}") from error
 
 
 def save_policy(policy: torch.nn.Module, path: str | Path) -> None:
-    """Writes the policy's ``state_dict``; read it with ``torch.load(path, weights_only=True)``."""
+    """Writes a policy's ``state_dict``, for ``torch.load(path, weights_only=True)``."""
     content = io.BytesIO()
     torch.save({k: v.detach().clone() for k, v in policy.state_dict().items()}, content)
     write_atomically(path, content.getvalue())

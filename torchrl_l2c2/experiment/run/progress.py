@@ -1,4 +1,4 @@
-"""What a run shows while it trains, and keeps in ``train.log``."""
+"""Progress bar and log of a run."""
 
 from __future__ import annotations
 
@@ -17,38 +17,39 @@ LINE_SECONDS = 60.0
 
 
 def log(folder: Path | None, line: str) -> None:
-    """Adds a line, with the time, to the ``train.log`` of a run's folder.
+    """Appends a line with the time to ``train.log`` in a run's folder.
 
     Raises:
-        OSError: names the file.
+        OSError: If the file cannot be written.
     """
     if folder is not None and folder.is_dir():
         append_line(folder / "train.log", f"{time.strftime('%Y-%m-%d %H:%M:%S')} {line}\n")
 
 
-def say(folder: Path | None, line: str) -> None:
-    """Shows a line, above a bar where there is one, and logs it."""
+def show_and_log(folder: Path | None, line: str) -> None:
+    """Shows a line on stderr, above a progress bar, and logs it."""
     tqdm.write(line, file=sys.stderr)
     sys.stderr.flush()
     log(folder, line)
 
 
 class Progress:
-    """A bar over the episodes or frames of a run, with what episodes were like lately.
+    """Progress bar of a run, with the mean metrics of the last 10 episodes.
 
-    Where there is no terminal it is lines, at each tenth of the run or a minute after the last one;
-    ``train.log`` has them in any case.
+    Without a terminal, it shows a line at each tenth of the run, or a minute after the last line.
+    ``train.log`` always has these lines.
 
     Args:
-        total (int): episodes or frames in all.
-        done (int): those of an earlier call.
-        frames (int): frames of an earlier call.
+        total (int): Total number of episodes or frames.
+        done (int): Number of episodes or frames of earlier calls.
+        frames (int): Number of frames of earlier calls.
 
     Keyword Args:
-        shown (bool or str): whether there is a bar, or lines; a text goes before them.
-        compiles (bool): whether the first updates wait for a compiler.
-        unit (str): what is counted, ``"episode"`` or ``"frame"``. Default ``"episode"``.
-        folder (Path, optional): of the run.
+        shown (bool or str): Whether to show the bar or lines; a text is shown before them.
+        compiles (bool): Whether the first updates are compiled.
+        unit (str): Unit of ``total`` and ``done``, ``"episode"`` or ``"frame"``. Default
+            ``"episode"``.
+        folder (Path, optional): Run folder, for ``train.log``. Default: nothing is logged.
     """
 
     def __init__(
@@ -67,14 +68,14 @@ class Progress:
         self._started, self._first_frame = time.monotonic(), frames
         self._last_line = self._started
         self._waiting = compiles
-        # tqdm leaves the bar out where there is no terminal.
+        # None: tqdm shows no bar without a terminal.
         disable = None if shown else True
         self._bar = tqdm(desc=name, total=total, initial=done, unit=unit, disable=disable)
         self._name = f"{name}; " if name else ""
         self._column = {"episode": "episode", "frame": "frames"}[unit]
         self._done: float = done
         if self._waiting:
-            self._say("compiling at the first updates, up to two minutes")
+            self._report("compiling at the first updates, up to two minutes")
 
     def __enter__(self) -> Progress:
         return self
@@ -88,33 +89,39 @@ class Progress:
         self._bar.close()
 
     def frames_per_second(self, frames: int) -> float:
-        """Frames a second since this call began."""
+        """Returns the frames per second of this call."""
         return (frames - self._first_frame) / (time.monotonic() - self._started)
 
     def show(self, rows: Sequence[dict[str, float]], first_update_seconds: float | None) -> None:
-        """Counts an episode; its metrics are the last row."""
+        """Updates the progress after an episode.
+
+        Args:
+            rows (sequence of dict): Metrics of all episodes.
+            first_update_seconds (float, optional): Duration of the first update, or ``None`` before
+                it.
+        """
         before, self._done = self._done, rows[-1][self._column]
         self._bar.update(self._done - before)
         if self._waiting and first_update_seconds is not None:
             self._waiting = False
-            self._say(f"compiled within {first_update_seconds:.0f} s")
-        lately = rows[-10:]
-        means = [statistics.fmean(r[key] for r in lately) for key in ("return", "action_variation")]
+            self._report(f"compiled within {first_update_seconds:.0f} s")
+        last = rows[-10:]
+        means = [statistics.fmean(r[key] for r in last) for key in ("return", "action_variation")]
         state = (
-            f"mean of the last {len(lately)} episodes: return {means[0]:.1f}, "
+            f"mean of the last {len(last)} episodes: return {means[0]:.1f}, "
             f"action variation {means[1]:.3f}, "
             f"{rows[-1]['frames_per_second']:.0f} frames/s"
         )
         self._bar.set_postfix_str(state)
-        # A last rollout may go on far beyond the end.
+        # The last rollout may exceed the total.
         tenth = min(self._done * 10 // self._total, 10) > before * 10 // self._total
         if tenth or time.monotonic() - self._last_line > LINE_SECONDS:
             self._last_line = time.monotonic()
             line = f"{self._name}{self._unit} {self._done:g} of {self._total}: {state}"
             if self._bar.disable:
-                self._say(line)
+                self._report(line)
             else:
                 log(self._folder, line)
 
-    def _say(self, line: str) -> None:
-        (say if self._shown else log)(self._folder, line)
+    def _report(self, line: str) -> None:
+        (show_and_log if self._shown else log)(self._folder, line)

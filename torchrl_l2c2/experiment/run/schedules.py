@@ -1,8 +1,7 @@
-"""When a run learns: after every frame, after every episode, or after every rollout.
+"""Training loops with updates after every frame, every episode, or every rollout.
 
-Each schedule is the whole loop: it plays, remembers, learns, and hands out the episodes that it has
-learned from, or ``None`` after a rollout that none has ended in. What a run does then, and when it
-ends, is the caller's.
+A schedule plays, stores transitions, makes updates, and yields each finished episode, or ``None``
+after a rollout without one. The caller decides when training ends.
 """
 
 from __future__ import annotations
@@ -26,13 +25,13 @@ def by_step(player: Player, learner: Learner, algorithm: OffPolicyConfig) -> Ite
                 learner.remember_frame(frames[-1])
                 _learn(learner, algorithm, 1, player.frames)
         except KeyboardInterrupt:
-            player.drop_episode()
+            player.discard_episode()
             raise
-        yield player.measured(stack_frames(frames), player.frames)
+        yield player.measure(stack_frames(frames), player.frames)
 
 
 def by_episode(player: Player, learner: Learner, algorithm: OffPolicyConfig) -> Iterator[Episode]:
-    """Updates after every episode: the schedule inferred for the paper."""
+    """Updates after every episode, the schedule inferred for the paper."""
     while True:
         episode = player.play()
         learner.remember(episode.transitions)
@@ -41,16 +40,16 @@ def by_episode(player: Player, learner: Learner, algorithm: OffPolicyConfig) -> 
 
 
 def by_rollout(player: Player, learner: Learner, algorithm: PPOConfig) -> Iterator[Episode | None]:
-    """Updates with everything that one policy has played, once it is enough."""
+    """Updates after every rollout."""
     if algorithm.num_envs is not None:
-        return by_cut_rollout(player, learner, algorithm)
-    return by_rollout_of_episodes(player, learner, algorithm)
+        return by_fixed_rollouts(player, learner, algorithm)
+    return by_episode_rollouts(player, learner, algorithm)
 
 
-def by_rollout_of_episodes(
+def by_episode_rollouts(
     player: Player, learner: Learner, algorithm: PPOConfig
 ) -> Iterator[Episode]:
-    """Updates after so many frames at least, of whole episodes."""
+    """Updates after whole episodes with at least ``algorithm.frames`` frames."""
     while True:
         episode = player.play()
         learner.remember(episode.transitions)
@@ -59,10 +58,10 @@ def by_rollout_of_episodes(
         yield episode
 
 
-def by_cut_rollout(
+def by_fixed_rollouts(
     player: Player, learner: Learner, algorithm: PPOConfig
 ) -> Iterator[Episode | None]:
-    """Updates after so many frames, wherever episodes are then; hands out those that have ended."""
+    """Updates after exactly ``algorithm.frames`` frames, also within episodes."""
     normalization = learner.agent.normalization
     while True:
         rollout, episodes = player.play_rollout()
@@ -70,13 +69,13 @@ def by_cut_rollout(
             learner.remember(frames)
         learner.learn_rollout(algorithm.epochs)
         if normalization is not None:
-            normalization.follow()
+            normalization.apply_statistics()
             learner.agent.refresh_policy()
         yield from episodes or (None,)
 
 
 def _learn(learner: Learner, algorithm: OffPolicyConfig, frames: int, last_frame: int) -> None:
-    """The updates that follow some frames, once the random ones are over."""
+    """Makes the updates that are due after new frames, once the random frames are over."""
     if last_frame >= algorithm.random_frames:
         stored, batch_size = len(learner.replay), learner.replay.batch_size
         learner.learn(algorithm.updates_after(frames, last_frame, stored, batch_size))

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: the first lets the episode end and is saved, a second one acts at once."""
+"""Ctrl-C and SIGTERM: the first finishes the episode and saves, the second ends at once."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from typing import Any, NoReturn
 
 from torchrl_l2c2.experiment.errors import CompilerError
 
-# Terminals and launchers send one signal to a process several times: to it, and to its group.
+# Terminals and launchers may send the same signal to a process and to its group.
 SAME_SIGNAL_SECONDS = 1.0
-# What ended, or was to end, what went before a training: libraries swallow exceptions in places.
-_heard: list[int] = []
+# Signals before training: some libraries swallow the exception that should end the process.
+_early_signals: list[int] = []
 FINISHING = "finishing the episode, then saving"
 
 
 class Interrupted(Exception):
-    """A signal ended the training; a checkpoint was written."""
+    """A signal ended the training after a checkpoint."""
 
     def __init__(self, signal_number: int, episode: int, folder: Path | None) -> None:
         name = signal.Signals(signal_number).name
@@ -33,25 +33,29 @@ class Interrupted(Exception):
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM, where it ends what is being done as Ctrl-C does."""
+    """SIGTERM, with the effect of Ctrl-C."""
 
 
 def terminate(number: int, frame: Any) -> NoReturn:
-    """A handler that lets what is being done end in order."""
-    _heard.append(number)
+    """Signal handler that ends the process in order, with an exception."""
+    _early_signals.append(number)
     raise Terminated
 
 
 @contextlib.contextmanager
 def stop_on_signals() -> Iterator[list[int]]:
-    """Collects SIGTERM and SIGINT in a list instead of dying; a second one acts as usual.
+    """Collects SIGTERM and SIGINT in a list; a second signal has its usual effect.
 
-    A signal to all processes of a job also ends compilers.
+    A signal to all processes of a job also ends compilers. Their failures after a signal count as
+    an interruption.
+
+    Yields:
+        list: Numbers of the received signals.
 
     Raises:
-        KeyboardInterrupt: a compiler failed after a signal.
+        KeyboardInterrupt: If a compiler fails after a signal.
     """
-    received = list(_heard)
+    received = list(_early_signals)
     if threading.current_thread() is not threading.main_thread():
         yield received
         return
@@ -62,7 +66,7 @@ def stop_on_signals() -> Iterator[list[int]]:
         if not received:
             first = time.monotonic()
             received.append(number)
-            print(f"\n{FINISHING}; once more: at once", file=sys.stderr, flush=True)
+            print(f"\n{FINISHING}; a second signal ends at once", file=sys.stderr, flush=True)
         elif time.monotonic() - first > SAME_SIGNAL_SECONDS:
             restore()
             signal.raise_signal(number)
@@ -86,10 +90,10 @@ def stop_on_signals() -> Iterator[list[int]]:
 
 
 def keep_ctrl_c_from_children() -> None:
-    """Has this process alone hear Ctrl-C, which a terminal sends to all processes that it started.
+    """Blocks Ctrl-C in all later child processes: only this process receives it.
 
-    Compilers, workers and jobs that are born from now on are deaf to it: they end their work, and
-    this process ends them. For a command's first lines, before there are other threads.
+    Terminals send Ctrl-C to all processes. Compilers, workers and jobs then finish their work, and
+    this process ends them. Call it first, before other threads start.
     """
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         return
@@ -99,17 +103,17 @@ def keep_ctrl_c_from_children() -> None:
     def as_ctrl_c(number: int, frame: Any) -> None:
         handler = signal.getsignal(signal.SIGINT)
         if handler is signal.default_int_handler:
-            _heard.append(signal.SIGINT)
+            _early_signals.append(signal.SIGINT)
         if callable(handler):
             handler(signal.SIGINT, frame)
 
     def listen() -> None:
         while True:
             signal.sigwait({signal.SIGINT})
-            # Another signal, which wakes the main thread even while it waits for a compiler.
+            # Another signal wakes the main thread even while it waits for a compiler.
             signal.pthread_kill(main, signal.SIGUSR1)
 
     signal.signal(signal.SIGUSR1, as_ctrl_c)
-    # What is blocked here is blocked in every thread and process that comes from here.
+    # All later threads and processes inherit the blocked signal.
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     threading.Thread(target=listen, daemon=True).start()

@@ -1,1 +1,1 @@
-"""Every setting of a run: default, range, meaning. Without torch."""
+"""Settings of a run, with defaults, ranges and descriptions. Does not import torch."""

@@ -9,22 +9,23 @@ from pydantic import Field
 from torchrl_l2c2.experiment.settings.fields import SettingError, neutral, settings
 
 Layers = tuple[Annotated[int, Field(ge=1, le=1_000_000)], ...]
-"""Neurons of hidden layers."""
+"""Number of neurons of each hidden layer."""
 
 
 class AlgorithmConfig:
-    """Settings that every algorithm has, and the replay buffer and optimizer that it defaults to.
+    """Common settings of all algorithms.
 
     Attributes:
-        usual_replay: name of the replay buffer that it comes with.
-        usual_optimizer: name of the optimizer that it comes with.
-        frames: least that an update learns from; 0 where a replay buffer has them.
-        num_envs: simulators that one policy plays at once; ``None`` where it plays one.
-        random_frames: played with random actions before learning starts.
+        default_replay: Name of the algorithm's default replay buffer.
+        default_optimizer: Name of the algorithm's default optimizer.
+        frames: Minimum frames per rollout; 0 for algorithms with a replay buffer.
+        num_envs: Number of simulators that one policy plays in turn; ``None`` for one simulator
+            that plays whole episodes.
+        random_frames: Frames with random actions before learning starts.
     """
 
-    usual_replay: ClassVar[str] = "uniform"
-    usual_optimizer: ClassVar[str] = "adam"
+    default_replay: ClassVar[str] = "uniform"
+    default_optimizer: ClassVar[str] = "adam"
 
     frames: int = 0
     num_envs: int | None = None
@@ -37,53 +38,53 @@ class AlgorithmConfig:
 
     @property
     def reward_factor(self) -> float:
-        """Factor on rewards while learning."""
+        """Factor on rewards during learning."""
         return 1.0 - self.gamma if self.reward_scale is None else self.reward_scale
 
 
 class OffPolicyConfig(AlgorithmConfig):
-    """An algorithm that learns from a replay buffer.
+    """Common settings of algorithms with a replay buffer.
 
     Attributes:
-        usual_replay_ratio: the default of ``replay_ratio``.
+        default_replay_ratio: Default of ``replay_ratio``.
     """
 
-    usual_replay_ratio: ClassVar[float | None] = None
+    default_replay_ratio: ClassVar[float | None] = None
 
     replay_ratio: float | None
     updates: int | None
 
     def __post_init__(self) -> None:
-        # A usual ratio gives way to a number of updates, a chosen one does not.
-        chosen = self.replay_ratio not in (None, self.usual_replay_ratio)
-        if chosen and self.updates is not None:
+        # Only the default ratio may be overridden by a number of updates.
+        changed = self.replay_ratio not in (None, self.default_replay_ratio)
+        if changed and self.updates is not None:
             raise SettingError(
                 "replay_ratio",
-                f"and updates both say how many updates there are: leave one at null, got "
+                f"and updates both set the number of updates: set one to null, got "
                 f"{self.replay_ratio} and {self.updates}.",
             )
 
     def updates_after(self, frames: int, last_frame: int, stored: int, batch_size: int) -> int:
-        """Returns the number of updates that follow some frames.
+        """Returns the number of updates due after new frames.
 
         Args:
-            frames (int): frames that were played.
-            last_frame (int): frames of the run up to and with them.
-            stored (int): transitions in the replay buffer.
-            batch_size (int): transitions that an update draws.
+            frames (int): Number of new frames.
+            last_frame (int): Total number of frames of the run, including the new ones.
+            stored (int): Number of transitions in the replay buffer.
+            batch_size (int): Number of transitions per update.
         """
         if self.updates is not None:
             return self.updates
         if self.replay_ratio is None:
             return 1 if self.schedule == "step" else stored // batch_size
-        # A fraction of an update is made up for later.
-        each = self.replay_ratio / batch_size
-        return int(each * last_frame) - int(each * (last_frame - frames))
+        # The difference of totals: fractions of an update add up to whole updates.
+        per_frame = self.replay_ratio / batch_size
+        return int(per_frame * last_frame) - int(per_frame * (last_frame - frames))
 
 
 @settings
 class PerStepConfig(OffPolicyConfig):
-    """Base of the algorithms with an update after every step and with target networks."""
+    """Common settings of algorithms with target networks and, by default, an update per step."""
 
     name: str = ""
     gamma: float = Field(default=0.99, ge=0, lt=1, description="discount factor")
@@ -97,7 +98,7 @@ class PerStepConfig(OffPolicyConfig):
         default=1000, ge=0, description="frames with random actions before learning starts"
     )
     reward_scale: float | None = Field(
-        default=1.0, gt=0, description="factor on rewards while learning; null: 1 - gamma"
+        default=1.0, gt=0, description="factor on rewards during learning; null: 1 - gamma"
     )
     schedule: Literal["step", "episode"] = Field(
         default="step", description="time of the updates: after every step or episode"
@@ -105,24 +106,24 @@ class PerStepConfig(OffPolicyConfig):
     replay_ratio: float | None = Field(
         default=None,
         gt=0,
-        description="average number of times that a transition is drawn, instead of updates: "
+        description="average number of times that a transition is sampled, instead of updates: "
         "ratio * frames / batch_size updates",
     )
     updates: int | None = Field(
         default=1,
         ge=1,
-        description="updates per step, or per episode; null: by the replay ratio, otherwise one"
-        " per step, or one pass over the buffer per episode",
+        description="number of updates per step or episode; null: set by replay_ratio, or if that "
+        "is null too, one per step, or one pass over the buffer per episode",
     )
 
 
 @settings
 class PPORPEConfig(OffPolicyConfig):
-    """PPO-RPE with target networks, the paper's algorithm and kappa, beta, decay, delta_min."""
+    """PPO-RPE with target networks: the paper's algorithm."""
 
-    usual_replay: ClassVar[str] = "prioritized"
-    usual_optimizer: ClassVar[str] = "adaterm"
-    usual_replay_ratio: ClassVar[float | None] = 10.0
+    default_replay: ClassVar[str] = "prioritized"
+    default_optimizer: ClassVar[str] = "adaterm"
+    default_replay_ratio: ClassVar[float | None] = 10.0
 
     name: str = "ppo_rpe"
     gamma: float = Field(default=0.99, ge=0, lt=1, description="discount factor")
@@ -151,7 +152,8 @@ class PPORPEConfig(OffPolicyConfig):
     )
     importance: Literal["max", "mean"] = Field(
         default="max",
-        description="divisor of the weights of prioritized replay: max or mean [inferred: max]",
+        description="divisor of the importance weights of prioritized replay: max or mean "
+        "[inferred: max]",
     )
     reduction: Literal["mean", "sum"] = Field(
         default="sum",
@@ -161,19 +163,19 @@ class PPORPEConfig(OffPolicyConfig):
     )
     acting_policy: Literal["target", "online"] = Field(
         default="target",
-        description="copy of the policy that acts: target or online [inferred: target]",
+        description="policy that plays the episodes: target or online network [inferred: target]",
     )
     reward_scale: float | None = Field(
         default=None,
         gt=0,
-        description="factor on rewards while learning; null: 1 - gamma [inferred]",
+        description="factor on rewards during learning; null: 1 - gamma [inferred]",
     )
     squash: Literal["tanh", "sigmoid", "none"] = Field(
         default="tanh", description="function that keeps actions in their bounds [inferred: tanh]"
     )
     time_limit: Literal["truncated", "terminated"] = Field(
         default="truncated",
-        description="value at a time limit: of the state (truncated), or 0 as at a terminal "
+        description="value at a time limit: the state's value (truncated), or 0 as at a terminal "
         "state [inferred: truncated]",
         json_schema_extra=neutral("truncated"),
     )
@@ -190,7 +192,7 @@ class PPORPEConfig(OffPolicyConfig):
         default=5, ge=1, description="heads of the value network; the value is their mean [paper]"
     )
     squish_b: float = Field(
-        default=4.0, gt=0, description="bend of the Squish activation [inferred]"
+        default=4.0, gt=0, description="parameter b of the Squish activation [inferred]"
     )
     schedule: Literal["episode", "step"] = Field(
         default="episode",
@@ -198,16 +200,16 @@ class PPORPEConfig(OffPolicyConfig):
         "episode]",
     )
     replay_ratio: float | None = Field(
-        default=usual_replay_ratio,
+        default=default_replay_ratio,
         gt=0,
-        description="average number of times that a transition is drawn: ratio * frames / "
+        description="average number of times that a transition is sampled: ratio * frames / "
         "batch_size updates [inferred: 10]",
     )
     updates: int | None = Field(
         default=None,
         ge=1,
-        description="updates per episode, or per step; null: by the replay ratio. If that is "
-        "null, too: one pass over the buffer per episode, or one update per step",
+        description="number of updates per episode or step; null: set by replay_ratio, or if that "
+        "is null too, one pass over the buffer per episode, or one update per step",
     )
     tau: float = Field(
         default=0.1,
@@ -224,11 +226,11 @@ class PPORPEConfig(OffPolicyConfig):
 
     def __post_init__(self) -> None:
         OffPolicyConfig.__post_init__(self)
-        # As in PPORPELoss, which could say it only once a task has been made.
-        widest = 2.0 * (1.0 - self.beta) / (self.beta * max(1.0, 1.0 / self.beta - 1.0))
-        if self.kappa >= widest:
+        # The check of PPORPELoss, before a task is created.
+        limit = 2.0 * (1.0 - self.beta) / (self.beta * max(1.0, 1.0 / self.beta - 1.0))
+        if self.kappa >= limit:
             raise SettingError(
-                "kappa", f"must be below {widest:g} with beta={self.beta:g}, got {self.kappa:g}."
+                "kappa", f"must be below {limit:g} with beta={self.beta:g}, got {self.kappa:g}."
             )
 
 
@@ -238,27 +240,27 @@ class SACConfig(PerStepConfig):
 
     name: str = "sac"
     alpha_init: float = Field(
-        default=1.0, gt=0, description="initial temperature, which is learned"
+        default=1.0, gt=0, description="initial value of the learned temperature"
     )
     target_entropy: float | None = Field(
         default=None,
-        description="target of the policy's entropy, of actions in the task's units: twice the "
-        "range adds log 2 per action; null: minus the number of action dimensions",
+        description="target of the policy's entropy, for actions in the task's units: a range "
+        "twice as wide adds log 2 per dimension; null: minus the number of action dimensions",
     )
     hidden: Layers = Field(
         default=(256, 256), description="neurons of the hidden layers of all networks"
     )
     scale_mapping: Literal["softplus", "exp"] = Field(
         default="softplus",
-        description="function from the network's output to the policy's scale; exp is cut to "
-        "e^-20 and e^2",
+        description="function from the network's output to the policy's scale; exp is clipped to "
+        "[e^-20, e^2]",
         json_schema_extra=neutral("softplus"),
     )
 
 
 @settings
 class TD3Config(PerStepConfig):
-    """Twin delayed DDPG: a deterministic policy."""
+    """Twin delayed DDPG, with a deterministic policy."""
 
     name: str = "td3"
     exploration_noise: float = Field(
@@ -280,7 +282,7 @@ class TD3Config(PerStepConfig):
     policy_delay: int = Field(
         default=2,
         ge=1,
-        description="updates of the value per update of the policy and the target networks",
+        description="value updates per update of the policy and the target networks",
     )
     hidden: Layers = Field(
         default=(256, 256), description="neurons of the hidden layers of all networks"
@@ -291,7 +293,7 @@ class TD3Config(PerStepConfig):
 class PPOConfig(AlgorithmConfig):
     """Proximal policy optimization with a clipped ratio, on rollouts."""
 
-    usual_replay: ClassVar[str] = "rollout"
+    default_replay: ClassVar[str] = "rollout"
 
     name: str = "ppo"
     gamma: float = Field(default=0.99, ge=0, lt=1, description="discount factor")
@@ -319,14 +321,15 @@ class PPOConfig(AlgorithmConfig):
     frames: int = Field(
         default=2048,
         ge=1,
-        description="frames per rollout; without num_envs at least so many, in whole episodes",
+        description="frames per rollout; without num_envs, a rollout has whole episodes and at "
+        "least this many frames",
     )
     epochs: int = Field(default=10, ge=1, description="passes over a rollout")
     hidden: Layers = Field(
         default=(64, 64), description="neurons of the hidden layers of both networks"
     )
     reward_scale: float | None = Field(
-        default=1.0, gt=0, description="factor on rewards while learning; null: 1 - gamma"
+        default=1.0, gt=0, description="factor on rewards during learning; null: 1 - gamma"
     )
     schedule: Literal["rollout"] = Field(
         default="rollout", description="time of the updates: after every rollout"
@@ -334,22 +337,23 @@ class PPOConfig(AlgorithmConfig):
     num_envs: int | None = Field(
         default=None,
         ge=1,
-        description="number of simulators, played in turn by one policy, each for frames / "
-        "num_envs frames per rollout; episodes may outlast a rollout. null: whole "
-        "episodes of one simulator",
+        description="number of simulators that one policy plays in turn, frames / num_envs frames "
+        "each per rollout; episodes may extend over several rollouts. null: whole episodes of one "
+        "simulator",
     )
     clip_actions: bool = Field(
         default=False,
-        description="normal policy whose actions are clipped into their bounds for the task "
-        "only, instead of a squashed one; needs num_envs",
+        description="normal policy, with actions clipped to their bounds for the task only; "
+        "false: squashed policy. Requires num_envs",
     )
     log_scale: float | None = Field(
         default=None,
-        description="initial logarithm of the policy's scale, which then does not depend on the"
-        " state; null: it depends on the state",
+        description="initial logarithm of a learned policy scale that does not depend on the "
+        "state; null: the scale depends on the state",
     )
     orthogonal: bool = Field(
-        default=False, description="orthogonal initial weights, small at the policy's output"
+        default=False,
+        description="orthogonal initial weights, with small weights in the policy's last layer",
     )
     activation: Literal["tanh", "relu"] = Field(
         default="tanh",
@@ -358,13 +362,13 @@ class PPOConfig(AlgorithmConfig):
     )
     normalize_observations: bool = Field(
         default=False,
-        description="normalization of observations by running mean and deviation, which the "
-        "policy keeps; needs num_envs",
+        description="normalization of observations by their running mean and standard deviation, "
+        "stored with the policy; requires num_envs",
     )
     normalize_rewards: bool = Field(
         default=False,
-        description="normalization of rewards by the running deviation of their discounted sum,"
-        " while learning; needs num_envs",
+        description="normalization of rewards during learning by the running standard deviation of "
+        "their discounted sum; requires num_envs",
     )
 
     def __post_init__(self) -> None:
@@ -372,13 +376,14 @@ class PPOConfig(AlgorithmConfig):
             if self.frames % self.num_envs:
                 raise SettingError(
                     "frames",
-                    f"must be a multiple of num_envs={self.num_envs}, which play as many each, got "
-                    f"{self.frames}.",
+                    f"must be a multiple of num_envs={self.num_envs}, got {self.frames}.",
                 )
             return
         for name in ("clip_actions", "normalize_observations", "normalize_rewards"):
             if getattr(self, name):
-                raise SettingError(name, "needs num_envs, got null: set it, to 1 for example.")
+                raise SettingError(
+                    name, "needs num_envs, got null: set num_envs, for example to 1."
+                )
 
 
 @settings

@@ -1,4 +1,4 @@
-"""The settings of a run: what its groups are, how they are read, and what depends on several."""
+"""Settings of a run, their groups, and checks across groups."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from torchrl_l2c2.experiment.settings.tasks import TASKS, TaskConfig
 
 @settings
 class LoggerConfig:
-    """Logger of the metrics, in addition to metrics.csv, which has a line per episode."""
+    """Logger of the metrics, in addition to metrics.csv with one line per episode."""
 
     name: Literal["csv", "tensorboard", "wandb", "mlflow"] = Field(
         default="csv", json_schema_extra=CHANGES_NO_NUMBERS
@@ -45,7 +45,7 @@ LOGGERS = {
     "mlflow": LoggerConfig("mlflow"),
 }
 
-# group -> name -> the settings that `group=name` chooses.
+# group -> name -> settings of `group=name`.
 GROUPS: dict[str, Mapping[str, Any]] = {
     "task": TASKS,
     "algorithm": ALGORITHMS,
@@ -54,14 +54,14 @@ GROUPS: dict[str, Mapping[str, Any]] = {
     "optimizer": OPTIMIZERS,
     "logger": LOGGERS,
 }
-# Settings of the command, which are no settings of a run: default and meaning.
-STEERING = {
-    "outputs": ("outputs", "folder that holds every run's folder"),
+# Settings of the command only, not of a run: default and description.
+COMMAND_SETTINGS = {
+    "outputs": ("outputs", "parent folder of all run folders"),
     "preset": ("null", "settings of a task and an algorithm: baselines, rl_zoo, field"),
-    "experiment": ("null", "a whole comparison, with -m; conf/experiment/ holds them"),
+    "experiment": ("null", "a whole comparison from conf/experiment/, with -m"),
     "resume": (
         "null",
-        "folder of another run to continue from; the same command continues its own run",
+        "folder of another run to continue from; null: the run's own folder",
     ),
     "allow_other_versions": (
         "false",
@@ -74,12 +74,12 @@ STEERING = {
 class ExperimentConfig:
     """Settings of a run, with the defaults of ``python train.py``.
 
-    Left out, ``replay`` and ``optimizer`` are the algorithm's usual ones, and
-    ``regularizer`` is L2C2 with the preset of the algorithm, or else the paper's settings; an
-    ``L2C2Config()`` that is given begins with the paper's settings.
+    ``replay`` and ``optimizer`` default to the algorithm's own choices. ``regularizer`` defaults to
+    L2C2 with the algorithm's preset, or with the paper's settings if there is no preset. An
+    explicit ``L2C2Config()`` always has the paper's settings.
 
     Raises:
-        SettingError: a setting that is not known or lies outside its range.
+        SettingError: If a setting is unknown or outside its range.
 
     Examples:
         >>> config = ExperimentConfig(task=TaskConfig(episodes=5), regularizer=REGULARIZERS["caps"])
@@ -89,13 +89,13 @@ class ExperimentConfig:
 
     task: TaskConfig = dataclasses.field(default_factory=lambda: TASKS["swingup"])
     algorithm: AlgorithmConfig = dataclasses.field(default_factory=PPORPEConfig)
-    # None stands for what __post_init__ chooses by the algorithm.
+    # None: __post_init__ chooses by the algorithm.
     regularizer: RegularizerConfig = None  # type: ignore[assignment]
     replay: ReplayConfig = None  # type: ignore[assignment]
     optimizer: OptimizerConfig = None  # type: ignore[assignment]
     logger: LoggerConfig = dataclasses.field(default_factory=LoggerConfig)
     seed: int = Field(
-        # Simulators and tests have seeds that are larger, and NumPy takes those below 2 ** 32.
+        # Simulators and tests use larger seeds, and NumPy's limit is 2 ** 32.
         default=0,
         ge=0,
         lt=2**31,
@@ -103,103 +103,104 @@ class ExperimentConfig:
     )
     device: str = Field(
         default="cpu",
-        description="device of the updates: cpu, cuda or cuda:N; episodes are played on the "
-        "CPU, by a copy of the policy",
+        description="device of the updates: cpu, cuda or cuda:N; a copy of the policy plays "
+        "episodes on the CPU",
         json_schema_extra=neutral("cpu"),
     )
     threads: int = Field(
         default=1,
         ge=1,
         le=1024,
-        description="threads of PyTorch; more do not speed up networks of this size",
+        description="number of PyTorch threads; more do not speed up small networks",
         json_schema_extra=CHANGES_NO_NUMBERS,
     )
     compile: bool = Field(
         default=True,
-        description="compilation of updates and policies, where a C++ compiler is found; false:"
-        " eager",
+        description="compilation of updates and policies if a C++ compiler is found; false: eager "
+        "mode",
     )
     on_nonfinite: Literal["stop", "skip"] = Field(
         default="stop",
-        description="reaction to a batch whose loss or gradient is NaN or infinite: stop the "
-        "run, or skip and count the batch",
+        description="reaction to a batch with a NaN or infinite loss or gradient: stop the run, or "
+        "skip and count the batch",
     )
     test_episodes: int = Field(
         default=100,
         ge=0,
-        description="test episodes after training, with mean actions, and as many with sampled "
-        "actions; 0: no evaluation.json, and reports leave the run out",
+        description="number of test episodes after training with mean actions, and the same number "
+        "with sampled actions; 0: no evaluation.json, and reports leave the run out",
         json_schema_extra=CHANGES_NO_NUMBERS,
     )
     evaluate_every: int = Field(
         default=0,
         ge=0,
-        description="training episodes between tests of 10 episodes; "
-        "policy_best.pt is from the best test; 0: none",
+        description="training episodes between tests of 10 episodes; policy_best.pt is the policy "
+        "with the best test; 0: no tests during training",
         json_schema_extra=CHANGES_NO_NUMBERS,
     )
     record: bool = Field(
         default=False,
-        description="video.mp4 of a test episode, after training (extra video)",
+        description="video.mp4 of a test episode after training (requires the extra video)",
         json_schema_extra=CHANGES_NO_NUMBERS,
     )
     late_share: float = Field(
         default=0.1,
         ge=0,
         le=1,
-        description="final fraction of training whose policies play a test episode each; 0: none",
+        description="last fraction of training in which every policy plays a test episode; 0: none",
         json_schema_extra=CHANGES_NO_NUMBERS,
     )
     checkpoint_interval: float = Field(
         default=60.0,
         ge=0,
-        description="seconds between checkpoints, which are written after episodes or rollouts",
+        description="minimum time between checkpoints in seconds; a checkpoint is saved after an "
+        "episode or a rollout",
         json_schema_extra=CHANGES_NO_NUMBERS,
     )
     checkpoint_keep: int = Field(
         default=2,
         ge=1,
-        description="number of newest checkpoints to keep",
+        description="number of latest checkpoints to keep",
         json_schema_extra=CHANGES_NO_NUMBERS,
     )
 
     def __post_init__(self) -> None:
-        # Frozen: this is how a default that depends on another field is set.
+        # A frozen dataclass: defaults that depend on other fields need object.__setattr__.
         if self.regularizer is None:
-            begins = preset_settings("l2c2", self.algorithm.name)
-            object.__setattr__(self, "regularizer", L2C2Config(**begins))
+            initial = preset_settings("l2c2", self.algorithm.name)
+            object.__setattr__(self, "regularizer", L2C2Config(**initial))
         if self.replay is None:
-            object.__setattr__(self, "replay", REPLAYS[self.algorithm.usual_replay])
+            object.__setattr__(self, "replay", REPLAYS[self.algorithm.default_replay])
         if self.optimizer is None:
-            object.__setattr__(self, "optimizer", OPTIMIZERS[self.algorithm.usual_optimizer])
+            object.__setattr__(self, "optimizer", OPTIMIZERS[self.algorithm.default_optimizer])
         self._check_names()
         self._check_device()
         self._check_replay()
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> ExperimentConfig:
-        """Reads nested mappings, such as a resolved Hydra configuration.
+        """Creates the settings from nested mappings, such as a resolved Hydra configuration.
 
         Args:
             values (Mapping): Settings by group and name. Missing settings have the defaults of the
-                group's name, for ``l2c2`` the paper's settings. ``outputs``, ``resume``,
-                ``experiment`` and ``allow_other_versions`` are settings of the command, and are
+                group's ``name``; for ``l2c2``, the paper's settings. Settings of the command
+                (``outputs``, ``preset``, ``resume``, ``experiment``, ``allow_other_versions``) are
                 ignored.
 
         Raises:
-            SettingError: an unknown key, an unknown name, or a value outside its range.
+            SettingError: If a key or name is unknown, or a value is outside its range.
         """
-        given = {k: v for k, v in values.items() if k not in STEERING}
+        given = {k: v for k, v in values.items() if k not in COMMAND_SETTINGS}
         for group in GROUPS.keys() & given.keys():
             given[group] = _read_group(group, given[group])
         return read(cls, given, "")
 
     def to_dict(self) -> dict[str, Any]:
-        """Nested dictionaries of plain values: ``from_dict`` reads them back."""
+        """Returns nested dictionaries of plain values, the inverse of :meth:`from_dict`."""
         return dataclasses.asdict(self)
 
     def _check_names(self) -> None:
-        """A group is found again by its name, as a run's folder has it; tasks may have any."""
+        """Checks that each group's name belongs to its class; tasks may have any name."""
         for group in GROUPS.keys() - {"task"}:
             chosen, choices = getattr(self, group), GROUPS[group]
             if type(choices.get(chosen.name)) is not type(chosen):
@@ -210,30 +211,30 @@ class ExperimentConfig:
                 )
 
     def _check_device(self) -> None:
-        # Not a pattern of the field, which pydantic would show as it is written.
+        # Not a pattern of the field: pydantic would show the regular expression to the user.
         if not re.fullmatch(r"cpu|cuda(:\d+)?", self.device):
             raise SettingError(
-                "device", f"must be cpu, cuda or cuda:N, a number from 0 up, got {self.device!r}."
+                "device", f"must be cpu, cuda or cuda:N with N >= 0, got {self.device!r}."
             )
 
     def _check_replay(self) -> None:
-        on_policy = self.algorithm.usual_replay == "rollout"
+        on_policy = self.algorithm.default_replay == "rollout"
         if on_policy != (type(self.replay) is type(REPLAYS["rollout"])):
             raise SettingError(
                 "replay",
-                f"{self.replay.name!r} is nothing that algorithm {self.algorithm.name!r} can learn "
-                "from: ppo needs rollout, the others prioritized or uniform.",
+                f"{self.replay.name!r} does not work with algorithm {self.algorithm.name!r}: ppo "
+                "needs rollout, the others prioritized or uniform.",
             )
 
 
 def _read_group(group: str, values: Mapping[str, Any]) -> Any:
-    """The settings of a group that a mapping's ``name`` chooses, with its other values."""
+    """Reads a group: the choice given by ``name``, changed by the other values."""
     if not isinstance(values, Mapping):
-        raise SettingError(group, f"must have settings by their names, got {values!r}.")
+        raise SettingError(group, f"must be a mapping of settings by name, got {values!r}.")
     choices, name = GROUPS[group], str(values.get("name"))
     if name in choices:
         return read(partial(dataclasses.replace, choices[name]), values, group)
-    if group == "task":  # Any name will do for a task of one's own.
+    if group == "task":  # A user's own task may have any name.
         if values.get("env_id", "") is None:
             raise SettingError(
                 "env_id", "must be given with task=gymnasium, such as Pendulum-v1, got null.", group

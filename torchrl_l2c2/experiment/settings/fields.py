@@ -1,6 +1,6 @@
-"""Groups of settings: frozen dataclasses whose fields have a default, a range and a meaning.
+"""Classes of settings: frozen dataclasses whose fields have a default, a range and a description.
 
-Settings do not import torch: help and errors appear at once.
+Settings do not import torch, so help and errors appear at once.
 """
 
 from __future__ import annotations
@@ -16,14 +16,13 @@ from torchrl_l2c2.experiment.errors import UserError
 
 Group = TypeVar("Group")
 
-# Metadata of a setting, for ``Field(json_schema_extra=...)``; :mod:`~.settings.identity` reads it.
-# A run and its continuation may differ in this setting: it changes none of the numbers, or only
-# how long the training is.
+# Metadata of a setting, for ``Field(json_schema_extra=...)``, used by ``settings/identity.py``.
+# The setting changes no numbers, or only the length of training: a continued run may change it.
 CHANGES_NO_NUMBERS: dict[str, Any] = {"changes_no_numbers": True}
 
 
 def neutral(value: Any) -> dict[str, Any]:
-    """Metadata of a setting: with this value, a run has the numbers of one without the setting."""
+    """Returns metadata: the value at which a setting does not change a run's numbers."""
     return {"neutral": value}
 
 
@@ -31,8 +30,8 @@ class SettingError(UserError):
     """A setting that is unknown or outside its range.
 
     Attributes:
-        setting: its name within its group; empty where it is about several.
-        problem: what is allowed, and what was given.
+        setting: Name of the setting within its group; empty if several are involved.
+        problem: Allowed values and the given value.
     """
 
     def __init__(self, setting: str, problem: str, group: str = "") -> None:
@@ -42,19 +41,23 @@ class SettingError(UserError):
 
 @dataclass_transform(frozen_default=True, field_specifiers=(Field,))
 def settings(cls: type[Group]) -> type[Group]:
-    """Makes a class of settings: frozen, its values checked against their types and ranges.
+    """Makes a class of settings: a frozen dataclass that checks types and ranges.
 
-    Raises:
-        SettingError: when an object is made with a value that is not allowed, or of another name.
+    Args:
+        cls (type): Class whose fields are settings.
+
+    Returns:
+        type: The dataclass. Creating an object with an unknown setting or a value outside its range
+        raises a :class:`SettingError`.
 
     Examples:
         >>> from pydantic import Field
         >>> @settings
-        ... class Pace:
-        ...     tau: float = Field(default=0.1, gt=0, le=1, description="how fast targets follow")
-        >>> Pace(tau=2.0)
+        ... class Targets:
+        ...     tau: float = Field(default=0.1, gt=0, le=1, description="rate of the soft update")
+        >>> Targets(tau=2.0)
         Traceback (most recent call last):
-        torchrl_l2c2.experiment.settings.fields.SettingError: Pace.tau must be less than or equal to 1, got 2.0.
+        torchrl_l2c2.experiment.settings.fields.SettingError: Targets.tau must be less than or equal to 1, got 2.0.
     """  # noqa: E501
     strict = ConfigDict(
         strict=True, extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True
@@ -66,25 +69,28 @@ def settings(cls: type[Group]) -> type[Group]:
         try:
             checked(self, *args, **values)
         except ValidationError as error:
-            raise _first_problem(error, made) from None
+            raise _first_error(error, made) from None
 
     made.__init__ = __init__  # type: ignore[method-assign]
     return made  # type: ignore[return-value]
 
 
 def read(make: Callable[..., Group], values: Mapping[str, Any], prefix: str) -> Group:
-    """Settings from plain values, as a file or a command line has them.
+    """Creates settings from the plain values of a file or a command line.
 
-    Lists stand for tuples, and whole floats for integers, as in ``task.frames=1e6``.
+    Lists become tuples, and whole floats become integers, as in ``task.frames=1e6``.
 
     Args:
-        make (Callable): a class of settings, or a ``functools.partial`` of ``dataclasses.replace``
-            and an object of one.
-        values (Mapping): by name.
-        prefix (str): how errors name the group, such as ``"task"``.
+        make (Callable): Class of settings, or a ``functools.partial`` of ``dataclasses.replace``
+            and an object of such a class.
+        values (Mapping): Values by name.
+        prefix (str): Name of the group in error messages, such as ``"task"``.
+
+    Returns:
+        The object that ``make`` returns.
 
     Raises:
-        SettingError: an unknown name, or a value outside its range.
+        SettingError: If a name is unknown or a value is outside its range.
     """
     plain = {name: _plain(value) for name, value in values.items()}
     try:
@@ -96,17 +102,17 @@ def read(make: Callable[..., Group], values: Mapping[str, Any], prefix: str) -> 
 def _plain(value: Any) -> Any:
     if isinstance(value, list):
         return tuple(map(_plain, value))
-    # Pydantic turns the integer into a float where the field is a float.
+    # If the field is a float, pydantic converts the integer back.
     whole = isinstance(value, float) and value.is_integer() and abs(value) < 2**63
     return int(value) if whole else value
 
 
-# A cache: the command's help and its nodes ask many times.
+# A cache: help and Hydra's nodes ask many times.
 _described: dict[type, dict[str, tuple[str, str]]] = {}
 
 
 def describe(group: type) -> dict[str, tuple[str, str]]:
-    """The range or choices and the meaning of every setting of a group, as they were declared."""
+    """Returns the allowed values and the description of each setting of a class, by name."""
     if group not in _described:
         types = get_type_hints(group)
         _described[group] = {
@@ -135,8 +141,8 @@ def _allowed(annotation: Any, declared: Any) -> str:
     return " | ".join([*choices, *([", ".join(limits)] if limits else [])])
 
 
-def _first_problem(error: ValidationError, cls: type) -> SettingError:
-    """Pydantic's first complaint as one line."""
+def _first_error(error: ValidationError, cls: type) -> SettingError:
+    """Converts pydantic's first error into one line."""
     first = error.errors(include_url=False, include_context=True)[0]
     where, given = [str(part) for part in first["loc"]], first["input"]
     name = next((part for part in where if part in {f.name for f in dataclasses.fields(cls)}), "")
@@ -147,8 +153,8 @@ def _first_problem(error: ValidationError, cls: type) -> SettingError:
         return SettingError(name, str(cause), cls.__name__)
     if first["type"] == "unexpected_keyword_argument":
         known = ", ".join(sorted(f.name for f in dataclasses.fields(cls)))
-        return SettingError(where[0], f"is not a setting; here there are {known}.", cls.__name__)
-    if first["type"] == "missing":  # of a tuple
+        return SettingError(where[0], f"is not a setting; choose from {known}.", cls.__name__)
+    if first["type"] == "missing":  # A tuple is too short.
         return SettingError(name, f"must have more entries, got {list(given)}.", cls.__name__)
     allowed = first["msg"].replace("Input should be", "must be", 1)
     allowed = allowed.replace("a valid tuple", "a list")

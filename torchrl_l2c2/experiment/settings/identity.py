@@ -1,7 +1,7 @@
-"""Identity of a run: a short code, and the settings that differ from the defaults.
+"""Identity of a run: a hash of its settings, and the settings that differ from the defaults.
 
-The fields of the settings say it: their metadata are :data:`~.fields.CHANGES_NO_NUMBERS` and
-:func:`~.fields.neutral`.
+The metadata of the settings' fields, ``CHANGES_NO_NUMBERS`` and ``neutral`` of ``fields.py``,
+declare which settings count.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.settings.config import GROUPS, ExperimentConfig
 from torchrl_l2c2.experiment.settings.tasks import TASKS
 
-NOT_THEN = "none, as it is a setting since"
-# How long a training is; a longer one is of the same kind.
+NEWER_SETTING = "none (a newer setting)"
+# Length of training: runs of different lengths are of the same kind.
 BUDGETS = ("task.episodes", "task.frames")
 
 
 @cache
 def _metadata() -> dict[str, dict[str, Any]]:
-    """The metadata of the settings that have any, by the names of the command line."""
+    """Returns the metadata of settings by their command-line names."""
     classes = {("", ExperimentConfig)}
     classes |= {(f"{g}.", type(each)) for g, choices in GROUPS.items() for each in choices.values()}
     return {
@@ -35,13 +35,13 @@ def _metadata() -> dict[str, dict[str, Any]]:
     }
 
 
-def is_free(name: str, gain_of: str | None = None) -> bool:
+def may_change(name: str, gain_of: str | None = None) -> bool:
     """Checks whether a setting may differ between a run and its continuation.
 
     Args:
-        name (str): name with the group, such as ``"task.solved_at"``.
-        gain_of (str, optional): the regularizer's ``gain_of``: what a gain follows is part of the
-            training.
+        name (str): Name with the group, such as ``"task.solved_at"``.
+        gain_of (str, optional): The regularizer's ``gain_of``. Settings that affect this metric may
+            not differ.
     """
     if name == "late_share" and str(gain_of).startswith("test_"):
         return False
@@ -52,17 +52,17 @@ def is_neutral(name: str, value: Any) -> bool:
     """Checks whether a run with this value has the numbers of a run without the setting.
 
     Args:
-        name (str): name with the group, such as ``"regularizer.policy_distance"``.
-        value: value of the setting.
+        name (str): Name with the group, such as ``"regularizer.policy_distance"``.
+        value: Value of the setting.
     """
     neutral = _metadata().get(name, {}).get("neutral")
     return value is None or value is False or (neutral is not None and neutral == value)
 
 
-def by_name(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings by the names of the command line; settings of groups as ``group.name``.
+def flatten_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the settings by their command-line names, such as ``group.name``.
 
-    As JSON has them, where a tuple and a list are the same.
+    Values are converted as by JSON, in which a tuple and a list are the same.
 
     Args:
         settings (Mapping): Content of ``config.json`` or of a checkpoint, or result of
@@ -74,61 +74,64 @@ def by_name(settings: Mapping[str, Any]) -> dict[str, Any]:
     return flat
 
 
-def differing(saved: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """Settings that change a run's numbers and have changed.
+def changed_settings(
+    saved: Mapping[str, Any], now: Mapping[str, Any]
+) -> dict[str, tuple[Any, Any]]:
+    """Returns changed settings, except for settings that change no numbers.
 
     Args:
         saved (Mapping): Content of ``config.json`` or of a checkpoint.
         now (Mapping): Result of ``ExperimentConfig.to_dict()``.
 
     Returns:
-        dict: The old and the new value by name; choices of a group first.
+        dict: The old and the new value by name; names of choices, such as ``task.name``, come
+        first.
     """
-    before, after = by_name(saved), by_name(now)
-    # The settings of another choice are others anyway.
+    before, after = flatten_settings(saved), flatten_settings(now)
+    # Names of choices first: they explain the differences in their settings.
     names = sorted(before.keys() | after.keys(), key=lambda n: (not n.endswith(".name"), n))
     followed = after.get("regularizer.gain_of")
     pairs = {
-        name: (before.get(name, NOT_THEN), after.get(name, NOT_THEN))
+        name: (before.get(name, NEWER_SETTING), after.get(name, NEWER_SETTING))
         for name in names
-        if not is_free(name, followed)
+        if not may_change(name, followed)
     }
     return {
         name: (was, is_now)
         for name, (was, is_now) in pairs.items()
-        if was != is_now and not (was == NOT_THEN and is_neutral(name, is_now))
+        if was != is_now and not (was == NEWER_SETTING and is_neutral(name, is_now))
     }
 
 
-def of_length(config: ExperimentConfig) -> list[str]:
-    """The settings by which a longer training begins otherwise than a shorter one."""
+def length_dependent_settings(config: ExperimentConfig) -> list[str]:
+    """Returns the settings whose effect during training depends on the training's length."""
     gain_of = str(getattr(config.regularizer, "gain_of", None))
-    going = {
+    length_dependent = {
         f"regularizer.gain_of={gain_of}": gain_of.startswith("test_"),
         "optimizer.linear=true": config.optimizer.linear,
         "regularizer.gain=ramp": config.regularizer.ramped,
     }
-    return [setting for setting, chosen in going.items() if chosen]
+    return [setting for setting, chosen in length_dependent.items() if chosen]
 
 
-# Groups that are chosen by name; their other fields are settings of the choice.
+# Groups whose choices do not depend on other groups.
 _COMPARED = ("task", "algorithm", "regularizer")
 
 
 def fingerprint(config: Mapping[str, Any]) -> str:
-    """Ten hexadecimal digits that two runs share if, and only if, they may be pooled.
+    """Returns a hash of ten hexadecimal digits that is equal for runs that may be pooled.
 
-    The seed, the logger and the task's name do not count. Neither do settings that change none of
-    the numbers, or only the length of the training. A setting that is off (null, false, or the
-    value of older runs) does not count either: a new setting keeps the codes of older runs.
+    It ignores the seed, the logger, the task's name, and settings that change no numbers or only
+    the length of training. It also ignores settings that are off (null, false, or the neutral
+    value), so a new setting does not change the hashes of older runs.
 
     Args:
-        config (Mapping): Content of ``config.json``; missing settings have their defaults.
+        config (Mapping): Content of ``config.json``. Missing settings have their defaults.
 
     Raises:
-        SettingError: a setting that is not known.
+        SettingError: If a setting is unknown.
     """
-    own = by_name(ExperimentConfig.from_dict(config).to_dict())
+    own = flatten_settings(ExperimentConfig.from_dict(config).to_dict())
     compared = {
         name: value
         for name, value in own.items()
@@ -138,17 +141,17 @@ def fingerprint(config: Mapping[str, Any]) -> str:
 
 
 def differences(config: Mapping[str, Any]) -> dict[str, str]:
-    """The settings that differ from the defaults of what the run's names choose.
+    """Returns the settings that differ from the defaults of the run's choices.
 
     Args:
         config (Mapping): Content of ``config.json``.
 
     Returns:
-        dict: such as ``{"algorithm.replay_ratio": "10", "task.episodes": "400"}``, sorted; without
-        the settings that change none of the numbers.
+        dict: Values by name, sorted, such as ``{"algorithm.replay_ratio": "10",
+        "task.episodes": "400"}``. Settings that change no numbers are left out.
 
     Raises:
-        SettingError: a setting that is not known.
+        SettingError: If a setting is unknown.
 
     Examples:
         >>> config = ExperimentConfig().to_dict()
@@ -156,27 +159,27 @@ def differences(config: Mapping[str, Any]) -> dict[str, str]:
         >>> differences(config)
         {'regularizer.beta': '0.5'}
     """
-    own = by_name(ExperimentConfig.from_dict(config).to_dict())
-    usual = by_name(ExperimentConfig.from_dict(_names(config, _COMPARED)).to_dict())
-    chosen = by_name(ExperimentConfig.from_dict(_names(config, GROUPS)).to_dict())
+    own = flatten_settings(ExperimentConfig.from_dict(config).to_dict())
+    defaults = flatten_settings(ExperimentConfig.from_dict(_names(config, _COMPARED)).to_dict())
+    chosen = flatten_settings(ExperimentConfig.from_dict(_names(config, GROUPS)).to_dict())
     return {
         name: _word(value)
         for name, value in sorted(own.items())
         if (_counts(name, own) or name in BUDGETS)
-        and value != (usual if name.endswith(".name") else chosen)[name]
+        and value != (defaults if name.endswith(".name") else chosen)[name]
     }
 
 
 def write_differences(values: Mapping[str, str]) -> str:
-    """One line of what differs: ``a=1 b=2``."""
+    """Returns the differences as one line, such as ``a=1 b=2``."""
     return " ".join(f"{name}={value}" for name, value in values.items())
 
 
 def read_differences(line: str) -> dict[str, str]:
-    """Reads :func:`write_differences` back.
+    """Parses a line of :func:`write_differences`.
 
     Raises:
-        UserError: a word that is no setting with its value.
+        UserError: If a word has no ``=``.
     """
     pairs = [word.partition("=") for word in line.split()]
     if cut := [name for name, equals, _ in pairs if not equals]:
@@ -186,17 +189,17 @@ def read_differences(line: str) -> dict[str, str]:
 
 def _names(config: Mapping[str, Any], groups: Any) -> dict[str, Any]:
     named = {group: {"name": config[group]["name"]} for group in groups if group in config}
-    if named["task"]["name"] not in TASKS:  # A task of one's own is what its id says.
+    if named["task"]["name"] not in TASKS:  # A user's own task is identified by its env_id.
         named["task"]["env_id"] = config["task"]["env_id"]
     return named
 
 
 def _counts(name: str, settings: Mapping[str, Any]) -> bool:
-    return name != "seed" and not is_free(name, settings.get("regularizer.gain_of"))
+    return name != "seed" and not may_change(name, settings.get("regularizer.gain_of"))
 
 
 def _word(value: Any) -> str:
-    """A value without a space in it: as JSON, but for plain words and whole floats."""
+    """Formats a value without spaces: as JSON, except for plain words and whole floats."""
     if isinstance(value, float) and value.is_integer():
         value = int(value)
     if isinstance(value, str) and value.replace("_", "").isalnum():

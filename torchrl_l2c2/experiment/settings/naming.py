@@ -1,7 +1,7 @@
-"""Names of run folders: task, algorithm, regularizer, and settings that are not the defaults.
+"""Names of run folders, from the task, the algorithm, the regularizer and changed settings.
 
-Names are taken as they are by shells, Hydra's command line and every file system, and are the same
-for single runs and sweeps. The whole of the settings is in the folder's ``config.json``.
+Names need no quoting in shells, on Hydra's command line or in any file system. Single runs and
+sweeps use the same names. The folder's ``config.json`` contains all settings.
 """
 
 from __future__ import annotations
@@ -15,23 +15,23 @@ from pathlib import PurePosixPath
 from typing import Any
 
 from torchrl_l2c2.experiment.settings.config import GROUPS, ExperimentConfig
-from torchrl_l2c2.experiment.settings.identity import is_free
+from torchrl_l2c2.experiment.settings.identity import may_change
 from torchrl_l2c2.experiment.settings.regularizers import preset_settings
 from torchrl_l2c2.experiment.settings.tasks import TaskConfig
 
-LONGEST = 64
+MAX_PART_LENGTH = 64
 
 
 def run_name(config: ExperimentConfig) -> str:
-    """The path of a run's folder below ``outputs``.
+    """Returns the path of a run's folder below ``outputs``.
 
     Args:
         config (ExperimentConfig): The run's settings.
 
     Returns:
-        str: ``task/algorithm/regularizer/setting-value_setting-value/seed_0``, of letters, digits
-        and ``.+-_`` only. The fourth part is missing if every setting has its default. A long part
-        is cut and ends with a hash; the regularizer's settings then come first.
+        str: ``task/algorithm/regularizer/setting-value_setting-value/seed_0`` of letters, digits
+        and ``.+-_``. The fourth part is left out if every setting has its default. A part longer
+        than 64 characters is cut and ends with a hash; the regularizer's settings then come first.
 
     Examples:
         >>> from torchrl_l2c2.experiment import ExperimentConfig, L2C2Config
@@ -44,44 +44,44 @@ def run_name(config: ExperimentConfig) -> str:
 
 
 def _settings_part(config: ExperimentConfig) -> list[str]:
-    unusual = list(_unusual(config))
-    if sum(len(_written(*each[1:])) + 1 for each in unusual) > LONGEST + 1:
-        # Keep the settings that runs are compared by.
-        unusual.sort(key=lambda each: each[0] != "regularizer")
-    return ["_".join(_written(*each[1:]) for each in unusual)] if unusual else []
+    changed = list(_changed_settings(config))
+    if sum(len(_written(*each[1:])) + 1 for each in changed) > MAX_PART_LENGTH + 1:
+        # Comparisons vary the regularizer's settings most often: keep these.
+        changed.sort(key=lambda each: each[0] != "regularizer")
+    return ["_".join(_written(*each[1:]) for each in changed)] if changed else []
 
 
-def _unusual(config: ExperimentConfig) -> Iterator[tuple[str, str, Any]]:
-    """Settings that change a run's numbers and differ from its choices, with their groups."""
-    usual_names = {
-        "replay": config.algorithm.usual_replay,
-        "optimizer": config.algorithm.usual_optimizer,
+def _changed_settings(config: ExperimentConfig) -> Iterator[tuple[str, str, Any]]:
+    """Yields group, name and value of each setting that differs from the defaults."""
+    default_names = {
+        "replay": config.algorithm.default_replay,
+        "optimizer": config.algorithm.default_optimizer,
     }
     names = Counter(name for group in GROUPS for name in vars(getattr(config, group)))
     for group in sorted(GROUPS):
         chosen = getattr(config, group)
-        if chosen.name != usual_names.get(group, chosen.name):
+        if chosen.name != default_names.get(group, chosen.name):
             yield group, group, chosen.name
-        usual = _usual(group, chosen, config.algorithm.name)
+        defaults = _defaults_of_choice(group, chosen, config.algorithm.name)
         for name, value in vars(chosen).items():
-            free = name == "name" or is_free(f"{group}.{name}")
-            if not free and value != getattr(usual, name):
-                alone = group == "regularizer" or names[name] == 1
-                yield group, name if alone else f"{group}.{name}", value
-    usual, followed = ExperimentConfig(), getattr(config.regularizer, "gain_of", None)
+            ignored = name == "name" or may_change(f"{group}.{name}")
+            if not ignored and value != getattr(defaults, name):
+                unique = group == "regularizer" or names[name] == 1
+                yield group, name if unique else f"{group}.{name}", value
+    default, gain_of = ExperimentConfig(), getattr(config.regularizer, "gain_of", None)
     for name in sorted(vars(config).keys() - GROUPS.keys() - {"seed"}):
-        if not is_free(name, followed) and getattr(config, name) != getattr(usual, name):
+        if not may_change(name, gain_of) and getattr(config, name) != getattr(default, name):
             yield "", name, getattr(config, name)
 
 
-def _usual(group: str, chosen: Any, algorithm: str) -> Any:
-    """The settings of ``group=name``: a regularizer's preset for the algorithm, a task's own id."""
+def _defaults_of_choice(group: str, chosen: Any, algorithm: str) -> Any:
+    """Returns the settings of ``group=name``, with the regularizer's preset for the algorithm."""
     if group == "task" and chosen.name not in GROUPS[group]:
         return TaskConfig(chosen.name, chosen.name)
-    usual = GROUPS[group][chosen.name]
+    defaults = GROUPS[group][chosen.name]
     if group == "regularizer":
-        return replace(usual, **preset_settings(chosen.name, algorithm))
-    return usual
+        return replace(defaults, **preset_settings(chosen.name, algorithm))
+    return defaults
 
 
 def _written(name: str, value: Any) -> str:
@@ -89,7 +89,7 @@ def _written(name: str, value: Any) -> str:
 
 
 def plain(value: Any) -> str:
-    """A value in characters that file names take."""
+    """Formats a value for a file name."""
     if isinstance(value, tuple):
         return "x".join(map(plain, value))
     if value is None or isinstance(value, bool):
@@ -98,6 +98,6 @@ def plain(value: Any) -> str:
 
 
 def _short(part: str) -> str:
-    if len(part) <= LONGEST:
+    if len(part) <= MAX_PART_LENGTH:
         return part
-    return f"{part[: LONGEST - 9]}_{hashlib.sha256(part.encode()).hexdigest()[:8]}"
+    return f"{part[: MAX_PART_LENGTH - 9]}_{hashlib.sha256(part.encode()).hexdigest()[:8]}"

@@ -11,7 +11,7 @@ from torchrl_l2c2.experiment.settings.fields import SettingError, settings
 
 @settings
 class AdaTermConfig:
-    """The paper's optimizer, AdaTerm, at one learning rate."""
+    """The paper's optimizer, AdaTerm, with a constant learning rate."""
 
     linear: ClassVar[bool] = False
 
@@ -20,7 +20,7 @@ class AdaTermConfig:
     beta: float = Field(default=0.9, gt=0, lt=1, description="decay of the moments [paper]")
     eps: float = Field(default=1e-5, gt=1.1e-19, description="smallest scale of a gradient [paper]")
     nu_min: float = Field(
-        default=1.0, gt=0, description="fewest degrees of freedom; larger is less robust [paper]"
+        default=1.0, gt=0, description="minimum degrees of freedom; larger is less robust [paper]"
     )
 
 
@@ -41,7 +41,7 @@ class AdamConfig:
     linear: bool = Field(
         default=False,
         description="linear decay of the learning rate to 0 over the training. If a run is "
-        "later extended, its decay was steeper than in a run of the full length",
+        "extended later, its first part has decayed faster than in a run of the full length",
     )
 
     def __post_init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Settings of the regularizers, and of the gain's schedule."""
+"""Settings of the regularizers and of the gain's schedule."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ from pydantic import Field
 from torchrl_l2c2.experiment.settings.fields import SettingError, neutral, settings
 from torchrl_l2c2.presets import KINDS, METHODS, preset
 
-# Values of ``gain`` with which a setting has an effect.
-READ_BY = {
+# Setting -> values of ``gain`` for which the setting has an effect.
+USED_WITH_GAIN = {
     "gain_target": ("target",),
     "gain_of": ("target",),
     "gain_rate": ("target",),
     "gain_limit": ("target",),
     "gain_length": ("ramp",),
 }
-# The setting of regularizers that compare means.
+# Shared by the regularizers that compare means.
 COMPARED_MEAN: Any = Field(
     default="loc",
-    description="means that are compared: before the squashing (loc) or after it (action); "
-    "no difference for deterministic policies (td3) [inferred: loc]",
+    description="means to compare: before the squashing (loc) or after it (action); the same for "
+    "deterministic policies (td3) [inferred: loc]",
 )
 
 
 class RegularizerConfig:
-    """Settings of a regularizer.
+    """Common settings of all regularizers.
 
     Attributes:
-        reads_previous: whether batches must have the previous observation.
+        reads_previous: Whether batches must contain the previous observation.
     """
 
     reads_previous: ClassVar[bool] = False
@@ -45,19 +45,19 @@ class RegularizerConfig:
 
 @settings
 class GainConfig(RegularizerConfig):
-    """Settings of a regularizer with a gain, and of the gain's schedule."""
+    """Common settings of regularizers with a gain, and the gain's schedule."""
 
     strength: float = Field(
         default=1.0,
         ge=0,
-        description="factor on the penalty; larger values smooth more, too large values lower the "
-        "return",
+        description="factor on the penalty; larger values smooth more, but too large values lower "
+        "the return",
         json_schema_extra=neutral(1.0),
     )
     gain: Literal["constant", "ramp", "target"] = Field(
         default="constant",
-        description="schedule of the gain: constant, a linear ramp from 0 to 1, or the gain that "
-        "keeps gain_of at or below gain_target; set after every episode",
+        description="schedule of the gain, applied after every episode: constant, ramp (linear "
+        "from 0 to 1), or target (keeps gain_of at or below gain_target)",
         json_schema_extra=neutral("constant"),
     )
     gain_target: float | None = Field(
@@ -65,43 +65,44 @@ class GainConfig(RegularizerConfig):
     )
     gain_of: str = Field(
         default="action_variation",
-        description="column of metrics.csv that gain=target keeps at or below gain_target; its "
-        "numbers must be at least 0",
+        description="column of metrics.csv that gain=target keeps at or below gain_target; must be "
+        "a nonnegative metric",
         json_schema_extra=neutral("action_variation"),
     )
     gain_rate: float = Field(
         default=0.1,
         gt=0,
         le=1,
-        description="largest change of the gain's logarithm in a step of gain=target",
+        description="largest change of the gain's logarithm per step of gain=target; larger values "
+        "react faster",
         json_schema_extra=neutral(0.1),
     )
     gain_limit: float = Field(
         default=1000.0,
         gt=1,
-        description="largest gain of gain=target; the smallest is 1 over it",
+        description="largest gain of gain=target; the smallest gain is 1 / gain_limit",
         json_schema_extra=neutral(1000.0),
     )
     gain_length: float = Field(
         default=1.0,
         gt=0,
         le=1,
-        description="share of training after which gain=ramp is at full strength",
+        description="share of training after which gain=ramp reaches its full value",
         json_schema_extra=neutral(1.0),
     )
 
     def __post_init__(self) -> None:
-        if self.gain in READ_BY["gain_target"] and self.gain_target is None:
+        if self.gain in USED_WITH_GAIN["gain_target"] and self.gain_target is None:
             raise SettingError("gain_target", f"must be given with gain={self.gain}, got null.")
         declared: Any = {field.name: field.default for field in dataclasses.fields(GainConfig)}
-        for name, gains in READ_BY.items():
-            given, usual = getattr(self, name), declared[name].default
-            if self.gain not in gains and given != usual:
+        for name, gains in USED_WITH_GAIN.items():
+            given, default = getattr(self, name), declared[name].default
+            if self.gain not in gains and given != default:
                 raise SettingError(
                     name,
                     f"works only with gain={' or gain='.join(gains)}, got {given} with "
                     f"gain={self.gain}: change gain, or leave {name} at "
-                    f"{'null' if usual is None else usual}.",
+                    f"{'null' if default is None else default}.",
                 )
 
     @property
@@ -129,16 +130,16 @@ class L2C2Config(GainConfig):
     neighbors: Literal["box", "line"] = Field(
         default="box",
         description="shape of the neighborhood: a box around s with s' at a corner (one random "
-        "number for each dimension of the state) [paper], or the line through s and s' (one number "
-        "for all)",
+        "number per dimension of the state) [paper], or the line through s and s' (one random "
+        "number for all dimensions)",
         json_schema_extra=neutral("box"),
     )
     max_step: float | None = Field(
         default=None,
         gt=0,
-        description="longest step from s to s' that counts, in the observation's units (with "
-        "algorithm.normalize_observations, in standard deviations); excludes resets and teleports; "
-        "null: no limit [paper]",
+        description="largest step from s to s' in the observation's units (with "
+        "algorithm.normalize_observations, in standard deviations); transitions with larger steps, "
+        "such as resets and teleports, have no penalty; null: no limit [paper]",
     )
     beta: float = Field(
         default=0.1,
@@ -148,24 +149,24 @@ class L2C2Config(GainConfig):
     num_samples: int = Field(default=1, ge=1, description="neighbors per transition [inferred: 1]")
     over_neighbors: Literal["mean", "max"] = Field(
         default="mean",
-        description="reduction over a transition's neighbors: their mean [paper], or the "
-        "largest penalty, which needs num_samples above 1",
+        description="reduction over a transition's neighbors: mean [paper] or max of the penalty; "
+        "max requires num_samples above 1",
         json_schema_extra=neutral("mean"),
     )
     fraction: float = Field(
         default=1.0,
         gt=0,
         le=1,
-        description="share of the batch that has neighbors; smaller values save time in large "
-        "batches and make the terms noisier [paper: all]",
+        description="share of the batch that is regularized; smaller values save time in large "
+        "batches but make the penalty noisier [paper: all]",
         json_schema_extra=neutral(1.0),
     )
     policy_distance: Literal["hellinger", "mean", "mse", "kl"] = Field(
         default="hellinger",
-        description="distance of policies: hellinger [paper]; mean: half the squared distance of "
-        "the means before the squashing; mse: their mean squared error over the action's "
-        "dimensions; kl: the KL divergence. Each needs other gains. For deterministic policies "
-        "(td3), hellinger and mean are half the squared distance of the actions",
+        description="distance between policies: hellinger [paper]; mean: half the squared distance "
+        "of the means before the squashing; mse: their mean squared error over the action's "
+        "dimensions; kl: the KL divergence. Each distance needs its own gains. For deterministic "
+        "policies (td3), hellinger and mean are half the squared distance of the actions",
         json_schema_extra=neutral("hellinger"),
     )
 
@@ -175,7 +176,7 @@ class L2C2Config(GainConfig):
             raise SettingError(
                 "lambda_max",
                 f"must be above lambda_min and above sigma * lambda_min, here above {least:g}, got "
-                f"{self.lambda_max:g}: raise it, or lower lambda_min or sigma.",
+                f"{self.lambda_max:g}: increase lambda_max, or decrease lambda_min or sigma.",
             )
         if self.over_neighbors == "max" and self.num_samples == 1:
             raise SettingError("num_samples", "must be above 1 with over_neighbors=max, got 1.")
@@ -190,10 +191,12 @@ class CAPSConfig(GainConfig):
         default=0.2, gt=0, description="standard deviation of the noise on the state [paper]"
     )
     lambda_temporal: float = Field(
-        default=0.01, ge=0, description="gain of the distance between s and s' [paper]"
+        default=0.01, ge=0, description="gain of the action distance between s and s' [paper]"
     )
     lambda_spatial: float = Field(
-        default=0.05, ge=0, description="gain of the distance between s and its noisy copy [paper]"
+        default=0.05,
+        ge=0,
+        description="gain of the action distance between s and its noisy copy [paper]",
     )
     mean: Literal["loc", "action"] = COMPARED_MEAN
 
@@ -207,14 +210,14 @@ class CATSConfig(GainConfig):
         default="ramp", description="schedule of the gain, as for other methods [paper: ramp]"
     )
     lambda_temporal: float = Field(
-        default=0.1, ge=0, description="gain of the distance between s and s' [inferred]"
+        default=0.1, ge=0, description="gain of the action distance between s and s' [inferred]"
     )
     mean: Literal["loc", "action"] = COMPARED_MEAN
 
 
 @settings
 class GradCAPSConfig(GainConfig):
-    """Settings of GradCAPSLoss. Batches have the previous observation."""
+    """Settings of GradCAPSLoss, which needs the previous observation in each batch."""
 
     reads_previous: ClassVar[bool] = True
 
@@ -232,7 +235,7 @@ class GradCAPSConfig(GainConfig):
 
 @settings
 class ASAPConfig(GainConfig):
-    """Settings of ASAPLoss. Batches have the previous observation."""
+    """Settings of ASAPLoss, which needs the previous observation in each batch."""
 
     reads_previous: ClassVar[bool] = True
 
@@ -241,7 +244,7 @@ class ASAPConfig(GainConfig):
         default=0.3,
         ge=0,
         description="gain of the distance to the predicted action [the authors' value for MuJoCo; "
-        "0.03 for LunarLander and Pendulum]",
+        "for LunarLander and Pendulum: 0.03]",
     )
     lambda_temporal: float = Field(
         default=2.0, ge=0, description="gain of the predictor's loss [the authors' value]"
@@ -249,8 +252,8 @@ class ASAPConfig(GainConfig):
     lambda_grad: float = Field(
         default=0.05,
         ge=0,
-        description="gain of the action's second difference [the authors' value for MuJoCo; 0.005 "
-        "for LunarLander and Pendulum]",
+        description="gain of the action's second difference [the authors' value for MuJoCo; for "
+        "LunarLander and Pendulum: 0.005]",
     )
     epsilon: float = Field(
         default=0.1,
@@ -262,7 +265,7 @@ class ASAPConfig(GainConfig):
 
 @settings
 class SR2LConfig(GainConfig):
-    """Settings of SR2LLoss. An update takes several times as long as with other regularizers."""
+    """Settings of SR2LLoss, whose updates take several times longer than other regularizers."""
 
     name: str = "sr2l"
     epsilon: float = Field(
@@ -272,13 +275,13 @@ class SR2LConfig(GainConfig):
     steps: int = Field(
         default=10,
         ge=1,
-        description="ascent steps towards the worst state in the box; each costs a pass of the "
-        "policy",
+        description="gradient ascent steps towards the worst state in the box; each step is a "
+        "forward and backward pass of the policy",
     )
     policy_distance: Literal["jeffreys", "hellinger", "mean", "mse", "kl"] = Field(
         default="jeffreys",
-        description="distance of policies; deterministic policies are compared by their actions, "
-        "and kl does not work with them",
+        description="distance between policies; deterministic policies are compared by their "
+        "actions, without kl",
     )
 
 
@@ -290,20 +293,20 @@ class LCPConfig(GainConfig):
     coeff: float = Field(default=0.002, ge=0, description="gain of the squared gradient")
     of: Literal["log_prob", "mean"] = Field(
         default="log_prob",
-        description="function to differentiate: the log-likelihood [the authors' choice] or the "
-        "mean action, whose gradient does not fall when the policy gets wider",
+        description="differentiated function: the log-likelihood [the authors' choice], or the "
+        "mean action, whose gradient does not shrink when the policy's scale grows",
     )
 
 
 @settings
 class NoRegularizerConfig(RegularizerConfig):
-    """The loss without a regularizer: the baseline."""
+    """The baseline: the loss without a regularizer."""
 
     name: str = "none"
 
 
-# Choices that start from the algorithm's preset, with their overrides. l2c2_paper has the paper's
-# settings with every algorithm.
+# Choices that start with the algorithm's preset: method and overrides. l2c2_paper is not one of
+# them: it has the paper's settings for every algorithm.
 BEGIN_WITH_PRESET: dict[str, tuple[str, dict[str, Any]]] = {
     "l2c2": ("l2c2", {}),
     "l2c2_constant": ("l2c2", {"gain": "constant"}),
@@ -313,14 +316,14 @@ BEGIN_WITH_PRESET: dict[str, tuple[str, dict[str, Any]]] = {
 
 
 def preset_settings(regularizer: str, algorithm: str) -> dict[str, Any]:
-    """The initial settings of a regularizer for an algorithm.
+    """Returns a regularizer's initial settings for an algorithm.
 
     Args:
-        regularizer (str): a name in :data:`REGULARIZERS`.
-        algorithm (str): name of the algorithm.
+        regularizer (str): Name of the regularizer, a key of :data:`REGULARIZERS`.
+        algorithm (str): Name of the algorithm.
 
     Returns:
-        dict: settings by name; empty if there is no preset.
+        dict: Settings by name; empty if there is no preset.
 
     Examples:
         >>> preset_settings("l2c2_constant", "ppo")["gain"], preset_settings("l2c2_paper", "ppo")
@@ -346,9 +349,9 @@ REGULARIZERS: dict[str, RegularizerConfig] = {
     "lcp": LCPConfig(),
     "l2c2": L2C2Config(),
     "l2c2_paper": L2C2Config(name="l2c2_paper"),
-    # The paper's ablation: only the policy is regularized.
+    # The paper's ablation: no value term.
     "l2c2_policy": L2C2Config(name="l2c2_policy", beta=0.0),
-    # The distance of the means suits policies of any scale; a ramp costs less return early.
+    # The distance of means suits policies of any scale; a ramp lowers early returns less.
     "l2c2_mean": L2C2Config(name="l2c2_mean", policy_distance="mean"),
     "l2c2_ramp": L2C2Config(name="l2c2_ramp", policy_distance="mean", gain="ramp"),
     "l2c2_constant": L2C2Config(name="l2c2_constant"),

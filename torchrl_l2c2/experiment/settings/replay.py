@@ -22,7 +22,7 @@ class PrioritizedReplayConfig:
     capacity: int = Field(default=10_000, ge=1, le=10**12, description="transitions kept [paper]")
     batch_size: int = Field(default=32, ge=1, description="transitions per update [paper]")
     alpha: float = Field(
-        # The least priority, 1e-8, to a higher power is 0, which cannot be drawn.
+        # The least priority, 1e-8, raised to a higher power is 0, which is never sampled.
         default=1.0,
         ge=0,
         le=4,
@@ -52,7 +52,7 @@ class UniformReplayConfig:
 
 @settings
 class RolloutReplayConfig:
-    """The frames of one rollout, each used once per epoch, for on-policy learning."""
+    """Frames of one rollout, each used once per epoch, for on-policy learning."""
 
     name: str = "rollout"
     batch_size: int = Field(default=64, ge=1, description="transitions per update")

@@ -19,7 +19,7 @@ from torchrl.objectives import LossModule
 from torchrl_l2c2.experiment.agents.agent import Agent
 from torchrl_l2c2.experiment.agents.build import make_agent
 from torchrl_l2c2.experiment.agents.normalization import Normalization
-from torchrl_l2c2.experiment.agents.regularizers import neighborhood_of
+from torchrl_l2c2.experiment.agents.regularizers import make_neighborhood
 from torchrl_l2c2.experiment.analysis.diagnosis.measured import (
     Diagnosis,
     TermShare,
@@ -91,7 +91,7 @@ def diagnose_run(
             name=name or str(folder),
             episodes=episodes,
             max_steps=max_steps,
-            neighborhood=neighborhood_of(config.regularizer),
+            neighborhood=make_neighborhood(config.regularizer),
             value=None if agent is None else value_function(agent.loss, agent.normalization),
             noise_scale=noise or 0.01,
         )
@@ -197,7 +197,7 @@ def _batch(agent: Agent, config: ExperimentConfig, env: EnvBase, max_steps: int)
         episode.set(PREVIOUS, torch.cat((seen[:1], seen[:-1])))
         if agent.normalization is not None:
             episode = agent.normalization.normalized(episode)
-        return agent.as_learned(episode, config.algorithm.reward_factor)
+        return agent.prepare_for_loss(episode, config.algorithm.reward_factor)
 
 
 def _pictures(

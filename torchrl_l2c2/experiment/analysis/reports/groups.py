@@ -43,7 +43,7 @@ class Group:
     def setup(self) -> tuple[Any, ...]:
         """Every setting but the regularizer's: what is compared with it has the same."""
         # A run of so many frames has a number of episodes, too, which says nothing.
-        settings = self.first.settings_of_any_length.items()
+        settings = self.first.settings_without_length.items()
         others = sorted(pair for pair in settings if not pair[0].startswith("regularizer."))
         return (self.first.task, self.first.algorithm, self.first.length, *others)
 
@@ -159,7 +159,7 @@ def _differing(group: Group, groups: Sequence[Group]) -> dict[str, str]:
             if not own_kind or other.first.method == group.first.method
         }
 
-    known = group.first.settings_of_any_length.items()
+    known = group.first.settings_without_length.items()
     return {k: v for k, v in known if len(others_have(k)) > 1}
 
 

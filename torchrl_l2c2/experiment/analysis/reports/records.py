@@ -26,7 +26,7 @@ def place(record: Record) -> tuple[Any, ...]:
     Records that differ only in the regularizer, and so are compared, come together.
     """
     task = list(TASKS).index(record.task) if record.task in TASKS else len(TASKS)
-    words = {k: f"{k}={v}" for k, v in record.settings_of_any_length.items()}
+    words = {k: f"{k}={v}" for k, v in record.settings_without_length.items()}
     own = [word for name, word in words.items() if name.startswith("regularizer.")]
     others = [word for word in words.values() if word not in own]
     amount, unit = record.length.split()
