@@ -54,20 +54,20 @@ def test_the_critics_loss():
 
 
 @pytest.mark.parametrize(
-    ("reading", "deviation", "updated"),
+    ("statistic", "deviation", "updated"),
     [("max", 0.8, 0.8), ("ema", 0.5, 0.9 * 0.6 + 0.1 * 0.5)],
 )
-def test_the_deviation_is_a_decaying_maximum_or_an_average(reading, deviation, updated):
+def test_the_deviation_is_a_decaying_maximum_or_an_average(statistic, deviation, updated):
     """Of |rho_R - 1| = .2 and .8, after Delta = .6."""
     found = update_deviation(
-        torch.tensor(0.6), torch.tensor([0.8, 1.8]), decay=0.9, floor=0.1, reading=reading
+        torch.tensor(0.6), torch.tensor([0.8, 1.8]), decay=0.9, floor=0.1, statistic=statistic
     )
     assert [x.item() for x in found] == pytest.approx([deviation, updated])
 
 
 def test_the_deviation_decays_to_its_floor_and_forgets_nan():
     """Equal policies: decay * Delta, and not below; NaN counts as no deviation."""
-    settings = {"decay": 0.5, "floor": 0.1, "reading": "max"}
+    settings = {"decay": 0.5, "floor": 0.1, "statistic": "max"}
     same = torch.tensor([1.0, math.nan])
     assert update_deviation(torch.tensor(0.6), same, **settings)[1].item() == pytest.approx(0.3)
     assert update_deviation(torch.tensor(0.15), same, **settings)[1].item() == pytest.approx(0.1)

@@ -106,7 +106,7 @@ class Neighborhood:
 
     @property
     def on_line(self) -> bool:
-        """Whether neighbors lie on the line through a state and its successor."""
+        """Checks whether neighbors lie on the line through a state and its successor."""
         return self.neighbors == "line"
 
     @property

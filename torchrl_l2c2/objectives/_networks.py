@@ -171,8 +171,8 @@ def _is_stochastic(actor: nn.Module) -> bool:
 def _check_declares_keys(net: nn.Module, name: str) -> None:
     if not (hasattr(net, "in_keys") and hasattr(net, "out_keys")):
         raise TypeError(
-            f"{name} is a {type(net).__name__}, which does not say what it reads and writes: make "
-            "it a TensorDictModule with in_keys and out_keys."
+            f"{name} is a {type(net).__name__}, which declares no keys: make it a "
+            "TensorDictModule with in_keys and out_keys."
         )
 
 
@@ -183,9 +183,8 @@ def _check_not_recurrent(net: Any, name: str) -> None:
     handed_on = any(unravel_key(("next", key)) in written for key in net.in_keys)
     if recurrent or handed_on or "is_init" in net.in_keys:
         raise TypeError(
-            f"{name} is recurrent: its output depends on the states before, so that it has no "
-            "value at a state near the current one alone. Only feed-forward networks can be "
-            "regularized."
+            f"{name} is recurrent: its output depends on earlier states, and not only on the "
+            "current one. Only feed-forward networks can be regularized."
         )
 
 

@@ -118,12 +118,12 @@ def update_deviation(
     *,
     decay: float,
     floor: float,
-    reading: Literal["max", "ema"],
+    statistic: Literal["max", "ema"],
     mask: Tensor | None = None,  # shape: [*B]
 ) -> tuple[Tensor, Tensor]:  # shape: [], []
     r"""The batch's deviation of the ratio, and :math:`\Delta`, which sets the threshold.
 
-    With ``reading="max"``, :math:`\Delta \leftarrow \max(\Delta_{\min}, \delta\Delta,
+    With ``statistic="max"``, :math:`\Delta \leftarrow \max(\Delta_{\min}, \delta\Delta,
     \max|\rho_R - 1|)`; with ``"ema"``, :math:`\Delta \leftarrow \max(\Delta_{\min}, \delta\Delta +
     (1 - \delta)\,\mathrm{mean}|\rho_R - 1|)` [inferred].
 
@@ -133,7 +133,7 @@ def update_deviation(
             maximum must stay finite, and the losses show the NaN.
         decay: :math:`\delta`, in ``[0, 1]``. Smaller values forget large deviations sooner.
         floor: :math:`\Delta_{\min}`, greater than 0.
-        reading: ``"max"`` or ``"ema"``, as above.
+        statistic: ``"max"`` or ``"ema"``, as above.
         mask: mask of the transitions that count; ``None`` for all.
 
     Returns:
@@ -143,13 +143,13 @@ def update_deviation(
     Examples:
         >>> import torch
         >>> ratio = torch.tensor([1.0, 1.5])
-        >>> update_deviation(torch.tensor(0.1), ratio, decay=0.9, floor=0.1, reading="max")
+        >>> update_deviation(torch.tensor(0.1), ratio, decay=0.9, floor=0.1, statistic="max")
         (tensor(0.5000), tensor(0.5000))
     """
     deviation = (relative_ratio - 1.0).abs().nan_to_num(0.0)
     if mask is not None:
         deviation = torch.where(mask, deviation, 0.0)
-    if reading == "max":
+    if statistic == "max":
         deviation = deviation.max()
         updated = (decay * largest).maximum(deviation)
     else:
@@ -161,14 +161,14 @@ def update_deviation(
 
 def importance_weight(
     weight: Tensor,  # shape: [*B]
-    reading: Literal["max", "mean"],
+    divisor: Literal["max", "mean"],
     mask: Tensor | None = None,  # shape: [*B]
 ) -> Tensor:  # shape: [*B]
     r"""The weights of prioritized replay, divided by their maximum or mean [inferred].
 
     Args:
         weight: weights from the replay buffer, at least 0.
-        reading: the divisor, ``"max"`` or ``"mean"``.
+        divisor: the divisor, ``"max"`` or ``"mean"``.
         mask: mask of the transitions that count; ``None`` for all.
 
     Examples:
@@ -178,11 +178,11 @@ def importance_weight(
         tensor([0.5000, 1.0000, 0.0000])
     """
     if mask is None:
-        return weight / (weight.max() if reading == "max" else weight.mean())
+        return weight / (weight.max() if divisor == "max" else weight.mean())
     kept = torch.where(mask, weight, 0.0)
-    divisor = kept.max() if reading == "max" else kept.sum() / mask.sum().clamp_min(1)
+    scale = kept.max() if divisor == "max" else kept.sum() / mask.sum().clamp_min(1)
     # If nothing counts, 0 / 0 would give a loss of 0 a gradient of NaN.
-    return kept / divisor.clamp_min(torch.finfo(kept.dtype).tiny)
+    return kept / scale.clamp_min(torch.finfo(kept.dtype).tiny)
 
 
 def of_each_transition(
@@ -517,7 +517,7 @@ class PPORPELoss(SharedEvaluation):
             relative_ratio,
             decay=self.decay,
             floor=self.delta_min,
-            reading=self.threshold,
+            statistic=self.threshold,
             mask=mask,
         )
         if self.training:

@@ -181,7 +181,7 @@ def play_episodes(
 ) -> Iterator[TensorDictBase]:
     """Plays episodes ``[T]`` with mean or sampled actions; the environment stays open.
 
-    The arguments are those of :func:`~torchrl_l2c2.experiment.evaluate_policy`. For environments
+    The arguments are as for :func:`~torchrl_l2c2.experiment.evaluate_policy`. For environments
     that :class:`EpisodeCollector` refuses, it calls ``env.rollout``, without compiling the policy.
 
     Raises:

@@ -59,7 +59,7 @@ class Simulation:
     def observation(self) -> Tensor:
         """Returns what the policy acts on; starts an episode after the end of the last one.
 
-        Not earlier, so that between episodes the states of the generators are all there is to save.
+        It does not start one earlier: between episodes only the generators' states must be saved.
         """
         if self.next_observation is None:
             self.frames = []

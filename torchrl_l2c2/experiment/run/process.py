@@ -101,7 +101,7 @@ def keep_freed_memory() -> bool:
 
 
 def _restore(state: Mapping[str, Any]) -> None:
-    """Sets the generators; those of GPUs only if there are as many as before."""
+    """Sets the generators; the GPUs' generators only if the number of GPUs is the same."""
     gpus = len(state.get("torch_cuda", ()))
     if gpus and gpus != torch.cuda.device_count():
         state = {name: each for name, each in state.items() if name != "torch_cuda"}
