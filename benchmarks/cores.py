@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import heapq
 import logging
-import math
 import statistics
 import time
 from collections.abc import Mapping, Sequence
@@ -18,13 +17,14 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from benchmarks.timing import machine
 from studies.paper import is_as_usual
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig
-from torchrl_l2c2.experiment.analysis.reports import Record, read_records
+from torchrl_l2c2.experiment.analysis.reports import group_records, read_records
 from torchrl_l2c2.experiment.cli.composition import CONF
 from torchrl_l2c2.experiment.envs.environments import time_limit
 from torchrl_l2c2.experiment.settings.regularizers import REGULARIZERS
@@ -64,15 +64,11 @@ def sweep() -> list[tuple[str, str]]:
     ]
 
 
-def recorded(records: Sequence[Record], task: str, method: str) -> list[float]:
+def recorded(records: pd.DataFrame, task: str, method: str) -> list[float]:
     """Seconds of the runs of a task and a method that had the table's length and settings."""
-    return [
-        record.seconds
-        for record in records
-        if (record.task, record.method) == (task, method)
-        and is_as_usual(record)
-        and math.isfinite(record.seconds)
-    ]
+    found = records[(records["task"] == task) & (records["method"] == method)]
+    usual = [group.runs["seconds"] for group in group_records(found) if is_as_usual(group)]
+    return [float(seconds) for each in usual for seconds in each.dropna()]
 
 
 def paced(task: str, method: str) -> float:

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
+import pandas as pd
+
+from studies.cells import number_range, of_runs
 from studies.paper import is_of_own_task
-from torchrl_l2c2.experiment.analysis.reports.comparison import (
-    COMPARED,
-    INTERVAL_NOTE,
-    Estimate,
-    estimate_cell,
-    improvement_cell,
-)
 from torchrl_l2c2.experiment.analysis.reports.groups import (
     Group,
     baseline_of,
@@ -20,8 +16,14 @@ from torchrl_l2c2.experiment.analysis.reports.groups import (
     group_records,
 )
 from torchrl_l2c2.experiment.analysis.reports.statistics import mean
-from torchrl_l2c2.experiment.analysis.reports.tables import Table, number_range, of_runs
-from torchrl_l2c2.experiment.run.finished import Record
+from torchrl_l2c2.experiment.analysis.reports.table import (
+    COMPARED,
+    INTERVAL_NOTE,
+    Estimate,
+    Table,
+    estimate_cell,
+    improvement_cell,
+)
 from torchrl_l2c2.experiment.settings.tasks import FIELD_TASKS
 
 
@@ -56,7 +58,7 @@ PUBLISHED: dict[tuple[str, str, str], PublishedCell] = {
     for task, cell in zip(FIELD_TASKS, cells, strict=True)
 }
 NAMES = {
-    "none": "vanilla",
+    "none": "baseline",
     "caps": "CAPS",
     "cats": "CATS",
     "l2c2_asap": "L2C2, ASAP's code",
@@ -72,14 +74,14 @@ LEGEND = (
     "of the bootstrap over seeds in brackets. Sm as in the published table: `(2 / N) sum_i f_i "
     "|FFT_i|` at one action per unit of time, averaged over the action's dimensions; unlike the "
     "action variation it grows with the length N of an episode. P: the probability that a run is "
-    "better than a run of vanilla with the same other settings (ties count half). "
+    "better than a run of the baseline with the same other settings (ties count half). "
     f"{INTERVAL_NOTE} Published: "
-    "CATS (arXiv 2610.07910), ten seeds by ten episodes; its L2C2 is that of ASAP's code, which "
-    "does not follow the paper's equations."
+    "CATS (arXiv 2610.07910), ten seeds by ten episodes; its L2C2 is ASAP's code, which does not "
+    "follow the paper's equations."
 )
 
 
-def field_table(records: Iterable[Record]) -> Table:
+def field_table(records: pd.DataFrame) -> Table:
     """A row for every group of runs on these tasks, then the other published rows."""
     groups = field_groups(records)
     rows = []
@@ -93,18 +95,20 @@ def field_table(records: Iterable[Record]) -> Table:
         ]
     columns = ["task", "algorithm", "method", "seeds", *(name for name, _ in COMPARED.values())]
     columns += [*BETTER.values(), "published: return", "published: Sm"]
-    return Table("Beside the published table", columns, rows, [LEGEND])
+    return Table("Next to the published table", columns, rows, [LEGEND])
 
 
-def field_groups(records: Iterable[Record]) -> list[Group]:
+def field_groups(records: pd.DataFrame) -> list[Group]:
     """Groups of the records on these tasks with PPO or SAC."""
-    return group_records(r for r in records if (r.task, r.algorithm, "none") in PUBLISHED)
+    known = {(task, algorithm) for task, algorithm, _ in PUBLISHED}
+    pairs = zip(records["task"], records["algorithm"], strict=True)
+    return group_records(records[[pair in known for pair in pairs]])
 
 
 def published_of(group: Group) -> PublishedCell | None:
     """The published results of a group's task and method; ``None`` without any."""
     first = group.first
-    if not is_of_own_task(first):
+    if not is_of_own_task(group):
         return None
     return PUBLISHED.get((first.task, first.algorithm, first.method))
 
@@ -118,7 +122,7 @@ def point(group: Group) -> Sequence[float] | None:
 def known_cell(group: Group, quantity: str, cell: str) -> str:
     """A cell that names the number of its runs, if some lack the quantity."""
     known = len(group.scores(TEST, quantity))
-    return cell + of_runs(known, len(group.records)) if known else cell
+    return cell + of_runs(known, len(group.runs)) if known else cell
 
 
 def _row(group: Group, baseline: Group | None) -> list[str]:

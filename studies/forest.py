@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 
 from studies.field import TEST
 from studies.pages import ROOT, SUMMARIZED, fill, headline_groups
-from torchrl_l2c2.experiment.analysis.reports.comparison import Estimate, improvement
 from torchrl_l2c2.experiment.analysis.reports.figures import subplots
 from torchrl_l2c2.experiment.analysis.reports.groups import Group
+from torchrl_l2c2.experiment.analysis.reports.table import Estimate, improvement
 from torchrl_l2c2.experiment.run.files import write_atomically
 
 PAGE = ROOT / "results" / "README.md"

@@ -33,8 +33,8 @@ from torchrl.objectives import ClipPPOLoss, LossModule, SACLoss, SoftUpdate, TD3
 from torchrl.objectives.value import GAE
 
 from torchrl_l2c2 import action_variation, make_actor, make_critic, smooth
-from torchrl_l2c2.experiment.analysis.reports.comparison import Estimate
 from torchrl_l2c2.experiment.analysis.reports.statistics import mean, probability_of_improvement
+from torchrl_l2c2.experiment.analysis.reports.table import Estimate
 
 SEEDS = range(10)
 TEST_EPISODES = 10

@@ -4,36 +4,33 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
+from studies.cells import number_range, of_runs, over_tasks
 from studies.field import BETTER, TEST, field_groups, known_cell
-from torchrl_l2c2.experiment.analysis.reports.comparison import (
+from torchrl_l2c2.experiment.analysis.reports.groups import Group, baseline_of
+from torchrl_l2c2.experiment.analysis.reports.table import (
     COMPARED,
     INTERVAL_NOTE,
-    improvement_cell,
-)
-from torchrl_l2c2.experiment.analysis.reports.groups import Group, baseline_of, over_tasks
-from torchrl_l2c2.experiment.analysis.reports.tables import (
     Table,
+    improvement_cell,
     number,
-    number_range,
-    of_runs,
     or_dash,
 )
-from torchrl_l2c2.experiment.run.finished import Record
 
 CHOICE_LEGEND = (
-    "Compared with vanilla's runs of the same seeds and other settings, smoothest first; the "
-    "last policy's test episodes, with its mean actions. Return: the difference of the means "
-    "over seeds, relative to the size of vanilla's, averaged over tasks. Sm: the ratio of the "
-    "means over seeds, geometric mean over tasks; 1 is no smoother. P: the probability that a "
-    "run is better than a run of vanilla (all pairs of runs, ties count half), averaged over "
-    f"tasks. {INTERVAL_NOTE}"
+    "Compared with the baseline's runs of the same seeds and other settings, smoothest first; "
+    "the last policy's test episodes, with its mean actions. Return: the difference of the means "
+    "over seeds, relative to the size of the baseline's mean, averaged over tasks. Sm: the ratio "
+    "of the means over seeds, geometric mean over tasks; 1 is no smoother. P: the probability "
+    "that a run is better than a run of the baseline (all pairs of runs, ties count half), "
+    f"averaged over tasks. {INTERVAL_NOTE}"
 )
-MOST = 12  # Methods of a table: more are what a search tried, and are told by their plane.
+MOST = 12  # Methods of a table: more are a search, which a picture shows.
 PAIRWISE_LEGEND = (
     "The probability that a run of the row is better than a run of the column (all pairs of runs "
     "on a task, ties count half), averaged over tasks; 95% intervals of the stratified bootstrap "
@@ -46,8 +43,8 @@ AGAINST_LEGEND = (
 )
 
 
-class Beside(NamedTuple):
-    """A setting and the baseline on one task, of the seeds that both have."""
+class Pair(NamedTuple):
+    """A setting and the baseline on one task, on the seeds that both have."""
 
     group: Group
     baseline: Group
@@ -61,28 +58,28 @@ class Beside(NamedTuple):
         return self.group.first.task
 
 
-def choice_table(records: Iterable[Record]) -> Table:
-    """Settings in order over tasks: smoothness, and its cost in return."""
+def choice_table(records: pd.DataFrame) -> Table:
+    """Settings in the order of their smoothness over tasks, with the cost in return."""
     groups = field_groups(records)
     compared = {
-        group: beside
+        group: pair
         for group in groups
         if (baseline := baseline_of(group, groups)) is not None
-        and (beside := _beside(group, baseline)) is not None
+        and (pair := _pair(group, baseline)) is not None
     }
     settings = [
         (algorithm, name, [compared[group] for group in row])
         for algorithm, name, row in over_tasks(compared)
     ]
-    # What ran on most tasks comes first: other means are of other tasks.
+    # Methods of most tasks come first: means over other tasks are not comparable.
     settings.sort(key=lambda row: (row[0], -len(row[2]), np.nan_to_num(_sm(row[2]), nan=np.inf)))
     rows = [[algorithm, name, *_cells(tasks)] for algorithm, name, tasks in settings]
     columns = ["algorithm", "method", "tasks", "seeds"]
-    columns += [f"{what}{where}" for what in ("return", "Sm") for where in ("", ", worst task")]
+    columns += [f"{measure}{end}" for measure in ("return", "Sm") for end in ("", ", worst task")]
     return Table("In order over tasks", [*columns, *BETTER.values()], rows, [CHOICE_LEGEND])
 
 
-def pairwise_tables(records: Iterable[Record]) -> list[Table]:
+def pairwise_tables(records: pd.DataFrame) -> list[Table]:
     """Probabilities of improvement of every method over every other, by return and by Sm.
 
     Returns:
@@ -102,11 +99,11 @@ def pairwise_tables(records: Iterable[Record]) -> list[Table]:
     ]
 
 
-def against_table(records: Iterable[Record], name: str) -> Table:
+def against_table(records: pd.DataFrame, name: str) -> Table:
     """One method against each other one with the same other settings, task by task.
 
     Args:
-        records (iterable of Record): Records of any tasks; only the field's tasks are used.
+        records (DataFrame): Records of any tasks; only the field's tasks are used.
         name (str): The method's name in tables, such as ``"L2C2, mse 1, ramp"``.
     """
     groups = field_groups(records)
@@ -137,10 +134,10 @@ def _pairwise_table(better: str, quantity: str, methods: dict[str, list[Group]])
     of = [group.first for group in next(iter(methods.values()))]
     title = f"{better}, {of[0].algorithm} on {', '.join(record.task for record in of)}"
     lacking = [
-        f"{group.first.task}, {name}{of_runs(known, len(group.records))}"
+        f"{group.first.task}, {name}{of_runs(known, len(group.runs))}"
         for name, groups in methods.items()
         for group in groups
-        if (known := len(group.scores(TEST, quantity))) < len(group.records)
+        if (known := len(group.scores(TEST, quantity))) < len(group.runs)
     ]
     notes = [f"Not all runs have it: {'; '.join(lacking)}."] if lacking else []
     return Table(title, ["method", *methods], rows, [PAIRWISE_LEGEND, *notes])
@@ -158,7 +155,7 @@ def _against_row(ours: Group, theirs: Group) -> list[str]:
     return cells
 
 
-def _beside(group: Group, baseline: Group) -> Beside | None:
+def _pair(group: Group, baseline: Group) -> Pair | None:
     values = [
         side.by_seed(TEST, quantity)
         for quantity in ("return", "sm_asap")
@@ -171,18 +168,17 @@ def _beside(group: Group, baseline: Group) -> Beside | None:
     # A return of 0 has no parts.
     gained = float((total - their_total) / abs(their_total)) if their_total else math.nan
     ours, theirs = (
-        Group(tuple(r for r in side.records if r.seed in seeds), side.name)
-        for side in (group, baseline)
+        Group(side.runs[side.runs["seed"].isin(seeds)], side.name) for side in (group, baseline)
     )
     # Policies that never move have no ratio, or none with a logarithm.
-    return Beside(ours, theirs, gained, float(sm / their_sm) if sm * their_sm else math.nan, seeds)
+    return Pair(ours, theirs, gained, float(sm / their_sm) if sm * their_sm else math.nan, seeds)
 
 
-def _sm(tasks: Sequence[Beside]) -> float:
+def _sm(tasks: Sequence[Pair]) -> float:
     return float(np.exp(np.mean(np.log([each.sm for each in tasks]))))
 
 
-def _cells(tasks: Sequence[Beside]) -> list[str]:
+def _cells(tasks: Sequence[Pair]) -> list[str]:
     gained, rough = [each.gained for each in tasks], [each.sm for each in tasks]
     # For NumPy NaN is the smallest and the largest: the worst task, as it may be.
     least, roughest = tasks[int(np.argmin(gained))], tasks[int(np.argmax(rough))]

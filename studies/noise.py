@@ -19,12 +19,17 @@ from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 from tqdm import tqdm
 
-from torchrl_l2c2.experiment.analysis.reports import find_runs
-from torchrl_l2c2.experiment.analysis.reports.comparison import COMPARED, Estimate, estimate_cell
-from torchrl_l2c2.experiment.analysis.reports.figures import finish, styles, subplots
+from studies.cells import number_range
+from torchrl_l2c2.experiment.analysis.reports.figures import finish, save, styles, subplots
 from torchrl_l2c2.experiment.analysis.reports.groups import Group, group_records
+from torchrl_l2c2.experiment.analysis.reports.records import find_runs, records_of
 from torchrl_l2c2.experiment.analysis.reports.statistics import mean
-from torchrl_l2c2.experiment.analysis.reports.tables import Table, number_range
+from torchrl_l2c2.experiment.analysis.reports.table import (
+    COMPARED,
+    Estimate,
+    Table,
+    estimate_cell,
+)
 from torchrl_l2c2.experiment.collect.episodes import play_episodes
 from torchrl_l2c2.experiment.envs.frames import check_finite
 from torchrl_l2c2.experiment.errors import UserError, one_line_errors
@@ -165,7 +170,8 @@ def draw_noise(played: Sequence[Played], path: str | Path) -> None:
         axis.set_xlabel("noise, in deviations of each feature")
         axis.set_ylabel(name)
     first = groups[0].first
-    finish(figure, axes, f"{first.task}, {first.algorithm}: noise on the observations", path)
+    finish(figure, axes, f"{first.task}, {first.algorithm}: noise on the observations")
+    save(figure, path)
 
 
 def write_noise(folder: str | Path, played: Sequence[Played]) -> list[Path]:
@@ -239,13 +245,13 @@ Summaries = Mapping[tuple[str | int, ...], Mapping[float, Mapping[str, float]]]
 
 
 def _grouped(played: Sequence[Played]) -> tuple[list[Group], Summaries]:
-    groups = group_records(each.run.record for each in played)
+    groups = group_records(records_of(each.run for each in played))
     return groups, {each.run.record.identity: each.summaries for each in played}
 
 
 def _estimate(group: Group, summaries: Summaries, level: float, quantity: str) -> Estimate | None:
     name = f"{quantity}_mean"
-    found = [summaries[record.identity][level].get(name, np.nan) for record in group.records]
+    found = [summaries[*group.kind, seed][level].get(name, np.nan) for seed in group.seeds]
     values = [value for value in found if not np.isnan(value)]
     return Estimate.of(mean, np.array(values).reshape(-1, 1))
 

@@ -1,8 +1,8 @@
-"""Writes the generated parts of the README and of the results' pages anew, and their pictures.
+"""Writes the generated parts of the README and of the pages of results, and their pictures.
 
 ``python -m studies.pages`` makes them from the records in ``results/*.csv``. A page has each part
-between ``<!-- NAME: start -->`` and ``<!-- NAME: end -->``. A picture is drawn again if it is not
-of the same records; to have one drawn in another way, delete it first.
+between ``<!-- NAME: start -->`` and ``<!-- NAME: end -->``. A picture is drawn again if its records
+have changed; to draw it in another way, delete it first.
 """
 
 from __future__ import annotations
@@ -13,7 +13,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import pandas as pd
+
 from studies import field, front_door, paper
+from studies.cells import digest, number_range, regrouped
 from studies.field import BETTER, TEST, field_groups, field_table
 from studies.methods import against_table, choice_table, pairwise_tables
 from studies.paper import (
@@ -26,25 +29,23 @@ from studies.paper import (
     statistics_table,
 )
 from studies.targets import gain_targets_table
-from torchrl_l2c2.experiment.analysis.reports.comparison import (
-    COMPARED,
-    Estimate,
-    improvement_cell,
-)
 from torchrl_l2c2.experiment.analysis.reports.figures import draw_plane
-from torchrl_l2c2.experiment.analysis.reports.groups import Group, group_records
-from torchrl_l2c2.experiment.analysis.reports.records import digest, merge, read_records
+from torchrl_l2c2.experiment.analysis.reports.groups import (
+    Group,
+    group_records,
+    settings_notes,
+)
+from torchrl_l2c2.experiment.analysis.reports.records import merge, read_records
 from torchrl_l2c2.experiment.analysis.reports.statistics import mean
-from torchrl_l2c2.experiment.analysis.reports.tables import number_range, settings_notes
+from torchrl_l2c2.experiment.analysis.reports.table import COMPARED, Estimate, improvement_cell
 from torchrl_l2c2.experiment.run.files import write_atomically
-from torchrl_l2c2.experiment.run.finished import Record
 
 ROOT = Path(__file__).parents[1]
 FRONT_DOOR = ROOT / "results" / "front_door.csv"
 FIELD_PAGES = ("field", "hopper", "sac_lunarlander", "sac_pendulum", "walker2d")
 # PPO's one setting of L2C2, and the methods that one page compares it with.
 OURS = "L2C2, mse 1, ramp"
-RIVALS = ("vanilla", "CAPS", "CAPS, lambda_spatial=0.005", "CATS")
+RIVALS = ("baseline", "CAPS", "CAPS, lambda_spatial=0.005", "CATS")
 TARGETS = ("targets", "runs", "sac_pendulum", "field", "walker2d", "hopper")
 HEADLINE = """\
 | | seeds | measure | baseline | with L2C2 | change | P(smoother) | return: baseline | with L2C2 | P(returns more) |
@@ -52,7 +53,7 @@ HEADLINE = """\
 SUMMARY = """\
 | task | algorithm (seeds) | action change per step: baseline | with L2C2 | change | return: baseline | with L2C2 |
 | --- | --- | --- | --- | --- | --- | --- |"""  # noqa: E501
-# Rows of the table of results: whose records, of which method and length.
+# Rows of the table of results: the file of records, the method and the length.
 HEADLINES = {
     "SAC, Pendulum": ("sac_pendulum", "L2C2, means 10", "30000 frames"),
     "PPO, LunarLander": ("field", OURS, "500000 frames"),
@@ -65,9 +66,9 @@ HEADLINES = {
 }
 # Rows of the README's table; the text below it has Swingup.
 SUMMARIZED = [label for label in HEADLINES if "Swingup" not in label]
-# What the page of the setting's parts calls them, by their names in tables and in its order.
+# Names of the rows in results/parts.md, by their names in other tables.
 PARTS = {
-    "vanilla": "vanilla",
+    "baseline": "baseline",
     f"{OURS}, beta=0, neighbors=line": "`regularizer=l2c2`",
     "L2C2, mse 0.01, ramp, beta=0, neighbors=line": "with the paper's gain",
     "L2C2, Hellinger 1, ramp, beta=0, neighbors=line": "with the Hellinger distance",
@@ -101,10 +102,10 @@ class Page(NamedTuple):
 def pages() -> dict[str, Page]:
     """Every page with generated parts, by its path from the root."""
     runs, one, caps = records("runs"), records("one_gain"), records("caps_gains")
-    averaged = [r for r in runs if r.other_settings.get("algorithm.reduction") == "mean"]
-    summed = [r for r in runs if r not in averaged]
-    short = [r for r in summed if (r.task, r.length) == ("reacher", "3000 episodes")]
-    caps += [r for r in one if r.method == "none" and r.task != "walker2d_v5"]
+    with_mean = runs["differences"].str.contains("algorithm.reduction=mean", regex=False)
+    short = runs[~with_mean & (runs["task"] == "reacher") & (runs["length"] == "3000 episodes")]
+    averaged, short = group_records(runs[with_mean]), group_records(short)
+    caps = merge(caps, one[(one["method"] == "none") & (one["task"] != "walker2d_v5")])
     chosen = [choice_table(each).markdown() for each in (records("field_gains"), one, caps)]
     targets = [
         gain_targets_table(records(*names)).markdown()
@@ -118,8 +119,8 @@ def pages() -> dict[str, Page]:
         "results/paper.md": _paper_page(runs),
         **{f"results/{name}.md": _field_page(name, records(name)) for name in FIELD_PAGES},
         "results/one_setting.md": _field_page("one_setting", one_setting()),
-        "results/batch_mean.md": Page({"results": paper_table(group_records(averaged)).markdown()}),
-        "results/reacher_3000.md": Page({"results": paper_table(group_records(short)).markdown()}),
+        "results/batch_mean.md": Page({"results": paper_table(averaged).markdown()}),
+        "results/reacher_3000.md": Page({"results": paper_table(short).markdown()}),
         "results/parts.md": Page({"parts": parts()}),
         "results/front_door.md": Page(
             {"results": front_door.table(ROOT / "results" / "front_door.csv")}
@@ -131,16 +132,15 @@ def pages() -> dict[str, Page]:
     }
 
 
-def records(*names: str) -> list[Record]:
+def records(*names: str) -> pd.DataFrame:
     """The records of these files in ``results/``."""
-    found = (read_records(ROOT / "results" / f"{name}.csv") for name in names)
-    return merge([], [record for each in found for record in each])
+    return merge(*(read_records(ROOT / "results" / f"{name}.csv") for name in names))
 
 
-def one_setting() -> list[Record]:
+def one_setting() -> pd.DataFrame:
     """The records of PPO's one setting and of its rivals."""
     groups = group_records(records("field", "walker2d", "hopper"))
-    return [r for group in groups if group.name in (OURS, *RIVALS) for r in group.records]
+    return regrouped(group for group in groups if group.name in (OURS, *RIVALS))
 
 
 def headline_groups(label: str) -> tuple[Group, Group]:
@@ -148,17 +148,15 @@ def headline_groups(label: str) -> tuple[Group, Group]:
     name, method, length = HEADLINES[label]
     named = label.split(", ")[1].lower()
     task = f"{named}_v5" if named in ("hopper", "walker2d") else named
-    found = [r for r in records(name) if (r.task, r.length) == (task, length) and is_usual_pace(r)]
+    found = records(name)
+    found = found[(found["task"] == task) & (found["length"] == length)]
+    # With the usual pace of the target networks.
+    found = found[~found["differences"].str.contains(TAU, regex=False)]
     (ours,) = (group for group in group_records(found) if group.name == method)
-    same = [r for r in found if r.method == "none" and r.seed in ours.seeds]
+    same = found[(found["method"] == "none") & found["seed"].isin(ours.seeds)]
     (baseline,) = group_records(same)
     assert baseline.seeds == ours.seeds and baseline.setup == ours.setup
     return ours, baseline
-
-
-def is_usual_pace(record: Record) -> bool:
-    """Tells if the target networks have the usual pace of the paper."""
-    return TAU not in record.other_settings
 
 
 def summary() -> str:
@@ -184,15 +182,12 @@ def headline() -> str:
 
 def parts() -> str:
     """The table of PPO's setting with one part changed at a time, on common seeds."""
-    own = records("parts")
-    seeds = {record.seed for record in own}
-    others = [
-        r
-        for r in records("field")
-        if r.seed in seeds
-        and (r.method in ("none", "l2c2_paper") or r.commit.startswith("e01476b"))
+    own, others = records("parts"), records("field")
+    others = others[
+        others["seed"].isin(own["seed"])
+        & (others["method"].isin(["none", "l2c2_paper"]) | others["commit"].str.match("e01476b"))
     ]
-    table = field_table([*own, *others])
+    table = field_table(merge(own, others))
     kept = ["seeds", *(name for name, _ in COMPARED.values()), *BETTER.values()]
     found = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
     shown = {(row["task"], row["method"]): row for row in found if row["seeds"]}
@@ -214,7 +209,8 @@ TD3_TESTED = {
 
 def td3_test() -> str:
     """The table of TD3's presets on seeds 0 to 9, of the policies of the last 10% of training."""
-    found = [r for r in records("td3") if r.seed < 10 and r.method in TD3_TESTED]
+    found = records("td3")
+    found = found[(found["seed"] < 10) & found["method"].isin(list(TD3_TESTED))]
     groups = {group.first.method: group for group in group_records(found)}
     columns = ["setting", "return", "action variation", "P(returns more)", "P(smoother)"]
     rows = [columns, ["---"] * len(columns)]
@@ -237,7 +233,8 @@ def td3_choice() -> str:
     rows = [["setting", "return by seed", "action variation by seed", "mean return"]]
     rows[0].append("mean action variation")
     rows.append(["---"] * 5)
-    for group in group_records([r for r in records("td3") if r.seed >= 100]):
+    tried = records("td3")
+    for group in group_records(tried[tried["seed"] >= 100]):
         both = [group.scores("late_mean", q) for q in ("return", "action_variation")]
         each = [", ".join(f"{v:.{d}f}" for v in s.flat) for s, d in zip(both, (0, 3), strict=True)]
         means = [f"{both[0].mean():.1f}", f"{both[1].mean():.3f}"]
@@ -245,12 +242,12 @@ def td3_choice() -> str:
     return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
 
-def reacher_by_seed(runs: Sequence[Record]) -> str:
+def reacher_by_seed(runs: pd.DataFrame) -> str:
     """Return and action variation of Reacher's late policies with sampled actions."""
-    groups = shown_groups([record for record in runs if record.task == "reacher"])
+    groups = shown_groups(runs[runs["task"] == "reacher"])
     groups = [group for group in groups if group.first.method != "caps"]
     rows = [["seed", *(group.name for group in groups)], ["---"] * (1 + len(groups))]
-    for together in zip(*(group.records for group in groups), strict=True):
+    for together in zip(*(group.runs.itertuples() for group in groups), strict=True):
         cells = (
             f"{r.late_sampled_return:.1f} / {r.late_sampled_action_variation:.3f}" for r in together
         )
@@ -261,7 +258,7 @@ def reacher_by_seed(runs: Sequence[Record]) -> str:
 def draw_published(
     point: Callable[[Group], Sequence[float] | None], note: str, axis: Any, group: Group, color: str
 ) -> str | None:
-    """A hollow diamond for a group's published results, with their deviations, dotted, if known."""
+    """Draws a hollow diamond for a group's published results, and dotted bars for deviations."""
     found = point(group)
     if found is None:
         return None
@@ -274,9 +271,10 @@ def draw_published(
     return note
 
 
-def _paper_page(runs: Sequence[Record]) -> Page:
+def _paper_page(runs: pd.DataFrame) -> Page:
     groups = shown_groups(runs)
-    faster = faster_targets_table(record for record in runs if is_as_usual(record, TAU))
+    usual = [group for group in group_records(runs) if is_as_usual(group, TAU)]
+    faster = faster_targets_table(regrouped(usual))
     tables = [deployed_table(groups), statistics_table(groups), faster]
     texts = [
         "![Return against action variation of every method](paper.svg)",
@@ -285,21 +283,22 @@ def _paper_page(runs: Sequence[Record]) -> Page:
         *(table.markdown() for table in tables),
     ]
     more = partial(draw_published, paper.point, "hollow: the paper")
-    draw = partial(draw_plane, groups, "late_sampled", more=more)
+    draw = partial(draw_plane, groups, "late_sampled", more=more, description=description(groups))
     return Page({"results": "\n\n".join(texts)}, groups, draw)
 
 
-def _field_page(name: str, shown: Sequence[Record]) -> Page:
+def _field_page(name: str, shown: pd.DataFrame) -> Page:
     first = [against_table(shown, OURS)] if name in ("hopper", "one_setting") else []
     tables = [field_table(shown), choice_table(shown), *pairwise_tables(shown)]
     texts = [
         *(table.markdown() for table in first),
-        f"![Return against Sm of every method, beside what was published]({name}.svg)",
+        f"![Return against Sm of every method, and the published results]({name}.svg)",
         *(table.markdown() for table in tables),
     ]
     groups = field_groups(shown)
     more = partial(draw_published, field.point, "hollow: published")
-    draw = partial(draw_plane, groups, TEST, measure="sm_asap", more=more)
+    about = description(groups)
+    draw = partial(draw_plane, groups, TEST, measure="sm_asap", more=more, description=about)
     return Page({"results": "\n\n".join(texts)}, groups, draw)
 
 
@@ -345,10 +344,14 @@ def fill(text: str, name: str, part: str) -> str:
     return pattern.sub(lambda found: f"{found[1]}{start}\n{part}\n{found[1]}{end}", text)
 
 
+def description(shown: Sequence[Group]) -> str:
+    """The description of a picture of these groups: a code of their records."""
+    return f"records {digest(shown)}"
+
+
 def is_drawn(path: Path, shown: Sequence[Group]) -> bool:
     """Tells if a picture shows the records of these groups, by its description."""
-    drawn_of = digest(record for group in shown for record in group.records)
-    return path.exists() and f"records {drawn_of}<" in path.read_text()
+    return path.exists() and f"{description(shown)}<" in path.read_text()
 
 
 def main() -> None:

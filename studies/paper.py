@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from torchrl_l2c2.experiment.analysis.reports.comparison import (
-    COMPARED,
-    INTERVAL_NOTE,
-    comparison_table,
-    improvement_cell,
-    improvements_over_tasks,
-)
+import pandas as pd
+
+from studies.cells import improvements_over_tasks, number_range, pooled, regrouped
 from torchrl_l2c2.experiment.analysis.reports.groups import Group, baseline_of, group_records
 from torchrl_l2c2.experiment.analysis.reports.statistics import interquartile_mean
-from torchrl_l2c2.experiment.analysis.reports.tables import Table, number, number_range, pooled
-from torchrl_l2c2.experiment.run.finished import QUANTITIES, TESTS, Record
+from torchrl_l2c2.experiment.analysis.reports.table import (
+    COMPARED,
+    INTERVAL_NOTE,
+    Table,
+    comparison_table,
+    improvement_cell,
+    number,
+)
+from torchrl_l2c2.experiment.run.finished import QUANTITIES, TESTS
 from torchrl_l2c2.experiment.settings.tasks import TASKS
 
 
@@ -57,14 +60,14 @@ TAU, FASTER = "algorithm.tau", 0.5
 FASTER_RETURNS = {"l2c2": 376.0, "l2c2_policy": 284.0}
 LEGEND = (
     "Means over seeds, standard deviations in brackets; the paper's are over 18 seeds. Actions "
-    "are sampled, as in training; the action variation is that of the policy's mean, smaller is "
+    "are sampled, as in training; the action variation is of the policy's mean, smaller is "
     "smoother. The first column of each is of the late policies (training's own episodes in its "
     "last tenth or late_share); † marks means further from the paper's than the paper's "
-    "deviation. P is of the same: the probability that a run is better than a run of vanilla "
+    "deviation. P is of the same: the probability that a run is better than a run of the baseline "
     "with the same other settings (ties count half), with its 95% interval of the stratified "
     f"bootstrap; over several tasks it is the mean of theirs. {INTERVAL_NOTE} The "
-    "policy scale is that of the late policies: the Hellinger distance is relative to it, so that "
-    "a wider policy may change more."
+    "policy scale is of the late policies: the Hellinger distance is relative to it, so a "
+    "wider policy may change more."
 )
 DEPLOYED_LEGEND = (
     "The same runs with mean actions, as a trained policy is used: the late policies in a test "
@@ -77,57 +80,58 @@ DEPLOYED = ("late_mean", "last_mean")
 BETTER = {quantity: COMPARED[quantity][1] for quantity in QUANTITIES}
 STATISTICS_LEGEND = (
     "95% intervals of the stratified bootstrap in brackets (Agarwal et al. 2021). P: the "
-    "probability that a run is better than a run of vanilla with the same other settings "
+    "probability that a run is better than a run of the baseline with the same other settings "
     f"(ties count half). {INTERVAL_NOTE}"
 )
 FASTER_LEGEND = (
     "Means over seeds, standard deviations in brackets, of the late policies with sampled "
-    "actions, and of the last policy; for tau .5 the paper has the returns alone. P: the "
+    "actions, and of the last policy; for tau .5 the paper has only returns. P: the "
     "probability that a run of L2C2 returns more than a run without the value term (beta=0) at "
     "the same tau (ties count half), with its 95% interval of the stratified bootstrap. "
     + INTERVAL_NOTE
 )
 
 
-def paper_of(record: Record) -> Published | None:
-    """The paper's results of a run's task and method; ``None`` where it has none.
+def paper_of(group: Group) -> Published | None:
+    """The paper's results for a group's task and method; ``None`` without any.
 
-    Runs with other settings of the regularizer, another simulator or another pace of the target
-    networks have none. What else the paper leaves open may differ: the tables name it.
+    Groups with other settings of the regularizer, another simulator or another pace of the target
+    networks have none. Other settings that the paper leaves open may differ; the tables name them.
     """
     varied = ("regularizer.", TAU)
-    if not is_of_own_task(record) or any(k.startswith(varied) for k in record.other_settings):
+    if not is_of_own_task(group) or any(name.startswith(varied) for name in group.settings):
         return None
-    return PAPER.get((record.task, record.method)) if is_of_paper(record) else None
+    return PAPER.get((group.first.task, group.first.method)) if is_of_paper(group) else None
 
 
-def is_of_paper(record: Record) -> bool:
-    """Tells if a run is on one of the paper's tasks with its algorithm, by any method."""
-    return record.algorithm == "ppo_rpe" and (record.task, "none") in PAPER
+def is_of_paper(group: Group) -> bool:
+    """Tells if a group is on one of the paper's tasks with its algorithm, by any method."""
+    return group.first.algorithm == "ppo_rpe" and (group.first.task, "none") in PAPER
 
 
-def is_of_own_task(record: Record) -> bool:
-    """Tells if a run has the simulator, the noise and the longest episode of its task."""
-    return not {"task.env_id", "task.noise_scale", "task.max_steps"} & record.other_settings.keys()
+def is_of_own_task(group: Group) -> bool:
+    """Tells if a group has the simulator, the noise and the longest episode of its task."""
+    return not {"task.env_id", "task.noise_scale", "task.max_steps"} & group.settings.keys()
 
 
-def is_as_usual(record: Record, *but: str) -> bool:
+def is_as_usual(group: Group, *but: str) -> bool:
     """Tells if length and settings are the task's defaults, except for the settings ``but``."""
-    task = TASKS.get(record.task)
-    others = {k for k in record.settings_without_length if not k.startswith("regularizer.")}
-    others -= {*but}
-    return task is not None and record.length == f"{task.episodes} episodes" and not others
+    task = TASKS.get(group.first.task)
+    others = {name for name in group.settings if not name.startswith("regularizer.")} - {*but}
+    return task is not None and group.first.length == f"{task.episodes} episodes" and not others
 
 
-def shown_groups(records: Iterable[Record]) -> list[Group]:
+def shown_groups(records: pd.DataFrame) -> list[Group]:
     """The groups of the paper's table: per task the default length and settings, if it has them."""
-    records = [r for r in records if is_of_paper(r)]
-    as_usual = {r.task for r in records if is_as_usual(r)}
-    return group_records(r for r in records if is_as_usual(r) or r.task not in as_usual)
+    groups = [group for group in group_records(records) if is_of_paper(group)]
+    as_usual = {group.first.task for group in groups if is_as_usual(group)}
+    shown = [g for g in groups if is_as_usual(g) or g.first.task not in as_usual]
+    # New names: only differences between these groups count.
+    return group_records(regrouped(shown)) if shown else []
 
 
 def paper_table(groups: Sequence[Group]) -> Table:
-    """Each group's late and last policies with sampled actions, next to the paper's results."""
+    """Late and last policies of each group with sampled actions, next to the paper's results."""
     columns = ["task", "method", "seeds"]
     for quantity, better in BETTER.items():
         columns += [QUANTITIES[quantity], "the paper's", "last policy", better]
@@ -137,7 +141,7 @@ def paper_table(groups: Sequence[Group]) -> Table:
         for quantity in QUANTITIES:
             cells += [
                 pooled(group, FIRST, quantity) + ("†" if _is_off(group, quantity) else ""),
-                _published(paper_of(group.first), quantity),
+                _published(paper_of(group), quantity),
                 pooled(group, SECOND, quantity),
                 improvement_cell([group], [baseline_of(group, groups)], FIRST, quantity),
             ]
@@ -145,7 +149,7 @@ def paper_table(groups: Sequence[Group]) -> Table:
     for _, name, ours, found in improvements_over_tasks(groups, FIRST, QUANTITIES):
         across = [cell for each in found for cell in ("", "", "", each)]
         rows.append([f"{len(ours)} tasks", name, "", *across, ""])
-    return Table("Beside the paper's table", [*columns, "policy scale"], rows, [LEGEND])
+    return Table("Next to the paper's table", [*columns, "policy scale"], rows, [LEGEND])
 
 
 def deployed_table(groups: Sequence[Group]) -> Table:
@@ -171,23 +175,39 @@ def deployed_table(groups: Sequence[Group]) -> Table:
 def statistics_table(groups: Sequence[Group]) -> Table:
     """Interquartile means of the late policies with sampled actions."""
     table = comparison_table(FIRST, groups, interquartile_mean)
+    across = [
+        [
+            f"{len(ours)} tasks",
+            algorithm,
+            name,
+            _runs(ours),
+            *(c for each in found for c in ("", each)),
+        ]
+        for algorithm, name, ours, found in improvements_over_tasks(groups, FIRST, QUANTITIES)
+    ]
     means = {name: f"{name}: interquartile mean" for name in QUANTITIES.values()}
     return replace(
         table,
         title=f"Statistics: {TESTS[FIRST]}",
         columns=[means.get(column, column) for column in table.columns],
+        rows=[*table.rows, *across],
         notes=[STATISTICS_LEGEND],
     )
 
 
-def faster_targets_table(records: Iterable[Record]) -> Table:
+def _runs(groups: Sequence[Group]) -> str:
+    return number_range(sorted({len(group.scores(FIRST, "return")) for group in groups}))
+
+
+def faster_targets_table(records: pd.DataFrame) -> Table:
     """L2C2 on Swingup with and without its value term, at every pace of the target networks."""
     groups = group_records(
-        record
-        for record in records
-        if (record.task, record.algorithm) == ("swingup", "ppo_rpe")
-        and record.method in FASTER_RETURNS
-        and not any(name.startswith("regularizer.") for name in record.other_settings)
+        records[
+            (records["task"] == "swingup")
+            & (records["algorithm"] == "ppo_rpe")
+            & records["method"].isin(FASTER_RETURNS)
+            & ~records["differences"].str.contains("regularizer.", regex=False)
+        ]
     )
     rows = []
     for group in groups:
@@ -197,7 +217,7 @@ def faster_targets_table(records: Iterable[Record]) -> Table:
             [
                 *(group.first.task, group.name, number_range(group.seeds)),
                 *(pooled(group, test, "return") for test in (FIRST, SECOND)),
-                _faster_published(group.first),
+                _faster_published(group),
                 improvement_cell([group], without[:1] or [None], FIRST, "return"),
             ]
         )
@@ -208,7 +228,7 @@ def faster_targets_table(records: Iterable[Record]) -> Table:
 
 def point(group: Group) -> tuple[float, ...] | None:
     """The paper's action variation and return of a group, then their standard deviations."""
-    paper = paper_of(group.first)
+    paper = paper_of(group)
     if paper is None:
         return None
     ends = zip(paper.cell("action_variation"), paper.cell("return"), strict=True)
@@ -217,7 +237,7 @@ def point(group: Group) -> tuple[float, ...] | None:
 
 def _is_off(group: Group, quantity: str) -> bool:
     """Tells if late policies are further from the paper's mean than its standard deviation."""
-    scores, paper = group.scores(FIRST, quantity), paper_of(group.first)
+    scores, paper = group.scores(FIRST, quantity), paper_of(group)
     if paper is None or not len(scores):
         return False
     center, deviation = paper.cell(quantity)
@@ -231,8 +251,8 @@ def _published(paper: Published | None, quantity: str) -> str:
     return f"{number(center, quantity)} ({number(deviation, quantity, center)})"
 
 
-def _faster_published(record: Record) -> str:
-    tau = record.other_settings.get(TAU)
+def _faster_published(group: Group) -> str:
+    tau, method = group.settings.get(TAU), group.first.method
     if tau is None:
-        return number(PAPER[record.task, record.method].return_mean, "return")
-    return number(FASTER_RETURNS[record.method], "return") if tau == str(FASTER) else ""
+        return number(PAPER[group.first.task, method].return_mean, "return")
+    return number(FASTER_RETURNS[method], "return") if tau == str(FASTER) else ""

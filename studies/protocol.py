@@ -16,14 +16,22 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
+from studies.cells import number_range
 from studies.paper import is_of_paper, paper_of, paper_table
 from torchrl_l2c2.experiment.analysis.reports.groups import Group, group_records
 from torchrl_l2c2.experiment.analysis.reports.names import method_name
-from torchrl_l2c2.experiment.analysis.reports.records import merge, read_records, write_records
-from torchrl_l2c2.experiment.analysis.reports.runs import find_runs
-from torchrl_l2c2.experiment.analysis.reports.tables import Table, number_range, or_dash
+from torchrl_l2c2.experiment.analysis.reports.records import (
+    find_runs,
+    merge,
+    read_records,
+    records_of,
+    write_records,
+)
+from torchrl_l2c2.experiment.analysis.reports.table import Table, or_dash
 from torchrl_l2c2.experiment.errors import UserError, one_line_errors
-from torchrl_l2c2.experiment.run.finished import QUANTITIES, TESTS, FinishedRun, Record
+from torchrl_l2c2.experiment.run.finished import QUANTITIES, TESTS, FinishedRun
 from torchrl_l2c2.experiment.settings.config import ExperimentConfig
 from torchrl_l2c2.experiment.settings.identity import length_dependent_settings
 
@@ -35,7 +43,7 @@ CAP = 5.0
 class Reading:
     """One choice of what the paper leaves open, on one task: its runs of vanilla and of CAPS."""
 
-    vanilla: Group
+    baseline: Group
     caps: Group
 
     def cells(self, test: str) -> dict[tuple[str, str], float]:
@@ -49,9 +57,9 @@ class Reading:
             most 5; NaN where the runs do not have the test.
         """
         cells = {}
-        for group in (self.vanilla, self.caps):
+        for group in (self.baseline, self.caps):
             for quantity in QUANTITIES:
-                published = paper_of(group.first)
+                published = paper_of(group)
                 assert published is not None
                 center, deviation = published.cell(quantity)
                 values = group.scores(test, quantity)
@@ -66,18 +74,19 @@ class Reading:
 
     @property
     def updates(self) -> float:
-        """Mean over its runs: of two readings that are as near, the one with fewer is taken."""
-        return statistics.fmean(r.updates for r in (*self.vanilla.records, *self.caps.records))
+        """Mean number of updates of the runs: fewer are preferred if the scores are close."""
+        both = pd.concat([self.baseline.runs, self.caps.runs])
+        return float(both["updates"].mean())
 
 
 def readings(groups: Sequence[Group]) -> list[Reading]:
-    """Pairs vanilla and CAPS of the paper's tasks where their other settings are the same."""
+    """Pairs the baseline and CAPS on the paper's tasks if their other settings are the same."""
     found: dict[tuple[Any, ...], dict[str, list[Group]]] = {}
     for group in groups:
-        if group.first.method in METHODS and paper_of(group.first) is not None:
+        if group.first.method in METHODS and paper_of(group) is not None:
             alike = found.setdefault(group.setup, {method: [] for method in METHODS})
             alike[group.first.method].append(group)
-    # Several of one, of other defaults, are readings of their own.
+    # Groups of older defaults make further pairs.
     return [
         Reading(*pair)
         for alike in found.values()
@@ -93,10 +102,10 @@ def score_table(found: Sequence[Reading]) -> Table:
     ]
     rows = []
     for reading in found:
-        first = reading.vanilla.first
-        others = [f"{name}={value}" for name, value in first.settings_without_length.items()]
+        first = reading.baseline.first
+        others = [f"{name}={value}" for name, value in reading.baseline.settings.items()]
         start = [first.task, " ".join(others) or "the defaults", first.length]
-        seeds = list(dict.fromkeys(number_range(g.seeds) for g in (reading.vanilla, reading.caps)))
+        seeds = list(dict.fromkeys(number_range(g.seeds) for g in (reading.baseline, reading.caps)))
         for test in ("late_mean", "late_sampled"):
             cells = reading.cells(test)
             if all(map(math.isnan, cells.values())):
@@ -154,23 +163,25 @@ def main(arguments: Iterable[str] | None = None) -> None:
         if chosen.csv:
             write_records(chosen.csv, merge(read_records(chosen.csv), records))
         groups = group_records(records)
-        tables = [paper_table([group for group in groups if is_of_paper(group.first)])]
+        tables = [paper_table([group for group in groups if is_of_paper(group)])]
         if found := readings(groups):
             tables.insert(0, score_table(found))
         print("\n\n".join([*(table.markdown() for table in tables), *notes]))
 
 
-def _read(paths: Sequence[str], lengths: Sequence[int] | None) -> tuple[list[Record], list[str]]:
+def _read(paths: Sequence[str], lengths: Sequence[int] | None) -> tuple[pd.DataFrame, list[str]]:
     files = [path for path in paths if Path(path).is_file()]
     found = find_runs(path for path in paths if path not in files)
     if lengths is None:
-        known = [record for file in files for record in read_records(file)]
-        return merge([], [*known, *(run.record for run in found.runs)]), found.notes
+        return merge(*map(read_records, files), records_of(found.runs)), found.notes
     if files:
-        raise UserError(f"--length needs the folders of runs, got the file {files[0]!r}.")
+        raise UserError(f"Expected folders of runs with --length, got the file {files[0]!r}.")
     cut = [each for run in found.runs for n in lengths if (each := until(run, n)) is not None]
     if not cut:
-        raise UserError(f"no run is as long as {min(lengths)} episodes or frames.")
+        raise UserError(
+            f"Expected runs of {min(lengths)} episodes or frames, got shorter ones. Name a smaller "
+            "--length."
+        )
     shorter = [ExperimentConfig.from_dict(run.config) for run in cut if not run.evaluation]
     settings = Counter(
         setting for config in shorter for setting in length_dependent_settings(config)
@@ -180,7 +191,7 @@ def _read(paths: Sequence[str], lengths: Sequence[int] | None) -> tuple[list[Rec
         "training of this length would give other numbers"
         for setting, many in settings.items()
     ]
-    return merge([], [run.record for run in cut]), [*found.notes, *notes]
+    return merge(records_of(cut)), [*found.notes, *notes]
 
 
 if __name__ == "__main__":

@@ -1,44 +1,40 @@
-"""Gains that follow a target: the target, the action variation that came of it, and its cost."""
+"""Table of gains that follow a target: the target, the action variation, and the return."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 
+import pandas as pd
+
+from studies.cells import number_range, pooled, regrouped
 from torchrl_l2c2.experiment.analysis.reports.groups import (
     Group,
     baseline_of,
     by_task,
     group_records,
 )
-from torchrl_l2c2.experiment.analysis.reports.tables import (
-    Table,
-    number,
-    number_range,
-    or_dash,
-    pooled,
-)
-from torchrl_l2c2.experiment.run.finished import QUANTITIES, Record
+from torchrl_l2c2.experiment.analysis.reports.table import Table, number, or_dash
+from torchrl_l2c2.experiment.run.finished import QUANTITIES
 
-# A target is followed in training's own episodes, and is to hold of a policy that is deployed.
+# The gain follows the target in training episodes; a deployed policy should have it, too.
 FOLLOWED, DEPLOYED = "late_sampled", "last_mean"
 LEGEND = (
     "Means over seeds, standard deviations in brackets. Followed: the action variation of "
     "training's own episodes, with sampled actions, in its last tenth or late_share, by which "
     "the gain was set; off by: the distance of its mean from the target, relative to the target. "
     "Then the last policy's test, with its mean actions. Below the runs with a target are those "
-    "of vanilla with the same other settings."
+    "of the baseline with the same other settings."
 )
 
 
-def gain_targets_table(records: Iterable[Record]) -> Table:
+def gain_targets_table(records: pd.DataFrame) -> Table:
     """A row for every target of the action variation, and for the baseline of the same settings."""
     groups = group_records(records)
-    following = [group for group in groups if _asked(group.first) is not None]
+    following = [group for group in groups if _asked(group) is not None]
     baselines = (baseline_of(group, groups) for group in following)
     shown = dict.fromkeys(group for group in (*following, *baselines) if group is not None)
-    # Named anew, by what sets these apart from one another; the baseline's below the others.
-    named = group_records(record for group in shown for record in group.records)
+    # New names: only differences between these groups count. The baseline is the last row.
+    named = group_records(regrouped(shown)) if shown else []
     rows = [
         _row(group)
         for together in by_task(named)
@@ -49,8 +45,8 @@ def gain_targets_table(records: Iterable[Record]) -> Table:
     return Table("Targets of the action variation", columns, rows, [LEGEND])
 
 
-def _asked(record: Record) -> float | None:
-    own = record.other_settings
+def _asked(group: Group) -> float | None:
+    own = group.settings
     if own.get("regularizer.gain") != "target" or "regularizer.gain_of" in own:
         return None
     return float(own["regularizer.gain_target"])
@@ -66,7 +62,7 @@ def _row(group: Group) -> list[str]:
 
 
 def _followed(group: Group) -> list[str]:
-    asked, scores = _asked(group.first), group.scores(FOLLOWED, "action_variation")
+    asked, scores = _asked(group), group.scores(FOLLOWED, "action_variation")
     reached = pooled(group, FOLLOWED, "action_variation")
     if asked is None:
         return ["", reached, ""]

@@ -2,13 +2,12 @@
 
 import math
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from benchmarks.cores import RECORDS, makespan, recorded, report, sweep
-from torchrl_l2c2.experiment.analysis.reports import read_records
+from torchrl_l2c2.experiment.analysis.reports.records import merge, read_records
 
 ROOT = Path(__file__).parents[1]
 
@@ -27,15 +26,16 @@ def test_the_table_has_all_of_the_papers_runs():
 
 def test_a_run_takes_what_those_of_the_tables_settings_took():
     """Neither other lengths, nor other settings of the algorithm, nor what no run says."""
-    run = replace(read_records(RECORDS)[0], task="swingup", algorithm="ppo_rpe", method="l2c2")
-    run = replace(run, length="350 episodes", differences="", seconds=120.0)
+    run = read_records(RECORDS).iloc[:1].assign(task="swingup", algorithm="ppo_rpe", method="l2c2")
+    run = run.assign(length="350 episodes", differences="", seconds=120.0)
     others = [
-        replace(run, length="300 episodes", seconds=60.0),
-        replace(run, differences="algorithm.tau=0.5", seconds=90.0),
-        replace(run, seconds=math.nan),
+        run.assign(length="300 episodes", seconds=60.0),
+        run.assign(settings="x", differences="algorithm.tau=0.5", seconds=90.0),
+        run.assign(seed=1, seconds=math.nan),
     ]
-    assert recorded([*others, run, replace(run, seconds=130.0)], "swingup", "l2c2") == [120, 130]
-    assert recorded(others, "swingup", "l2c2") == recorded([run], "swingup", "caps") == []
+    ours = merge(*others, run, run.assign(seed=2, seconds=130.0))
+    assert recorded(ours, "swingup", "l2c2") == [120, 130]
+    assert recorded(merge(*others), "swingup", "l2c2") == recorded(run, "swingup", "caps") == []
 
 
 def test_the_page_says_where_it_stops_scaling():

@@ -504,7 +504,7 @@ class TestPage:
         """Each has its words, a column of the table and every picture."""
         flipping = made_up(0.5 * FLIPPING, name="other", shares={"caps": TermShare(True, 0.1)})
         text = page([made_up(name="first"), flipping])
-        assert text.count("<div class=card>") == 2
+        assert text.count('<div class="card">') == 2
         # A step of the sine is 4 * .5 / 100 in the mean, of the other one 1.
         assert re.findall(r"width:([\d.]+)%", text) == ["2.0", "100.0"]
         assert "<th></th><th>first</th><th>other</th>" in text
@@ -581,9 +581,9 @@ class TestCommand:
         tuned = L2C2Config(policy_distance="mean", lambda_min=10.0, lambda_max=1000.0)
         first = folder("0ddc7233/seed_0", regularizer=tuned)
         second = folder("none/seed_0", regularizer=NoRegularizerConfig())
-        assert run_names([first, second]) == ["L2C2, means 10", "vanilla"]
+        assert run_names([first, second]) == ["L2C2, means 10", "baseline"]
         third = folder("none/seed_1", regularizer=NoRegularizerConfig(), seed=1)
-        assert run_names([first, third]) == ["L2C2, means 10/seed_0", "vanilla/seed_1"]
+        assert run_names([first, third]) == ["L2C2, means 10/seed_0", "baseline/seed_1"]
         other = folder("sigma-2/seed_0", regularizer=replace(tuned, sigma=2.0))
         assert run_names([first, other]) == ["0ddc7233", "sigma-2"]
 

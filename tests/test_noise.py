@@ -164,5 +164,5 @@ class TestCommand:
 
     def test_a_folder_without_runs_is_named(self, tmp_path):
         """With what is looked for."""
-        with pytest.raises(SystemExit, match=r"no finished run \(evaluation.json\) below"):
+        with pytest.raises(SystemExit, match=r"Expected finished runs \(evaluation.json\) below"):
             main([str(tmp_path)])

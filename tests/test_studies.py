@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from studies import forest, pages
+from studies.cells import improvements_over_tasks, over_tasks
 from studies.field import BETTER, field_groups, field_table
 from studies.methods import against_table, choice_table, pairwise_tables
 from studies.pages import (
@@ -36,11 +37,16 @@ from studies.paper import (
 from studies.protocol import main as score
 from studies.protocol import readings, until
 from studies.targets import gain_targets_table
-from tests.test_reports import cells, make_config, make_run
+from tests.test_reports import METHODS, cells, make_config, make_run, table_of
 from torchrl_l2c2.experiment import CATSConfig, L2C2Config, PPOConfig, PPORPEConfig, SACConfig
-from torchrl_l2c2.experiment.analysis.reports import group_records, read_records, read_runs
-from torchrl_l2c2.experiment.analysis.reports.comparison import improvement
+from torchrl_l2c2.experiment.analysis.reports import (
+    group_records,
+    read_records,
+    read_runs,
+    records_of,
+)
 from torchrl_l2c2.experiment.analysis.reports.records import merge
+from torchrl_l2c2.experiment.analysis.reports.table import improvement
 from torchrl_l2c2.experiment.settings.optimizers import AdamConfig
 from torchrl_l2c2.experiment.settings.tasks import TASKS
 
@@ -65,8 +71,8 @@ class TestPaper:
                 config = make_config(regularizer=method, seed=seed)
                 make_run(tmp_path / method / str(seed), config, *result)
         make_run(tmp_path / "sac", make_config(algorithm=SACConfig()), 99.0, 0.1)
-        table = paper_table(shown_groups(read(tmp_path)))
-        assert [row[:2] for row in table.rows] == [["swingup", "vanilla"], ["swingup", "L2C2"]]
+        table = paper_table(shown_groups(table_of(read(tmp_path))))
+        assert [row[:2] for row in table.rows] == [["swingup", "baseline"], ["swingup", "L2C2"]]
         row = dict(zip(table.columns, table.rows[1], strict=True))
         assert row["P(returns more)"].split()[0] == "0.75"
         assert row["P(smoother)"].split()[0] == "0.75"
@@ -78,7 +84,7 @@ class TestPaper:
     def test_a_cell_beyond_the_papers_deviation_is_marked(self, tmp_path, total, marks):
         """The paper's L2C2 on Swingup: 693.77 (123.78) at .075 (.012); .08 lies within."""
         make_run(tmp_path / "run", make_config(regularizer="l2c2"), total, 0.08)
-        (row,) = paper_table(group_records(read(tmp_path))).rows
+        (row,) = paper_table(group_records(table_of(read(tmp_path)))).rows
         assert "".join(row).count("†") == marks
 
     def test_as_deployed_they_are_compared_by_their_mean_actions(self, tmp_path):
@@ -94,7 +100,7 @@ class TestPaper:
             }.items()
             for seed, values in enumerate(runs)
         ]
-        plain, smooth = deployed_table(group_records(records)).rows
+        plain, smooth = deployed_table(group_records(table_of(records))).rows
         assert plain[3:] == ["15.00 (7.07)", plain[4], "", "0.500 (0.000)", plain[7], ""]
         assert (smooth[3], smooth[6]) == ("20.00 (7.07)", "0.500 (0.141)")
         assert (smooth[5].split()[0], smooth[8].split()[0]) == ("0.75", "0.50")
@@ -105,7 +111,7 @@ class TestPaper:
             for method, total in (("none", 10.0), ("caps", 10.0 + ahead)):
                 config = make_config(task=task, regularizer=method)
                 make_run(tmp_path / task / method, config, total, 0.1 - total / 1000)
-        groups = group_records(read(tmp_path))
+        groups = group_records(table_of(read(tmp_path)))
         for make, returned in ((paper_table, 6), (deployed_table, 5)):
             row = make(groups).rows[-1]
             assert row[:3] == ["2 tasks", "CAPS", ""] and row[returned] == "0.75"
@@ -122,7 +128,8 @@ class TestPaper:
                     make_run(folder, config, total + 10 * seed - 100 * tau, 0.1)
         records = read(tmp_path)
         of_rows = {
-            row[1]: (row[3].split()[0], *row[5:]) for row in faster_targets_table(records).rows
+            row[1]: (row[3].split()[0], *row[5:])
+            for row in faster_targets_table(table_of(records)).rows
         }
         assert of_rows == {
             "L2C2": ("295.0", "693.8", "1.00 [1.00, 1.00]"),
@@ -133,7 +140,7 @@ class TestPaper:
             "L2C2, beta=0, tau=0.5": ("155.0", "284.0", ""),
         }
         # And Table III is not of them.
-        published = {row[1]: row[4] for row in paper_table(group_records(records)).rows}
+        published = {row[1]: row[4] for row in paper_table(group_records(table_of(records))).rows}
         assert published["L2C2"] == "693.8 (123.8)" and published["L2C2, tau=0.5"] == ""
 
     def test_its_numbers_are_those_of_its_own_task_and_algorithm(self, tmp_path):
@@ -146,7 +153,10 @@ class TestPaper:
             "gain": make_config(regularizer=L2C2Config(beta=0.5)),
         }.items():
             make_run(tmp_path / name, config, 1.0, 0.1)
-        found = {run.folder.name: paper_of(run.record) for run in read_runs(tmp_path)}
+        found = {
+            run.folder.name: paper_of(*group_records(records_of([run])))
+            for run in read_runs(tmp_path)
+        }
         assert found["paper"].return_mean == 649.57
         assert all(found[name] is None for name in ("sac", "other", "gain"))
 
@@ -155,9 +165,10 @@ class TestPaper:
         make_run(tmp_path / "run", make_config(), 1.0, 0.1)
         (short,) = read(tmp_path)
         usual = replace(short, length=f"{TASKS['swingup'].episodes} episodes", seed=7)
-        assert is_as_usual(usual) and not is_as_usual(short)
-        assert [group.seeds for group in shown_groups([short])] == [[0]]
-        assert [group.seeds for group in shown_groups([short, usual])] == [[7]]
+        groups = {group.seeds[0]: group for group in group_records(table_of([short, usual]))}
+        assert is_as_usual(groups[7]) and not is_as_usual(groups[0])
+        assert [group.seeds for group in shown_groups(table_of([short]))] == [[0]]
+        assert [group.seeds for group in shown_groups(table_of([short, usual]))] == [[7]]
 
 
 @pytest.fixture
@@ -180,6 +191,49 @@ def pendulum(tmp_path):
     return read(tmp_path)
 
 
+@pytest.fixture(scope="module")
+def forty(tmp_path_factory):
+    """Records of two tasks, four methods and five seeds: returns are ``100 m + seed``."""
+    folder = tmp_path_factory.mktemp("forty")
+    for task in ("swingup", "reacher"):
+        for m, (name, method) in enumerate(METHODS.items()):
+            for seed in range(5):
+                config = make_config(task=task, regularizer=method, seed=seed)
+                make_run(folder / task / name / str(seed), config, 100.0 * m + seed, 0.1 - 0.01 * m)
+    return read(folder)
+
+
+class TestOverTasks:
+    def test_runs_are_counted_by_task(self, forty):
+        """None of 20 pairs and all of 15, of seeds that the tasks do not share."""
+        caps = [r for r in forty if r.method == "caps"]
+        swingup, reacher = ([r for r in caps if r.task == t] for t in ("swingup", "reacher"))
+        # Four runs that return less than every run of the baseline, and one without a test.
+        lost = [replace(r, last_mean_return=-9.0) for r in swingup[1:]]
+        untested = replace(swingup[0], last_mean_return=math.nan)
+        others = [replace(r, seed=100 + r.seed) for r in reacher[:3]]
+        baseline = [r for r in forty if r.method == "none"]
+        groups = group_records(table_of([untested, *lost, *others, *baseline]))
+        ((*_, cells),) = improvements_over_tasks(groups, "last_mean", ["return"])
+        assert cells == ["0.50 [0.50, 0.50]"]
+        groups = group_records(table_of([untested, *others, *baseline]))
+        assert not improvements_over_tasks(groups, "last_mean", ["return"])
+
+    def test_other_settings_of_a_method_are_another_row(self, forty):
+        """Also if every task has only one of them, so the names are the same."""
+        chosen = [r for r in forty if r.method == "none"]
+        for task, changed in (("swingup", False), ("reacher", True)):
+            ours = [r for r in forty if (r.task, r.method) == (task, "l2c2")]
+            chosen += [r for r in ours if ("regularizer.beta" in r.differences) == changed]
+        groups = group_records(table_of(chosen))
+        assert [group.name for group in groups] == ["baseline", "L2C2"] * 2
+        rows = over_tasks(group for group in groups if group.first.method != "none")
+        assert [(name, [g.first.task for g in row]) for _, name, row in rows] == [
+            ("L2C2", ["swingup"]),
+            ("L2C2", ["reacher"]),
+        ]
+
+
 class TestField:
     def test_published_rows_are_beside_the_means_over_seeds(self, tmp_path):
         """Of those tasks with PPO and SAC alone; an interval from two runs on; ties are halves."""
@@ -190,7 +244,7 @@ class TestField:
                 make_run(folder, make_config(regularizer=method, seed=seed, **preset), 100.0, 0.1)
                 change_summary(folder, sm_asap_mean=0.4 + 0.2 * seed)
         make_run(tmp_path / "paper", make_config(), 10.0, 0.1)
-        table = field_table(read(tmp_path))
+        table = field_table(table_of(read(tmp_path)))
         assert cells(table, "hopper_v5", "ppo", "CAPS") == [
             "0, 1",
             "120.0 [120.0, 120.0]",
@@ -208,12 +262,12 @@ class TestField:
         assert {row[0] for row in table.rows} == {"hopper_v5"}
         # With noise, or shorter episodes, it is another task.
         other = [replace(r, differences="task.max_steps=60") for r in read(tmp_path)]
-        assert all(row[-2:] == ["", ""] for row in field_table(other).rows if row[3])
+        assert all(row[-2:] == ["", ""] for row in field_table(table_of(other)).rows if row[3])
 
     def test_a_mean_says_of_how_many_runs_it_is(self, pendulum):
         """Those that were cut to a length have no last policy."""
         lacking = [replace(r, last_mean_return=math.nan) if r.seed else r for r in pendulum]
-        row = cells(field_table(lacking), "pendulum", "ppo", "CATS")
+        row = cells(field_table(table_of(lacking)), "pendulum", "ppo", "CATS")
         assert row[1] == "25.00, of 1 runs" and row[2] == "0.300 [0.300, 0.300]"
 
     def test_settings_are_in_order_over_tasks(self, tmp_path):
@@ -234,7 +288,7 @@ class TestField:
                     off = 10.0 * seed - 5.0 if seed < 2 else 1000.0
                     change_summary(folder, return_mean=total + off, sm_asap_mean=sm)
         records = read(tmp_path)
-        table = choice_table(records)
+        table = choice_table(table_of(records))
         # Of all pairs of these seeds: returns of .1 win 3.5 of 4 and none, of .3 2 and 3.5 of 4.
         assert [[*row[:-2], *(cell.split()[0] for cell in row[-2:])] for row in table.rows] == [
             ["ppo", f"L2C2, gain_target={share}", "pendulum, lunarlander", "0, 1", *row]
@@ -244,11 +298,11 @@ class TestField:
             }.items()
         ]
         # .3 beside .1: a half of 4 pairs of Pendulum and all of LunarLander's; Sm of these alone.
-        pairwise = pairwise_tables(records)
+        pairwise = pairwise_tables(table_of(records))
         assert [each.title.split(",")[0] for each in pairwise] == [*BETTER.values()]
         first, last = (f"L2C2, gain_target={share}" for share in (0.1, 0.3))
         for each, better in zip(pairwise, (0.56, 0.50), strict=True):
-            assert [*each.columns] == ["method", "vanilla", first, last]
+            assert [*each.columns] == ["method", "baseline", first, last]
             found = by_methods(each)
             assert found[last][first].split()[0] == f"{better:.2f}"
             assert found[first][last].split()[0] == f"{1 - better:.2f}"
@@ -260,7 +314,7 @@ class TestField:
             replace(r, last_mean_return=0.0, last_mean_sm_asap=0.0) if r.method == "none" else r
             for r in pendulum
         ]
-        row = cells(choice_table(still), "ppo", "CATS")
+        row = cells(choice_table(table_of(still)), "ppo", "CATS")
         assert row[2:6] == ["-", "- pendulum", "-", "- pendulum"] and not recwarn.list
 
     def test_runs_of_another_length_are_not_compared(self, pendulum):
@@ -270,14 +324,14 @@ class TestField:
             for r in pendulum
         ]
         usual = [r for r in pendulum if "gamma" not in r.differences]
-        assert not pairwise_tables(longer) and len(pairwise_tables(usual)) == 2
+        assert not pairwise_tables(table_of(longer)) and len(pairwise_tables(table_of(usual))) == 2
 
     def test_one_method_against_each_other_one(self, pendulum):
         """Of four pairs three return more, a half is smoother by Sm; a tie counts half."""
-        table = against_table(pendulum, "L2C2")
+        table = against_table(table_of(pendulum), "L2C2")
         # The run with another discount is no row.
         assert [row[:4] for row in table.rows] == [
-            ["pendulum", "ppo", name, "0, 1"] for name in ("vanilla", "CATS")
+            ["pendulum", "ppo", name, "0, 1"] for name in ("baseline", "CATS")
         ]
         baseline, cats = ([cell.split()[0] for cell in row[4:]] for row in table.rows)
         assert baseline == [
@@ -294,9 +348,9 @@ class TestField:
             for r in pendulum
             if "gamma" not in r.differences
         ]
-        row = against_table(lacking, "L2C2").rows[0]
+        row = against_table(table_of(lacking), "L2C2").rows[0]
         assert row[4] == "20.00" and row[7].endswith(", of 1 runs")
-        notes = [table.notes for table in pairwise_tables(lacking)]
+        notes = [table.notes for table in pairwise_tables(table_of(lacking))]
         assert [len(each) for each in notes] == [1, 2]
         assert notes[1][1] == "Not all runs have it: pendulum, L2C2, of 1 runs."
 
@@ -317,12 +371,12 @@ def test_targets_have_what_came_of_them_and_what_they_cost(tmp_path):
     ):
         config = make_config(regularizer=regularizer, seed=seed)
         make_run(tmp_path / name, config, 100.0 * (seed + 1), varied)
-    table = gain_targets_table(read(tmp_path))
+    table = gain_targets_table(table_of(read(tmp_path)))
     assert table.columns[4:7] == ["target", "followed", "off by"]
     assert [row[2:7] for row in table.rows] == [
         ["L2C2, gain_target=0.02", "0", "0.020", "0.020", "+0%"],
         ["L2C2, gain_target=0.05", "0, 1", "0.050", "0.045 (0.007)", "-10%"],
-        ["vanilla", "0", "", "0.100", ""],
+        ["baseline", "0", "", "0.100", ""],
     ]
     assert [row[7:] for row in table.rows] == [
         ["100.0", "0.500", "0.040", "120.0"],
@@ -341,18 +395,18 @@ class TestProtocol:
         make_run(tmp_path / "caps", make_config(regularizer="caps"), 239.57 - 79.68, 0.226)
         make_run(tmp_path / "l2c2", make_config(regularizer="l2c2"), -1e9, 9.0)
         records = read(tmp_path)
-        (reading,) = readings(group_records(records))
+        (reading,) = readings(group_records(table_of(records)))
         assert reading.score("late_sampled") == pytest.approx((1 + 2 + 3 + 5) / 4)
         # With mean actions, returns are 12 higher and variations .012.
         distances = (1 + 12 / 77.96, 2 - 0.012 / 0.011, 3 - 12 / 26.56, 5)
         assert reading.score("late_mean") == pytest.approx(sum(distances) / 4, abs=1e-5)
         # Vanilla of other defaults, when it was run, is another reading.
         then = [replace(r, settings="then") for r in records if r.method == "none"]
-        assert len(readings(group_records([*records, *then]))) == 2
+        assert len(readings(group_records(table_of([*records, *then])))) == 2
         # Nor are CAPS's of other settings beside it.
         other = [replace(r, differences="algorithm.replay_ratio=5") for r in records]
         caps = [r for r in other if r.method == "caps"]
-        assert not readings(group_records([*then, *caps]))
+        assert not readings(group_records(table_of([*then, *caps])))
 
     def test_a_run_can_be_read_as_if_it_had_ended_earlier(self, tmp_path):
         """Its own episodes up to there; what only its end was tested for is unknown."""
@@ -398,13 +452,14 @@ class TestProtocol:
             ("10 episodes", "sampled actions"),
             ("15 episodes", "sampled actions"),
         ]
-        kept = {(r.method, r.length): r.last_mean_return for r in read_records(file)}
+        rows = read_records(file).itertuples()
+        kept = {(r.method, r.length): r.last_mean_return for r in rows}
         assert kept["caps", "10 episodes"] == 30.0 and math.isnan(kept["caps", "15 episodes"])
         score([str(file)])
         assert "| swingup | the defaults | 15 episodes | 0 |" in capsys.readouterr().out
         for wrong, told in (
-            ((str(file), "--length", "10"), "--length needs the folders"),
-            ((str(tmp_path / "runs"), "--length", "30"), "no run is as long as 30"),
+            ((str(file), "--length", "10"), "Expected folders of runs with --length"),
+            ((str(tmp_path / "runs"), "--length", "30"), "Expected runs of 30 episodes"),
         ):
             with pytest.raises(SystemExit, match=f"error: {told}"):
                 score(wrong)
@@ -474,8 +529,7 @@ class TestProse:
         for label in HEADLINES:
             if "PPO-RPE" not in label:
                 ours, plain = (
-                    {r.seed: r.last_mean_return for r in group.records}
-                    for group in headline_groups(label)
+                    group.by_seed("last_mean", "return") for group in headline_groups(label)
                 )
                 lower = sum(ours[seed] < plain[seed] for seed in ours)
                 assert f"{lower} of {len(ours)} ({label})" in page
@@ -518,7 +572,8 @@ class TestProse:
         """Seed by seed, and in the mean."""
         page = (ROOT / "results" / "sac_pendulum.md").read_text()
         for frames, name in (("30,000", "sac_pendulum"), ("100,000", "sac_pendulum_100000")):
-            runs = {r.seed: r for r in records(name) if r.method == "none" and r.seed < 5}
+            rows = records(name).itertuples()
+            runs = {r.seed: r for r in rows if r.method == "none" and r.seed < 5}
             pairs = [(runs[s].last_mean_return, runs[s].last_mean_sm_asap) for s in range(5)]
             row = [f"{total:.0f} / {sm:.3f}" for total, sm in pairs]
             mean = "{:.1f} / {:.3f}".format(*np.mean(pairs, 0))
@@ -572,17 +627,17 @@ class TestProse:
             return "{:.1f} / {:.3f}".format(*means).replace("/ 0.", "/ .")
 
         gains = records("sac_gains")
-        assert all(cell(record) in page for record in gains if record.seed >= 100)
-        shown = [r for r in gains if r.seed < 100 and r.differences.count("lambda_") > 1]
-        for group in group_records([*shown, *records("sac_pendulum")]):
-            assert cell(*group.records[:4]) in page, group.name
+        assert all(cell(r) in page for r in gains.itertuples() if r.seed >= 100)
+        shown = gains[(gains["seed"] < 100) & (gains["differences"].str.count("lambda_") > 1)]
+        for group in group_records(merge(shown, records("sac_pendulum"))):
+            assert cell(*group.runs.iloc[:4].itertuples()) in page, group.name
 
     def test_walkings_gains(self):
         """Every run of the seeds that its gains are chosen on is a cell."""
         page = (ROOT / "results" / "field_gains.md").read_text()
-        one = [r for r in records("one_gain") if r.task == "walker2d_v5"]
-        shown = merge(records("walker2d_gains"), one)
-        for record in shown:
+        one = records("one_gain")
+        shown = merge(records("walker2d_gains"), one[one["task"] == "walker2d_v5"])
+        for record in shown.itertuples():
             cell = f"{record.last_mean_return:.0f} / {record.last_mean_sm_asap:.3f}"
             assert f"| {cell.replace('/ 0.', '/ .')} |" in page
         assert len(shown) >= 24

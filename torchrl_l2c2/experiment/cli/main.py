@@ -10,8 +10,8 @@ from importlib.util import find_spec
 from torchrl_l2c2._version import __version__
 
 # Packages of the experiment extra, which the components do not need.
-PACKAGES = ("gymnasium", "hydra", "pydantic", "matplotlib", "tqdm", "filelock")
-# Name: module and help. Each module has a function ``main(arguments)``.
+PACKAGES = ("gymnasium", "hydra", "pydantic", "matplotlib", "pandas", "jinja2", "tqdm", "filelock")
+# Name: module and help. Each module has a ``main(arguments)``.
 COMMANDS = {
     "train": ("train", "trains a policy, for example: train task=hopper seed=1"),
     "evaluate": ("evaluate", "plays test episodes, also with noise on observations"),

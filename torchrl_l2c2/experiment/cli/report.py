@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from torchrl_l2c2.experiment.errors import UserError, one_line_errors
 
 if TYPE_CHECKING:
-    from torchrl_l2c2.experiment.run.finished import FinishedRun, Record
+    import pandas as pd
+
+    from torchrl_l2c2.experiment.run.finished import FinishedRun
 
 DESCRIPTION = """\
-Reads all finished runs below folders, prints a table, and writes a report with tables, statistics
-and pictures, as one HTML page and as Markdown, SVG and JSON.
+Reads every finished run below folders, prints a table of them, and writes a report: tables,
+and pictures, as one page, as Markdown and as SVG.
 """
 EXAMPLES = """\
 examples:
@@ -70,8 +71,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _report(chosen: argparse.Namespace) -> None:
     from torchrl_l2c2.experiment.analysis.reports.records import merge, read_records, write_records
-    from torchrl_l2c2.experiment.analysis.reports.report import write_report
-    from torchrl_l2c2.experiment.analysis.reports.results import printed_table
+    from torchrl_l2c2.experiment.analysis.reports.report import printed_table, write_report
 
     records, runs, notes = _read(chosen)
     written = []
@@ -81,24 +81,29 @@ def _report(chosen: argparse.Namespace) -> None:
     if chosen.output or not (chosen.records or chosen.csv):
         folder = Path(chosen.output or Path(chosen.folders[0]) / "report")
         written.append(f"report: {write_report(folder, records, runs, notes)}")
-    # Printed last: a closed output, as with head, must not prevent the files.
+    # Last, as in `report ... | head`: the files are there when the reader ends.
     print("\n\n".join([printed_table(records), *notes, *written]))
 
 
-def _read(
-    chosen: argparse.Namespace,
-) -> tuple[Sequence[Record], Sequence[FinishedRun], Sequence[str]]:
-    from torchrl_l2c2.experiment.analysis.reports.records import merge, read_records
-    from torchrl_l2c2.experiment.analysis.reports.runs import find_runs
+def _read(chosen: argparse.Namespace) -> tuple[pd.DataFrame, Sequence[FinishedRun], Sequence[str]]:
+    from torchrl_l2c2.experiment.analysis.reports.records import (
+        find_runs,
+        merge,
+        read_records,
+        records_of,
+    )
 
     if chosen.folders:
         found = find_runs(chosen.folders, required=True)
-        return [run.record for run in found.runs], found.runs, found.notes
+        return records_of(found.runs), found.runs, found.notes
     for file in chosen.records:
         if not Path(file).exists():
-            raise FileNotFoundError(f"there is no file {file!r}: create it with --csv.")
-    records = merge([], chain.from_iterable(map(read_records, chosen.records)))
-    if not records:
+            raise FileNotFoundError(
+                f"Expected a file of records, got {file!r}, which does not exist. Make it with "
+                "--csv."
+            )
+    records = merge(*map(read_records, chosen.records))
+    if not len(records):
         named = ", ".join(map(repr, chosen.records))
-        raise UserError(f"no runs in {named}: add them with --csv.")
+        raise UserError(f"Expected records of runs in {named}, got none. Make them with --csv.")
     return records, [], []

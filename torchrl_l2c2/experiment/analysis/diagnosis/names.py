@@ -23,11 +23,11 @@ def run_names(folders: Sequence[str]) -> list[str]:
 
     Examples:
         >>> run_names(["a/sac/none/seed_0", "a/sac/caps/seed_0"])
-        ['vanilla', 'CAPS']
+        ['baseline', 'CAPS']
         >>> run_names(["a/sac/none/seed_0", "a/td3/none/seed_0", "b/sac/caps/seed_0"])
-        ['sac/vanilla', 'td3/vanilla', 'sac/CAPS']
+        ['sac/baseline', 'td3/baseline', 'sac/CAPS']
         >>> run_names(["/a/sac/none/seed_0"])
-        ['sac/vanilla/seed_0']
+        ['sac/baseline/seed_0']
     """
     paths = [Path(folder).resolve().parts for folder in folders]
     if len(set(paths)) < len(paths):

@@ -4,17 +4,22 @@
 a table of them and writes a report; ``--help`` lists its options.
 """
 
-from torchrl_l2c2.experiment.analysis.reports.comparison import comparison_table
 from torchrl_l2c2.experiment.analysis.reports.figures import draw_learning_curves, draw_plane
 from torchrl_l2c2.experiment.analysis.reports.groups import Group, group_records
-from torchrl_l2c2.experiment.analysis.reports.records import read_records, write_records
-from torchrl_l2c2.experiment.analysis.reports.report import write_report
-from torchrl_l2c2.experiment.analysis.reports.results import (
+from torchrl_l2c2.experiment.analysis.reports.records import (
+    Found,
+    find_runs,
+    read_records,
+    read_runs,
+    records_of,
+    write_records,
+)
+from torchrl_l2c2.experiment.analysis.reports.report import (
     result_lines,
     sweep_summary,
+    write_report,
 )
-from torchrl_l2c2.experiment.analysis.reports.runs import Found, find_runs, read_runs
-from torchrl_l2c2.experiment.analysis.reports.tables import Table
+from torchrl_l2c2.experiment.analysis.reports.table import Table, comparison_table
 from torchrl_l2c2.experiment.run.finished import (
     QUANTITIES,
     TESTS,
@@ -39,6 +44,7 @@ __all__ = [
     "group_records",
     "read_records",
     "read_runs",
+    "records_of",
     "result_lines",
     "sweep_summary",
     "write_records",

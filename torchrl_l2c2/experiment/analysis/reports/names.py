@@ -1,4 +1,4 @@
-"""What tables and pictures call a method, its color and its place among the others."""
+"""Names and colors of methods in tables and pictures, and their order."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torchrl_l2c2.experiment.settings.regularizers import REGULARIZERS, L2C2Conf
 
 # In the order of tables: name and color.
 METHODS = {
-    "none": ("vanilla", "#777777"),
+    "none": ("baseline", "#777777"),
     "caps": ("CAPS", "#d95f02"),
     "l2c2": ("L2C2", "#1b6ca8"),
     "l2c2_paper": ("L2C2, the paper's", "#6fa8dc"),
@@ -28,11 +28,17 @@ DISTANCES = {"hellinger": "Hellinger", "mean": "means", "mse": "mse", "kl": "KL"
 
 
 def method_name(method: str) -> str:
-    """How a method is called in tables and pictures; its own name where the paper has none."""
+    """Returns the name of a method in tables and pictures."""
     return METHODS.get(method, (method, ""))[0]
 
 
-def name_with_settings(method: str, settings: Mapping[str, str | None]) -> tuple[str, set[str]]:
+def method_order(method: str) -> tuple[int, str]:
+    """Sort key of methods: the order of ``METHODS``, then other methods by name."""
+    known = list(METHODS)
+    return (known.index(method) if method in known else len(known), method)
+
+
+def name_with_settings(method: str, settings: Mapping[str, str]) -> tuple[str, set[str]]:
     """Name of a method with its own settings, and the settings that the name contains.
 
     The name of L2C2 contains its distance and its gain, or the target of the gain. "L2C2" without
@@ -53,23 +59,20 @@ def name_with_settings(method: str, settings: Mapping[str, str | None]) -> tuple
         'L2C2, mse, target 0.1'
     """
     usual = REGULARIZERS.get(method)
-    own = {k.removeprefix("regularizer."): v for k, v in settings.items() if v is not None}
+    own = {name.removeprefix("regularizer."): value for name, value in settings.items()}
     if not isinstance(usual, L2C2Config) or not {"policy_distance", "lambda_min"} & own.keys():
         return method_name(method), set()
     distance = DISTANCES[own.get("policy_distance", usual.policy_distance)]
-    gain, edge = own.get("gain", usual.gain), own.get("lambda_min", f"{usual.lambda_min:g}")
-    told = {"policy_distance", "gain"}
+    gain, smallest = own.get("gain", usual.gain), own.get("lambda_min", f"{usual.lambda_min:g}")
+    contained = {"policy_distance", "gain"}
     if gain == "target":
-        told, name = told | {"gain_target"}, f"{distance}, {gain} {own.get('gain_target')}"
+        contained.add("gain_target")
+        name = f"{distance}, {gain} {own.get('gain_target')}"
     else:
-        told, name = told | {"lambda_min"}, f"{distance} {edge}{', ramp' if gain == 'ramp' else ''}"
-        ratio = float(own.get("lambda_max", usual.lambda_max)) / float(edge)
+        contained.add("lambda_min")
+        name = f"{distance} {smallest}{', ramp' if gain == 'ramp' else ''}"
+        ratio = float(own.get("lambda_max", usual.lambda_max)) / float(smallest)
+        # The paper's ratio is not part of a name.
         if math.isclose(ratio, usual.lambda_max / usual.lambda_min):
-            told.add("lambda_max")  # The paper's ratio goes without saying.
-    return f"L2C2, {name}", {f"regularizer.{setting}" for setting in told}
-
-
-def method_order(method: str) -> tuple[int, str]:
-    """Sorts the paper's methods as the paper does, others behind them by name."""
-    known = list(METHODS)
-    return (known.index(method) if method in known else len(known), method)
+            contained.add("lambda_max")
+    return f"L2C2, {name}", {f"regularizer.{setting}" for setting in contained}

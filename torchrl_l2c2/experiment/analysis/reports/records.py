@@ -1,107 +1,194 @@
-"""Records of runs as lines of a CSV file, from which every table can be made."""
+"""Finished runs below folders, and their records as a table with a row for each run."""
 
 from __future__ import annotations
 
-import csv
-import hashlib
 import io
-import math
 import re
 from collections.abc import Callable, Iterable
-from dataclasses import fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+import pandas as pd
 
 from torchrl_l2c2.experiment.analysis.reports.names import method_order
 from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.run.files import make_folder, read_rows, write_atomically
-from torchrl_l2c2.experiment.run.finished import Record
-from torchrl_l2c2.experiment.settings.identity import read_differences
+from torchrl_l2c2.experiment.run.finished import FinishedRun, Record
+from torchrl_l2c2.experiment.settings.identity import BUDGETS, read_differences
 from torchrl_l2c2.experiment.settings.tasks import TASKS
 
+TYPES = {field.name: str(field.type) for field in fields(Record)}
+# Runs that share these differ only in their seeds.
+KIND = ["task", "algorithm", "method", "settings", "length"]
 
-def place(record: Record) -> tuple[Any, ...]:
-    """The key by which tables are sorted: the order of tasks, then the fewest changed settings.
 
-    Records that differ only in the regularizer, and so are compared, come together.
+@dataclass(frozen=True)
+class Found:
+    """The runs below some folders.
+
+    Attributes:
+        runs: finished runs, in the order of tables.
+        notes: lines about folders that are unfinished, unreadable, repeated or untrained.
     """
-    task = list(TASKS).index(record.task) if record.task in TASKS else len(TASKS)
-    words = {k: f"{k}={v}" for k, v in record.settings_without_length.items()}
-    own = [word for name, word in words.items() if name.startswith("regularizer.")]
-    others = [word for word in words.values() if word not in own]
-    amount, unit = record.length.split()
-    reading = (len(others), others, unit, int(amount))
-    method = (*method_order(record.method), len(own), own, record.settings)
-    return (task, record.task, record.algorithm, *reading, *method, record.seed)
+
+    runs: list[FinishedRun]
+    notes: list[str]
 
 
-def read_records(path: str | Path) -> list[Record]:
-    """Reads what :func:`write_records` wrote; an empty or absent file has none.
+def find_runs(folders: Iterable[str | Path], *, required: bool = False) -> Found:
+    """Reads every finished run below folders, at any depth.
+
+    If several runs have the same settings and seed, the most recent run is used.
+
+    Args:
+        folders (iterable of str or Path): The folders.
+
+    Keyword Args:
+        required (bool): Whether a result without runs is an error. Default ``False``.
 
     Raises:
-        UserError: the file has other columns, a line that is cut, or a cell that is no number
-            where one must be.
+        FileNotFoundError: a folder does not exist, or no run was found and one is required.
+    """
+    searched = [Path(folder) for folder in folders]
+    if absent := [str(folder) for folder in searched if not folder.is_dir()]:
+        raise FileNotFoundError(
+            f"Expected a folder of runs, got {absent[0]!r}, which does not exist. Check the path."
+        )
+    below = {path.parent for folder in searched for path in folder.rglob("config.json")}
+    unfinished, unreadable, repeated = [], [], []
+    newest: dict[tuple[Any, ...], FinishedRun] = {}
+    for folder in sorted(below, key=_finished_at):
+        if not (folder / "evaluation.json").exists():
+            unfinished.append(str(folder))
+            continue
+        try:
+            run = FinishedRun.read(folder)
+            identity = run.record.identity
+        except (OSError, ValueError, KeyError, TypeError, ArithmeticError) as error:
+            unreadable.append(f"{folder} ({error})")
+            continue
+        if identity in newest:
+            repeated.append(f"{newest[identity].folder} (as {folder})")
+        newest[identity] = run
+    runs = sorted(newest.values(), key=lambda run: _place(run.record))
+    named = {
+        "unfinished (running, interrupted or failed)": sorted(unfinished),
+        "unreadable": sorted(unreadable),
+        "the same settings and seed as a newer one, left out": repeated,
+        "untrained (without an update, or with random actions only)": [
+            str(run.folder) for run in runs if run.is_untrained
+        ],
+    }
+    notes = [f"{len(names)} {kind}: {', '.join(names)}" for kind, names in named.items() if names]
+    if required and not runs:
+        places = ", ".join(repr(str(folder)) for folder in searched)
+        text = f"Expected finished runs (evaluation.json) below {places}, got none."
+        raise FileNotFoundError(" ".join([text, *notes, "Name an output folder of train.py."]))
+    return Found(runs, notes)
+
+
+def read_runs(folder: str | Path) -> list[FinishedRun]:
+    """Reads every finished run below a folder, at least one.
+
+    Raises:
+        FileNotFoundError: there is none.
+    """
+    return find_runs([folder], required=True).runs
+
+
+def records_of(runs: Iterable[FinishedRun]) -> pd.DataFrame:
+    """Makes the table of runs: a row for each run, a column for each field of its record."""
+    return _ordered(pd.DataFrame([asdict(run.record) for run in runs], columns=list(TYPES)))
+
+
+def read_records(path: str | Path) -> pd.DataFrame:
+    """Reads a CSV file of :func:`write_records`; an empty or absent file has no rows.
+
+    Raises:
+        UserError: a column is missing or unknown, a line is cut, or a cell has a wrong value.
     """
     path = Path(path)
     columns, lines = read_rows(path) if path.exists() else ([], [])
-    names = [field.name for field in fields(Record)]
-    if columns and columns != names:
-        raise UserError(f"{path} has the columns {columns}; they must be {names}.")
-    return merge([], (_parse(path, number, line) for number, line in enumerate(lines, start=2)))
+    if columns and columns != list(TYPES):
+        odd = ", ".join(sorted(set(columns) ^ TYPES.keys())) or "another order"
+        raise UserError(
+            f"Expected the columns of records in {path}, got other ones ({odd}). "
+            "Write the file with report --csv."
+        )
+    read: dict[str, Callable[[str], Any]] = {"int": int, "float": _number, "str": str}
+    rows = []
+    for number, line in enumerate(lines, start=2):
+        try:
+            rows.append({name: read[kind](line[name]) for name, kind in TYPES.items()})
+            read_differences(line["differences"])
+            if not re.fullmatch(r"\d+ (episodes|frames)", line["length"]):
+                raise ValueError(f"Expected '<N> episodes' or frames, got {line['length']!r}")
+        except ValueError as error:
+            raise UserError(f"{path}, line {number}: {error}. Mend the line.") from None
+    return merge(pd.DataFrame(rows, columns=list(TYPES)))
 
 
-def write_records(path: str | Path, records: Iterable[Record]) -> None:
-    """Writes records as CSV, sorted, whole or not at all; the same records give the same bytes."""
+def write_records(path: str | Path, records: pd.DataFrame) -> None:
+    """Writes records as CSV, sorted; the same records give the same bytes."""
     make_folder(Path(path).parent)
-    write_atomically(path, _written(records))
+    write_atomically(path, to_csv(records))
 
 
-def digest(records: Iterable[Record]) -> str:
-    """What tells these records from all others, as a picture of them says in its description."""
-    return hashlib.sha256(_written(records)).hexdigest()[:12]
-
-
-def _written(records: Iterable[Record]) -> bytes:
+def to_csv(records: pd.DataFrame) -> bytes:
+    """Returns records as the content of a CSV file."""
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(field.name for field in fields(Record))
-    for record in sorted(records, key=place):
-        writer.writerow(_cell(getattr(record, field.name)) for field in fields(Record))
+    _ordered(records).to_csv(text, index=False, float_format="%.6g", lineterminator="\n")
     return text.getvalue().encode()
 
 
-def merge(old: Iterable[Record], new: Iterable[Record]) -> list[Record]:
-    """Old and new records, sorted; a run's newer record takes the place of its older one.
+def merge(*records: pd.DataFrame) -> pd.DataFrame:
+    """Joins tables of records, sorted; a run's last record replaces its earlier ones.
 
-    But not one without its last policy's tests: that of a longer run, cut to the same length.
+    A record without tests of the last policy, as of a run that was cut to a length, never replaces
+    a record with tests.
     """
-    merged: dict[tuple[str | int, ...], Record] = {}
-    for record in (*old, *new):
-        older = merged.get(record.identity)
-        if older is None or record.is_tested or not older.is_tested:
-            merged[record.identity] = record
-    return sorted(merged.values(), key=place)
+    together = pd.concat([each for each in records if len(each)] or records[:1], ignore_index=True)
+    tested = together[["last_mean_return", "last_sampled_return"]].notna().any(axis=1)
+    by_tests = together.loc[tested.sort_values(kind="stable").index]
+    return _ordered(by_tests.drop_duplicates([*KIND, "seed"], keep="last"))
 
 
-def _cell(value: Any) -> str:
-    if not isinstance(value, float):
-        return str(value)
-    return "" if math.isnan(value) else f"{value:.6g}"
+def other_settings(record: Any) -> dict[str, str]:
+    """The settings of a record that differ from the defaults, except for the training's length."""
+    settings = read_differences(record.differences)
+    return {name: value for name, value in settings.items() if name not in BUDGETS}
+
+
+def _ordered(records: pd.DataFrame) -> pd.DataFrame:
+    places = [_place(record) for record in records.itertuples()]
+    order = sorted(range(len(places)), key=places.__getitem__)
+    return records.iloc[order].reset_index(drop=True).astype(TYPES)
+
+
+def _place(record: Any) -> tuple[Any, ...]:
+    """Sort key of tables: the order of tasks, then the fewest changed settings.
+
+    Records that differ only in the regularizer come together.
+    """
+    task = list(TASKS).index(record.task) if record.task in TASKS else len(TASKS)
+    words = [f"{name}={value}" for name, value in other_settings(record).items()]
+    own = [word for word in words if word.startswith("regularizer.")]
+    others = [word for word in words if word not in own]
+    amount, unit = record.length.split()
+    setup = (len(others), others, unit, int(amount))
+    method = (*method_order(record.method), len(own), own, record.settings)
+    return (task, record.task, record.algorithm, *setup, *method, record.seed)
+
+
+def _finished_at(folder: Path) -> tuple[float, str]:
+    mark = folder / "evaluation.json"
+    return (mark.stat().st_mtime if mark.exists() else 0.0, str(folder))
 
 
 def _number(cell: str) -> float:
-    """NaN of an empty cell: what is not known."""
-    if cell and not math.isfinite(float(cell)):
-        raise ValueError(f"a cell must be a finite number or empty, got {cell!r}")
-    return float(cell or "nan")
-
-
-def _parse(path: Path, number: int, line: dict[str, str]) -> Record:
-    readers: dict[str, Callable[[str], Any]] = {"int": int, "float": _number, "str": str}
-    try:
-        read_differences(line["differences"])
-        if not re.fullmatch(r"\d+ (episodes|frames)", line["length"]):
-            raise ValueError(f"length must be '<N> episodes' or frames, got {line['length']!r}")
-        return Record(**{f.name: readers[str(f.type)](line[f.name]) for f in fields(Record)})
-    except ValueError as error:
-        raise UserError(f"{path}, line {number}: {error}.") from None
+    value = float(cell or "nan")
+    if cell and not np.isfinite(value):
+        raise ValueError(f"Expected a finite number or an empty cell, got {cell!r}")
+    return value

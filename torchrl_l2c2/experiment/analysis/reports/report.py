@@ -1,97 +1,103 @@
-"""A report: tables, pictures and numbers of many runs in one folder, and one page of all of it."""
+"""The results of a run or a sweep in lines, and the report of many runs as a page."""
 
 from __future__ import annotations
 
-import html
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from torchrl_l2c2.experiment.analysis.reports.comparison import (
-    comparison_table,
-    known_tests,
-    summary,
-)
-from torchrl_l2c2.experiment.analysis.reports.document import picture, whole_page
+import pandas as pd
+
+from torchrl_l2c2.experiment.analysis.document import data_uri, render
 from torchrl_l2c2.experiment.analysis.reports.figures import draw_learning_curves, draw_plane
-from torchrl_l2c2.experiment.analysis.reports.groups import Group, group_records
-from torchrl_l2c2.experiment.analysis.reports.measures import measures_table
-from torchrl_l2c2.experiment.analysis.reports.tables import runs_table, settings_notes
-from torchrl_l2c2.experiment.run.files import make_folder, write_atomically, write_json
-from torchrl_l2c2.experiment.run.finished import FinishedRun, Record
+from torchrl_l2c2.experiment.analysis.reports.groups import group_records, settings_notes
+from torchrl_l2c2.experiment.analysis.reports.records import find_runs, records_of
+from torchrl_l2c2.experiment.analysis.reports.table import comparison_table, known_tests
+from torchrl_l2c2.experiment.run.files import make_folder, read_back, write_atomically
+from torchrl_l2c2.experiment.run.finished import QUANTITIES, FinishedRun
 from torchrl_l2c2.experiment.settings.naming import plain
 
-Draw = Callable[[Path], None]
+
+def result_lines(run: FinishedRun) -> str:
+    """Returns the return and the action variation of a run's test episodes, in lines.
+
+    Raises:
+        ValueError: the run's folder is damaged.
+    """
+    lines = [f"{'':>20}  {'return':>18}  {'action variation':>18}"]
+    tests = {"mean actions": run.evaluation, "sampled actions": run.evaluation.get("sampled")}
+    for name, test in tests.items():
+        own = (test or {}).get("summary")
+        if own is not None:
+            with read_back(run.folder):
+                total, variation = ((own[f"{q}_mean"], own[f"{q}_std"]) for q in QUANTITIES)
+                episodes = "episode" if own["episodes"] == 1 else "episodes"
+                lines.append(
+                    f"{name:>20}  {total[0]:>9.1f} ({total[1]:>6.1f})  {variation[0]:>10.3f} "
+                    f"({variation[1]:.3f})   {own['episodes']} test {episodes}, seed {run.seed}"
+                )
+    return "\n".join(lines)
+
+
+def printed_table(records: pd.DataFrame) -> str:
+    """Returns the table of records as Markdown: the last policies' mean actions, if tested."""
+    groups = group_records(records)
+    tables = [comparison_table(test, groups).markdown() for test in known_tests(groups)[:1]]
+    return "\n\n".join([*tables, *settings_notes(groups)])
+
+
+def sweep_summary(folders: Sequence[str | Path]) -> str:
+    """Returns a table of all runs below folders, and notes on unfinished runs, as Markdown.
+
+    Args:
+        folders (sequence of str or Path): Folders of runs, or folders that hold them.
+    """
+    found = find_runs(folders)
+    if not found.runs:
+        return "\n\n".join([f"No finished run below {', '.join(map(str, folders))}.", *found.notes])
+    return "\n\n".join([printed_table(records_of(found.runs)), *found.notes])
 
 
 def write_report(
     folder: str | Path,
-    records: Sequence[Record],
+    records: pd.DataFrame,
     runs: Sequence[FinishedRun] = (),
     notes: Sequence[str] = (),
 ) -> Path:
-    """Writes ``report.md``, ``report.html``, ``report.json`` and the pictures as SVG files.
+    """Writes ``report.md``, ``report.html`` and the pictures as SVG files.
 
-    Everything is made before anything is written: an error leaves no half report.
+    Everything is made before the first file is written, so an error leaves no partial report.
 
     Args:
         folder (str or Path): The report's folder, made if absent.
-        records (sequence of Record): The runs of the tables, at least one.
-        runs (sequence of FinishedRun): The folders of the same runs, for learning curves and
-            further measures.
+        records (DataFrame): The records of the runs, at least one.
+        runs (sequence of FinishedRun): The same runs, for learning curves.
         notes (sequence of str): Lines about left out folders, for example.
 
     Returns:
         Path: The page, which contains its pictures and needs no other file.
     """
     groups = group_records(records)
+    tests = known_tests(groups)
     notes = [*notes, *settings_notes(groups)]
-    tables = [comparison_table(test, groups) for test in known_tests(groups)]
-    details = [table for table in (measures_table(runs), runs_table(records)) if table is not None]
-    numbers = {"groups": summary(groups), "notes": notes}
+    tables = [comparison_table(test, groups) for test in tests]
     with TemporaryDirectory() as drawn:
-        for name, draw in _pictures(groups, runs).items():
-            draw(Path(drawn) / name)
-        shown = {path.name: path.read_bytes() for path in sorted(Path(drawn).iterdir())}
-    text = "\n\n".join(
-        [
-            "# Runs",
-            *notes,
-            *(table.markdown() for table in (*tables, *details)),
-            *(f"![{_title(name)}]({name})" for name in shown),
-        ]
-    )
-    parts = [
-        "<h1>Runs</h1>",
-        *(f"<p>{html.escape(note)}</p>" for note in notes),
-        *(table.html() for table in tables),
-        "<h2>Pictures</h2>",
-        *(f"<p>{picture(_title(name), content)}</p>" for name, content in shown.items()),
-        *(table.html() for table in details),
-    ]
-    page = whole_page("Runs", parts)
+        for task, algorithm in dict.fromkeys((run.task, run.algorithm) for run in runs):
+            together = [run for run in runs if (run.task, run.algorithm) == (task, algorithm)]
+            name = f"learning_curves_{plain(task)}_{algorithm}.svg"
+            draw_learning_curves(together, Path(drawn) / name)
+        for test in tests:
+            tested = [group for group in groups if len(group.scores(test, "return"))]
+            draw_plane(tested, test, Path(drawn) / f"plane_{test}.svg")
+        pictures = {path.name: path.read_bytes() for path in sorted(Path(drawn).iterdir())}
+    titles = {name: Path(name).stem.replace("_", " ") for name in pictures}
+    shown = {titles[name]: data_uri(content) for name, content in pictures.items()}
+    page = render("report.html", title="Runs", notes=notes, tables=tables, pictures=shown)
+    links = [f"![{title}]({name})" for name, title in titles.items()]
+    text = "\n\n".join(["# Runs", *notes, *(table.markdown() for table in tables), *links])
     folder = make_folder(folder)
-    for name, content in shown.items():
+    for name, content in pictures.items():
         write_atomically(folder / name, content)
     write_atomically(folder / "report.md", f"{text}\n".encode())
-    write_json(folder / "report.json", numbers)
     write_atomically(folder / "report.html", page.encode())
     return folder / "report.html"
-
-
-def _pictures(groups: Sequence[Group], runs: Sequence[FinishedRun]) -> dict[str, Draw]:
-    found: dict[str, Draw] = {}
-    for task, algorithm in dict.fromkeys((run.task, run.algorithm) for run in runs):
-        together = [run for run in runs if (run.task, run.algorithm) == (task, algorithm)]
-        name = f"learning_curves_{plain(task)}_{algorithm}.svg"
-        found[name] = partial(draw_learning_curves, together)
-    for test in known_tests(groups):
-        tested = [group for group in groups if len(group.scores(test, "return"))]
-        found[f"plane_{test}.svg"] = partial(draw_plane, tested, test)
-    return found
-
-
-def _title(name: str) -> str:
-    """What a picture shows, by its file."""
-    return Path(name).stem.replace("_", " ")
