@@ -29,7 +29,7 @@ from torchrl_l2c2.experiment.learn.update import ReplayUpdate, make_update
 from torchrl_l2c2.updaters import TSoftUpdate
 
 REGULARIZERS = {
-    "vanilla": NoRegularizerConfig(),
+    "baseline": NoRegularizerConfig(),
     "l2c2": L2C2Config(),
     "quarter": L2C2Config(fraction=0.25),
 }

@@ -20,10 +20,10 @@ def update_rows(effort: Effort) -> Iterable[Row]:
     times = alternate(
         {
             "l2c2": l2c2,
-            "vanilla": small("vanilla", effort.compile),
+            "baseline": small("baseline", effort.compile),
             "eager": small("l2c2", False),
             "products": matrix_products(small("l2c2", False)),
-            "vanilla products": matrix_products(small("vanilla", False)),
+            "baseline products": matrix_products(small("baseline", False)),
         },
         repeats=effort.rounds,
         calls=20,
@@ -39,7 +39,7 @@ def update_rows(effort: Effort) -> Iterable[Row]:
     )
     row = _smoothing_row("update", 32, us, 1.2)
     row.parts["l2c2's products us"] = us["products"]
-    row.parts["vanilla's products us"] = us["vanilla products"]
+    row.parts["baseline's products us"] = us["baseline products"]
     yield row
     yield Row(
         "update",
@@ -80,10 +80,10 @@ def _smoothing_row(
 ) -> Row:
     return Row(
         group,
-        f"L2C2 update{which} / vanilla update, batch {size}",
-        us["l2c2"] / us["vanilla"],
+        f"L2C2 update{which} / baseline update, batch {size}",
+        us["l2c2"] / us["baseline"],
         at_most=at_most,
-        parts={"l2c2 us": us["l2c2"], "vanilla us": us["vanilla"]},
+        parts={"l2c2 us": us["l2c2"], "baseline us": us["baseline"]},
     )
 
 

@@ -565,7 +565,7 @@ def test_a_sweep_gives_one_table(tmp_path):
     assert "run 4 of 4, about 1 min left; episode 3 of 3" in done.stderr
     # At the end of the sweep, of its own runs.
     _, table = done.stdout.split("**Last policy, mean actions**")
-    assert table.count("| vanilla | 2 |") == table.count("| L2C2 | 2 |") == 1
+    assert table.count("| baseline | 2 |") == table.count("| L2C2 | 2 |") == 1
 
 
 def test_in_a_sweep_a_failed_job_is_told_and_the_others_go_on(tmp_path):
