@@ -19,7 +19,6 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
-from gymnasium.wrappers import TransformObservation
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
@@ -45,19 +44,20 @@ from torchrl_l2c2.experiment.run.policies import load_policy
 from torchrl_l2c2.experiment.run.process import ProcessState
 
 NEEDED = ("onnx", "onnxruntime", "onnxscript")
-# Of the largest action there is: float32 kernels that sum in another order stay far below.
+# Share of the largest action. float32 kernels that sum in another order differ by far less.
 TOLERANCE = 1e-4
 
 
 class MeanPolicy(nn.Module):
-    """A policy's mean as a function of tensors: observations ``[B, *F]`` to actions ``[B, A]``.
+    """A policy's mean action as a function of tensors: ``[B, F]`` to ``[B, A]``.
 
-    All that belongs to it is inside: layers, squashing, bounds. Discrete ones are numbers ``[B]``,
-    those of the task.
+    It contains the layers, the squashing and the bounds. Discrete actions are the task's own
+    numbers ``[B]``.
 
     Args:
-        policy (TensorDictModule): acts deterministically under ``ExplorationType.DETERMINISTIC``.
-        first (int, optional): the number of the first action, where actions are one-hot vectors.
+        policy (TensorDictModule): The policy, deterministic under
+            ``ExplorationType.DETERMINISTIC``.
+        first (int, optional): Number of the first action, if actions are one-hot vectors.
     """
 
     def __init__(self, policy: TensorDictModule, first: int | None = None) -> None:
@@ -66,7 +66,7 @@ class MeanPolicy(nn.Module):
         self.first = first
 
     def forward(self, observation: Tensor) -> Tensor:
-        """The mean actions at these observations."""
+        """Returns the mean actions at the observations."""
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             batch = TensorDict({"observation": observation}, observation.shape[:1])
             action: Tensor = self.policy(batch)["action"]
@@ -75,11 +75,11 @@ class MeanPolicy(nn.Module):
 
 @dataclass(frozen=True)
 class Exported:
-    """What an export wrote.
+    """Result of an export.
 
     Attributes:
-        folder: with ``policy.onnx``, ``policy.pt2`` and ``contract.json``.
-        contract: what the last one says.
+        folder: Folder of ``policy.onnx``, ``policy.pt2`` and ``contract.json``.
+        contract: Content of ``contract.json``.
     """
 
     folder: Path
@@ -89,31 +89,32 @@ class Exported:
 def export_policy(
     run: str | Path, output: str | Path | None = None, *, best: bool = False, episodes: int = 1
 ) -> Exported:
-    """Writes the mean policy of a run for use without this package, and proves that it is the same.
+    """Writes the mean policy of a run for use without this package, and checks its actions.
 
-    ``policy.onnx`` has an input ``observation`` ``[batch, *F]`` and an output ``action``
-    ``[batch, A]``, float32, or ``[batch]`` of the task's own numbers where actions are discrete;
-    ``policy.pt2`` is the same as a ``torch.export`` program. ``contract.json`` says in which order
-    observations and actions come, the actions' bounds, how the task's image becomes an observation,
-    how often an action is due, what the run's test found, how far the exported policy is from
-    PyTorch's on recorded observations, and how long one action takes.
+    ``policy.onnx`` has an input ``observation`` ``[batch, F]`` and an output ``action``
+    ``[batch, A]``, float32; discrete actions are the task's own numbers ``[batch]``.
+    ``policy.pt2`` is the same policy as a ``torch.export`` program. ``contract.json`` has the order
+    of observations and actions, the bounds of the actions, the control rate, the run's test
+    results, the largest difference from PyTorch's actions on recorded observations, and the time
+    of one action.
 
     Args:
-        run (str or Path): a run's folder.
-        output (str or Path, optional): where the files go. Default: ``export/`` in the folder.
+        run (str or Path): The run's folder.
+        output (str or Path, optional): Folder of the files. Default: ``export/`` in the run's
+            folder.
 
     Keyword Args:
-        best (bool): whether to take ``policy_best.pt``. Default ``False``.
-        episodes (int): that are played to record observations, at least 1. Default 1.
+        best (bool): Whether to export ``policy_best.pt``. Default ``False``.
+        episodes (int): Number of episodes to record observations from, at least 1. Default 1.
 
     Returns:
-        Exported: the folder and the contract.
+        Exported: The folder and the contract.
 
     Raises:
-        ImportError: a package of the ``export`` extra is missing.
-        FileNotFoundError: the folder holds no run, or no policy yet.
-        OSError: the files' folder cannot be written to; no episode is played.
-        UserError: the exported policy differs from PyTorch's; no file is written.
+        ImportError: If a package of the ``export`` extra is missing.
+        FileNotFoundError: If the folder has no run, or no policy yet.
+        OSError: If the folder of the files cannot be written to; no episode is played.
+        UserError: If the exported policy differs from PyTorch's; no file is written.
     """
     missing = [name for name in NEEDED if find_spec(name) is None]
     if missing:
@@ -126,7 +127,7 @@ def export_policy(
         played = play_episodes(policy, env, episodes, max_steps=max_steps)
         observations = torch.cat([episode["observation"] for episode in played])
     mean = MeanPolicy(policy, _first_action(env)).eval()
-    # Two rows, also of an episode of one step: torch takes a batch of 1 for a constant.
+    # Two rows, even if an episode has one step: torch treats a batch of 1 as a constant.
     program, content = _translate(mean, observations[[0, -1]])
     act = _onnx_function(content)
     agreement = _compare(mean, act, observations)
@@ -173,7 +174,7 @@ def _onnx_function(content: bytes) -> Callable[[Any], Any]:
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1  # of one action there is nothing to share
+    options.intra_op_num_threads = 1  # one action is too little work for several threads
     session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
     return lambda observation: session.run(["action"], {"observation": observation})[0]
 
@@ -188,13 +189,13 @@ def _compare(
     if not difference <= TOLERANCE * max(1.0, largest):
         raise UserError(
             f"the ONNX policy differs from PyTorch's by {difference:.3g} on {len(observations)} "
-            f"recorded observations, where actions go up to {largest:.3g}: it was not written."
+            f"recorded observations with actions up to {largest:.3g}. No file was written."
         )
     return {"observations": len(observations), "largest_difference": difference}
 
 
 def _microseconds(function: Callable[[], Any]) -> float:
-    """The median time of a call, after some that are not counted."""
+    """Measures the median time of a call, after a warm-up."""
     times = []
     with torch.no_grad():
         for _ in range(220):
@@ -213,14 +214,14 @@ def _origin(run: Path, best: bool) -> dict[str, Any]:
         "algorithm": config["algorithm"]["name"],
         "regularizer": config["regularizer"]["name"],
         "seed": config["seed"],
-        # Of a run that has not ended there is no other.
+        # An unfinished run has only checkpoints.
         "policy": policy if (run / policy).exists() else "the newest checkpoint",
         "versions": versions(),
     }
 
 
 def _expected(run: Path, best: bool) -> dict[str, Any]:
-    """What the run's own test found of the policy, where it had one."""
+    """Returns the results of the run's own test, if there was one."""
     if best or not (run / "evaluation.json").exists():
         return {}
     summary = read_evaluation(run).get("summary", {})
@@ -229,31 +230,13 @@ def _expected(run: Path, best: bool) -> dict[str, Any]:
 
 
 def _describe_observation(env: EnvBase) -> dict[str, Any]:
-    shape = tuple(env.observation_spec["observation"].shape)
-    seen = untransformed(env).unwrapped.observation_space
-    described: dict[str, Any] = {"shape": ["batch", *shape], "dtype": "float32"}
-    if len(shape) == 1:
-        described["entries"] = entry_names(seen, shape[0])
-    else:
-        described["image"] = _describe_image(env)
-    return described
-
-
-def _describe_image(env: EnvBase) -> dict[str, Any]:
-    """How the task's image becomes what the policy sees: scaled to 0..1, then its axes moved."""
-    seeing = _wrapper(env, TransformObservation)
-    image: Any = seeing.env.observation_space
-    moved = image.shape != seeing.observation_space.shape and len(image.shape) == 3
-    return {
-        "shape": list(image.shape),
-        "low": float(image.low.min()),
-        "high": float(image.high.max()),
-        "axes": [2, 0, 1] if moved else list(range(len(image.shape))),
-    }
+    size = env.observation_spec["observation"].shape[-1]
+    names = entry_names(untransformed(env).unwrapped.observation_space, size)
+    return {"shape": ["batch", size], "dtype": "float32", "entries": names}
 
 
 def _wrapper(env: EnvBase, kind: type) -> Any:
-    """The outermost wrapper of a kind around the simulator; ``None`` without one."""
+    """Returns the outermost wrapper of a kind around the simulator; ``None`` without one."""
     wrapped = simulator_of(untransformed(env))
     while isinstance(wrapped, gymnasium.Wrapper):
         if isinstance(wrapped, kind):
@@ -263,7 +246,7 @@ def _wrapper(env: EnvBase, kind: type) -> Any:
 
 
 def entry_names(space: Any, size: int) -> list[str]:
-    """What the numbers of an observation are called: by their keys, in the order of a vector.
+    """Names the entries of an observation vector by their keys, in the order of the vector.
 
     Examples:
         >>> space = spaces.Dict(speed=spaces.Box(0, 1, (2,)), angle=spaces.Box(0, 1, (1,)))
@@ -274,12 +257,12 @@ def entry_names(space: Any, size: int) -> list[str]:
     if isinstance(space, spaces.Dict):
         for key in sorted(space.spaces):
             names += [f"{key}[{i}]" for i in range(spaces.flatdim(space[key]))]
-    # A wrapper may have changed what the task shows.
+    # A wrapper may have changed the observation.
     return names if len(names) == size else [f"observation[{i}]" for i in range(size)]
 
 
 def _first_action(env: EnvBase) -> int | None:
-    """The number that the task gives its first action; ``None`` where these are no numbers."""
+    """Returns the task's number of its first action; ``None`` for actions that are vectors."""
     counted = _wrapper(env, ZeroBasedActions)
     first = 0 if counted is None else counted.first
     return first if isinstance(env.action_spec, OneHot) else None

@@ -27,20 +27,20 @@ from torchrl_l2c2.experiment.run.process import ProcessState
 from torchrl_l2c2.experiment.settings.tasks import TaskConfig
 
 Picture = NDArray[np.uint8]
-# Of the files that H.264, the encoder's default, fits into.
+# File endings that H.264, the encoder's default, supports.
 ENDINGS = (".avi", ".m4v", ".mkv", ".mov", ".mp4")
 
 
 def check_video(path: str | Path | None = None) -> None:
-    """Refuses to record what could not be written afterwards.
+    """Checks that a video can be written.
 
     Args:
-        path (str or Path, optional): of the file, where it is known; its folder is made.
+        path (str or Path, optional): Path of the file; its folder is made.
 
     Raises:
-        ImportError: the ``video`` extra is missing.
-        ValueError: the file's ending is none of a video's.
-        OSError: its folder cannot be written to.
+        ImportError: If the ``video`` extra is missing.
+        ValueError: If the file has another ending.
+        OSError: If the folder cannot be written to.
     """
     if find_spec("imageio_ffmpeg") is None:
         raise MissingPackageError(
@@ -49,16 +49,18 @@ def check_video(path: str | Path | None = None) -> None:
     if path is None:
         return
     if Path(path).suffix.lower() not in ENDINGS:
-        raise UserError(f"a video's file ends in {', '.join(ENDINGS)}, got {str(path)!r}.")
+        raise UserError(
+            f"Expected a file that ends in {', '.join(ENDINGS)}, got {str(path)!r}. Rename it."
+        )
     make_parent_folder(path)
 
 
 def check_pictures(task: TaskConfig) -> None:
-    """Refuses a task that draws no pictures, by drawing its first one.
+    """Checks that a task can be rendered, by rendering its first picture.
 
     Raises:
-        ValueError: it has no pictures.
-        SimulatorError: it fails at drawing, for lack of a graphics library for example.
+        ValueError: If the task does not render.
+        SimulatorError: If rendering fails, for example without a graphics library.
     """
     with _without_a_screen(), ProcessState(0):
         make_env(task, 0, render=Drawing()).close()
@@ -76,26 +78,26 @@ def record_video(
     """Writes a video of test episodes with a run's mean policy, at the speed of simulated time.
 
     Args:
-        run (str or Path): a run's folder.
-        path (str or Path, optional): of the file; its ending, ``.mp4``, ``.m4v``, ``.mkv``,
-            ``.mov`` or ``.avi``, says what it is. Default: ``video.mp4`` in the folder.
+        run (str or Path): The run's folder.
+        path (str or Path, optional): Path of the file, with the ending ``.mp4``, ``.m4v``,
+            ``.mkv``, ``.mov`` or ``.avi``. Default: ``video.mp4`` in the run's folder.
 
     Keyword Args:
-        episodes (int): how many, one after the other, at least 1. Default 1.
-        seed (int, optional): of the environment and its noise. Default: that of the run's test, so
-            that these are its first episodes.
-        noise_scale (float, optional): of the environment's noise. Default: the task's.
-        best (bool): whether to take ``policy_best.pt``. Default ``False``.
+        episodes (int): Number of episodes, at least 1. Default 1.
+        seed (int, optional): Seed of the environment and its noise. Default: the seed of the run's
+            test, for its first episodes.
+        noise_scale (float, optional): Scale of the environment's noise. Default: the task's.
+        best (bool): Whether ``policy_best.pt`` acts. Default ``False``.
 
     Returns:
-        Path: of the file.
+        Path: Path of the file.
 
     Raises:
-        ImportError: the ``video`` extra is missing.
-        ValueError: the task draws no pictures, fewer than one episode, or a file with another
+        ImportError: If the ``video`` extra is missing.
+        ValueError: If the task does not render, ``episodes`` is below 1, or the file has another
             ending.
-        FileNotFoundError: the folder holds no run, or no policy yet.
-        OSError: the file cannot be written.
+        FileNotFoundError: If the folder has no run, or no policy yet.
+        OSError: If the file cannot be written.
     """
     check_video(path)
     if episodes < 1:

@@ -64,15 +64,15 @@ def interquartile_mean(scores: Scores) -> Scores:
 
 
 def probability_of_improvement(scores: Scores, baseline: Scores) -> Scores:
-    """How probable it is that a run scores higher than one of the baseline, ties halved.
+    """Computes the probability that a run scores higher than a run of the baseline, ties halved.
 
-    It is the mean over tasks of the Mann-Whitney statistic over the number of pairs; .5 where
-    neither is better, 1 where every run beats every one of the baseline. It needs no common scale
-    of tasks.
+    It is the mean over tasks of the Mann-Whitney statistic divided by the number of pairs: 0.5 if
+    neither is better, 1 if every run beats every run of the baseline. Tasks may have different
+    scales.
 
     Args:
-        scores (array): ``[..., runs, tasks]``; larger is better, so negate what should be small.
-            NaN where a task has fewer runs than others.
+        scores (array): ``[..., runs, tasks]``; larger is better, so negate measures that should be
+            small. Tasks with fewer runs than others have NaN.
         baseline (array): ``[..., other runs, tasks]``, in the same form.
 
     Returns:
@@ -83,11 +83,11 @@ def probability_of_improvement(scores: Scores, baseline: Scores) -> Scores:
         0.625
     """
     ours, theirs = scores[..., :, None, :], baseline[..., None, :, :]
-    # Where there is no run, neither holds.
+    # Both comparisons are false for NaN.
     better = ((ours > theirs) + 0.5 * (ours == theirs)).sum((-3, -2))
     pairs = (~np.isnan(scores)).sum(-2) * (~np.isnan(baseline)).sum(-2)
     most = pairs.max(-1, keepdims=True)
-    # Where tasks have as many pairs each, exact up to a single division.
+    # Exact up to one division if all tasks have the same number of pairs.
     return np.asarray((better * (most / pairs)).sum(-1) / (most[..., 0] * pairs.shape[-1]))
 
 
@@ -98,23 +98,23 @@ def bootstrap_interval(
     confidence: float = 0.95,
     resamples: int = 2000,
 ) -> Interval:
-    """Stratified bootstrap confidence interval: runs are drawn anew for each task by itself.
+    """Computes a stratified bootstrap confidence interval: runs are resampled within each task.
 
     Args:
-        statistic (Callable): of matrices ``[..., runs, tasks]``, to ``[...]``.
-        *scores (array): a matrix ``[runs, tasks]`` for each of its arguments. A task with fewer
-            runs than others has NaN below them, and as many in what is drawn.
+        statistic (Callable): Function from matrices ``[..., runs, tasks]`` to ``[...]``.
+        *scores (array): Matrix ``[runs, tasks]`` for each argument of the statistic. A task with
+            fewer runs than others has NaN in its last rows.
 
     Keyword Args:
-        generator (numpy.random.Generator): draws the runs.
-        confidence (float): share of the resamples between the ends, in (0, 1). Larger: wider.
-        resamples (int): how many, at least 1. More: steadier ends.
+        generator (numpy.random.Generator): Generator of the resamples.
+        confidence (float): Confidence level in (0, 1). Larger values give wider intervals.
+        resamples (int): Number of resamples, at least 1. Larger values give steadier intervals.
 
     Returns:
-        The lower and the upper end: percentiles of the resamples.
+        The lower and upper ends: percentiles of the statistic over the resamples.
 
     Raises:
-        ValueError: ``confidence`` or ``resamples`` out of its range.
+        ValueError: If ``confidence`` or ``resamples`` is out of its range.
 
     Examples:
         >>> bootstrap_interval(mean, np.ones((3, 1)), generator=np.random.default_rng(0))
@@ -131,7 +131,7 @@ def bootstrap_interval(
         absent = np.arange(len(matrix))[:, None] >= runs
         drawn.append(np.where(absent, np.nan, np.take_along_axis(matrix[None], rows, 1)))
     tail = (1.0 - confidence) / 2.0
-    # Of every pair of runs there is a number in each resample: a few resamples at a time.
+    # The statistic needs memory for every pair of runs: a few resamples at a time.
     cuts = range(RESAMPLES_AT_ONCE, resamples, RESAMPLES_AT_ONCE)
     parts = zip(*(np.split(matrices, cuts) for matrices in drawn), strict=True)
     found = np.concatenate([statistic(*part) for part in parts])
