@@ -41,7 +41,7 @@ CAP = 5.0
 
 @dataclass(frozen=True)
 class Reading:
-    """One choice of what the paper leaves open, on one task: its runs of the baseline and of CAPS."""
+    """A choice of the open details on one task: its runs of the baseline and of CAPS."""
 
     baseline: Group
     caps: Group

@@ -14,7 +14,7 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 MODULES = sorted((ROOT / "torchrl_l2c2").rglob("*.py"))
 # Pattern, and what to write instead, with the reason.
 WORDS = {
-    r"vanilla(?! \(no regularizer\))": "'the baseline': one name for the algorithm without a regularizer",
+    r"vanilla(?! \(no regularizer\))": "'the baseline': one name for it",
     r"the zoo\b|the zoo's": "'RL Zoo': the name that readers can look up",
     r"beside(?!s)": "'next to', 'in addition to' or 'compared with': say which",
     r"likewise": "'also', or the sentence again: readers search for what it refers to",
