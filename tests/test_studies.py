@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from studies import forest, pages
+from studies import forest, pages, trace
 from studies.cells import improvements_over_tasks, over_tasks
 from studies.field import BETTER, field_groups, field_table
 from studies.methods import against_table, choice_table, pairwise_tables
@@ -38,7 +38,16 @@ from studies.protocol import main as score
 from studies.protocol import readings, until
 from studies.targets import gain_targets_table
 from tests.test_reports import METHODS, cells, make_config, make_run, table_of
-from torchrl_l2c2.experiment import CATSConfig, L2C2Config, PPOConfig, PPORPEConfig, SACConfig
+from torchrl_l2c2.experiment import (
+    CATSConfig,
+    Experiment,
+    ExperimentConfig,
+    L2C2Config,
+    PPOConfig,
+    PPORPEConfig,
+    SACConfig,
+    TaskConfig,
+)
 from torchrl_l2c2.experiment.analysis.reports import (
     group_records,
     read_records,
@@ -698,3 +707,32 @@ class TestForest:
         assert [line for line in lines if line.startswith(tuple(starts))] == [
             next(line for line in lines if line.startswith(start)) for start in starts
         ]
+
+
+class TestTrace:
+    def test_a_row_shows_one_joint_and_its_mean_change(self, tmp_path):
+        """By hand: from -1 to 1 and back is a change of 2 per step; a constant has none."""
+        steps = np.arange(700)
+        shaking = np.stack([(-1.0) ** steps, 0.0 * steps], 1)
+        still = np.stack([0.0 * steps, (-1.0) ** steps], 1)
+        for path in (tmp_path / "one.svg", tmp_path / "two.svg"):
+            trace.draw([shaking, still], ["PPO", "PPO with L2C2"], path)
+        content = (tmp_path / "one.svg").read_text()
+        assert content == (tmp_path / "two.svg").read_text()
+        assert "<!-- PPO: mean change per step 2.00 -->" in content
+        assert "<!-- PPO with L2C2: mean change per step 0.00 -->" in content
+
+    def test_two_runs_are_played_and_drawn(self, tmp_path):
+        """The actions are those of the first test episode."""
+        task = TaskConfig("pendulum", "Pendulum-v1", episodes=1, max_steps=30)
+        for name in ("none", "l2c2"):
+            experiment = Experiment(ExperimentConfig(task=task, compile=False), tmp_path / name)
+            experiment.train()
+            tested = experiment.test(1)
+            experiment.finish(tested)
+            played = trace.actions_of(tmp_path / name)
+            change = np.abs(np.diff(played, axis=0)).mean()
+            assert change == pytest.approx(tested.action_variations[0], rel=1e-4)
+            experiment.close()
+        trace.main([str(tmp_path / "none"), str(tmp_path / "l2c2"), str(tmp_path / "a.svg")])
+        assert (tmp_path / "a.svg").stat().st_size > 1000
