@@ -88,7 +88,7 @@ class Sweep:
 
     @property
     def is_remote(self) -> bool:
-        """Whether another program, such as a cluster's scheduler, started this process."""
+        """Checks whether another program, such as a cluster's scheduler, started this process."""
         host, process = self.started_by
         return host != socket.gethostname() or process not in (os.getpid(), os.getppid())
 

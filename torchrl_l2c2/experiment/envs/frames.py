@@ -36,7 +36,7 @@ class Frame(NamedTuple):
 
     @property
     def done(self) -> bool:
-        """Whether the episode ends with this frame."""
+        """Checks whether the episode ends with this frame."""
         return self.terminated or self.truncated
 
     def row(self) -> dict[NestedKey, Tensor]:

@@ -50,7 +50,7 @@ class Record:
     Attributes:
         method: Name of the regularizer.
         length: Length of training, such as ``"400 episodes"``.
-        settings: Hash of the other settings, :func:`~..settings.identity.fingerprint`.
+        settings: Hash of the other settings, :func:`~.identity.fingerprint`.
         differences: Settings that differ from the defaults, such as
             ``"algorithm.replay_ratio=10"``.
         late_mean_return: Mean over the late policies (see ``late_share``) of a test episode with
@@ -110,7 +110,7 @@ class Record:
 
     @property
     def is_tested(self) -> bool:
-        """Whether the last policy was tested, with mean or sampled actions."""
+        """Checks whether the last policy was tested, with mean or sampled actions."""
         tests = (self.last_mean_return, self.last_sampled_return)
         return not all(map(math.isnan, tests))
 
@@ -189,7 +189,7 @@ class FinishedRun:
 
     @property
     def is_untrained(self) -> bool:
-        """Whether no update was made, or every action was random."""
+        """Checks whether no update was made or every action was random."""
         return bool((self.evaluation.get("training") or {}).get("untrained"))
 
     def column(self, name: str) -> list[float]:

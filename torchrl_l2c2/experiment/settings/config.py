@@ -249,7 +249,7 @@ class ExperimentConfig:
                 "num_workers",
                 f"must be 1 with algorithm.schedule=step, which updates after every frame, got "
                 f"{workers}: use one worker, or algorithm.schedule=episode algorithm.updates=null "
-                f"algorithm.replay_ratio={self.replay.batch_size}, one update a frame on average.",
+                f"algorithm.replay_ratio={self.replay.batch_size}, one update per frame.",
             )
 
 

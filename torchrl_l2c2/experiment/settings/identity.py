@@ -160,13 +160,13 @@ def differences(config: Mapping[str, Any]) -> dict[str, str]:
         {'regularizer.beta': '0.5'}
     """
     own = flatten_settings(ExperimentConfig.from_dict(config).to_dict())
-    usual = flatten_settings(ExperimentConfig.from_dict(_names(config, _COMPARED)).to_dict())
+    defaults = flatten_settings(ExperimentConfig.from_dict(_names(config, _COMPARED)).to_dict())
     chosen = flatten_settings(ExperimentConfig.from_dict(_names(config, GROUPS)).to_dict())
     return {
         name: _word(value)
         for name, value in sorted(own.items())
         if (_counts(name, own) or name in BUDGETS)
-        and value != (usual if name.endswith(".name") else chosen)[name]
+        and value != (defaults if name.endswith(".name") else chosen)[name]
     }
 
 

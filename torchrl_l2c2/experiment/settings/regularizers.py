@@ -39,7 +39,7 @@ class RegularizerConfig:
 
     @property
     def ramped(self) -> bool:
-        """Whether the gain is a ramp."""
+        """Checks whether the gain is a ramp."""
         return False
 
 
@@ -107,7 +107,7 @@ class GainConfig(RegularizerConfig):
 
     @property
     def ramped(self) -> bool:
-        """Whether the gain is a ramp."""
+        """Checks whether the gain is a ramp."""
         return self.gain == "ramp"
 
 
