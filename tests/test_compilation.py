@@ -128,7 +128,7 @@ def test_a_compiler_that_fails_is_one_line(tmp_path, monkeypatch):
     broken.chmod(0o755)
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path / "cache"))
     options = {"cpp.cxx": (str(broken),), "force_disable_caches": True}
-    why = r"^the compiler failed \(a.h:1: error: no\): compile="
+    why = r"^the compiler failed \(a.h:1: error: no\): set compile="
     with inductor_config.patch(options), pytest.raises(CompilerError, match=why) as told:
         compiled(lambda x: x.sin() + 7.5)(torch.rand(3))
     assert "In file included" in str(told.value.__cause__)

@@ -125,7 +125,7 @@ def test_matrices_labels_and_nested_entries_become_a_vector_on_request(
     """And without it are refused in one line that says so."""
     still(monkeypatch, space=space, seen=seen)
     assert observed(task(flatten=True)) == expected
-    with pytest.raises(ValueError, match=r"not a vector of numbers: task\.flatten=true") as refused:
+    with pytest.raises(ValueError, match=r"vector of numbers: set task\.flatten=true") as refused:
         make_env(task(), 0)
     assert "\n" not in str(refused.value)
 

@@ -81,7 +81,7 @@ def test_a_parameter_that_is_not_finite_stops_every_algorithm(tmp_path, monkeypa
     last = make(name, **few).train(2)[-1]["updates"]
     run.agent.optimizer.step = broken
     run.learner.rebuild_update()
-    with pytest.raises(FloatingPointError, match=f"not finite after update {last}: ") as stopped:
+    with pytest.raises(FloatingPointError, match=f"not finite after update {last}, ") as stopped:
         run.train(2)
     assert parameter_name in str(stopped.value)
     assert "Last good checkpoint: " in str(stopped.value) and "1.pt" in str(stopped.value)

@@ -67,7 +67,7 @@ class RowWriter:
     ``extend`` is made for batches: for one row it takes longer than the rest of a frame.
 
     Args:
-        replay (TensorDictReplayBuffer): Buffer of :func:`~..learn.replay.make_replay`, with one
+        replay (TensorDictReplayBuffer): Buffer of :func:`~.replay.make_replay`, with one
             batch dimension and a round-robin writer.
     """
 

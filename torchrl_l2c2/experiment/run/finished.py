@@ -50,7 +50,7 @@ class Record:
     Attributes:
         method: Name of the regularizer.
         length: Length of training, such as ``"400 episodes"``.
-        settings: Hash of the other settings, :func:`~..settings.identity.fingerprint`.
+        settings: Hash of the other settings, :func:`~.identity.fingerprint`.
         differences: Settings that differ from the defaults, such as
             ``"algorithm.replay_ratio=10"``.
         late_mean_return: Mean over the late policies (see ``late_share``) of a test episode with
