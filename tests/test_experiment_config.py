@@ -337,7 +337,7 @@ def test_hydras_folders_are_none_of_a_sweep(name):
         OmegaConf.update(hydra, key, value)
     check_folders(hydra.hydra, "outputs")
     OmegaConf.update(hydra, name, "mine")
-    with pytest.raises(SettingError, match=f"{name}.*'mine': give outputs=mine"):
+    with pytest.raises(SettingError, match=f"{name}.*'mine': set outputs=mine"):
         check_folders(hydra.hydra, "outputs")
     if name == "hydra.sweep.dir":
         hydra.hydra.sweep.subdir = "a"  # A folder of each run, which is read.
@@ -482,7 +482,10 @@ def test_wrong_settings_are_refused_with_what_is_allowed(settings, message):
         ),
         ({"regularizer": L2C2Config(name="caps")}, r"regularizer.name must .*, got 'caps'"),
         ({"algorithm": SACConfig(name="td3")}, r"one of \['sac'\] with SACConfig, got 'td3'"),
-        ({"replay": GROUPS["replay"]["rollout"]}, "'rollout' is nothing that algorithm 'ppo_rpe'"),
+        (
+            {"replay": GROUPS["replay"]["rollout"]},
+            "'rollout' does not work with algorithm 'ppo_rpe'",
+        ),
         (
             {"algorithm": PPOConfig(), "replay": GROUPS["replay"]["uniform"]},
             "'uniform' does not work with algorithm 'ppo'",

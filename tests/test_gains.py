@@ -360,7 +360,7 @@ class TestRefusals:
     def test_a_column_without_numbers_is_refused(self, column, settings):
         """Before anything is played, with those that have some."""
         regularizer = L2C2Config(gain="target", gain_target=1.0, gain_of=column)
-        told = rf"gain_of must be one of .*'action_variation'.*got '{column}' \(test_\* need a"
+        told = rf"gain_of must be one of .*'action_variation'.*got '{column}' \(test_\* need late"
         with pytest.raises(SettingError, match=told):
             Experiment(small(regularizer, **settings))
 

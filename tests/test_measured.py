@@ -79,7 +79,7 @@ def test_simulators_side_by_side_begin_apart():
 def test_the_variation_in_the_log_is_that_of_the_mean():
     """Which gain=target follows; that of the samples is exploration, for the most part."""
     run = Experiment(small())
-    (episode,) = run.player.play()
+    episode = run.player.play()
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         mean = run.agent.policy(episode.transitions.select("observation"))["action"]
     assert episode.measures["action_variation"] == action_variation(mean).item()

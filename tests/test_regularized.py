@@ -855,7 +855,7 @@ class TestNetworks:
 
         loss = DDPGLoss(deterministic_actor(), qvalue())
         loss.__dict__["actor_network"] = Plain()
-        with pytest.raises(TypeError, match="actor_network is a Plain, which does not say"):
+        with pytest.raises(TypeError, match="actor_network is a Plain, which declares no keys"):
             L2C2Loss(loss)
 
     def test_masked_actions(self):

@@ -459,7 +459,7 @@ def test_what_followed_another_length_is_told(tmp_path, setting, told):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         Experiment(config, tmp_path).close()
-    with pytest.warns(UserWarning, match=f"{told} .*training of 1 episodes; 6 episodes in one"):
+    with pytest.warns(UserWarning, match=f"{told} .*schedule of 1 episodes .* of 6 episodes would"):
         Experiment(replace(config, task=SWINGUP), tmp_path).close()
 
 
@@ -484,7 +484,7 @@ def test_a_setting_that_a_checkpoint_does_not_know_is_named(tmp_path):
     """One of an earlier release, before there was such a setting."""
     saved = small().to_dict()
     del saved["on_nonfinite"]
-    with pytest.raises(OtherRunError, match=r"made with on_nonfinite=none, as it is .*, not stop:"):
+    with pytest.raises(OtherRunError, match=r"made with on_nonfinite=none .*, not stop:"):
         check_same_settings(saved, small().to_dict())
 
 

@@ -327,7 +327,7 @@ def test_returns_that_are_no_number_are_not_averaged(monkeypatch):
 
     run = experiment("sac", task(episodes=1))
     monkeypatch.setattr(Still, "step", paid)
-    with pytest.raises(FloatingPointError, match=r"of a test episode is inf, a sum of \d+ fin"):
+    with pytest.raises(FloatingPointError, match=r"of a test episode is inf, the sum of \d+ fin"):
         run.test(1)
 
 

@@ -147,7 +147,7 @@ def test_a_folder_that_hydra_cannot_make_ends_in_a_line(tmp_path):
             "sigma=2",
             "sigma is not a setting; did you mean regularizer.sigma? --help lists every setting.",
         ),
-        ("outputs=~/runs", "Shells do not expand ~ here: write $HOME."),
+        ("outputs=~/runs", "No shell expands this ~: write $HOME."),
     ],
 )
 def test_what_cannot_be_composed_ends_with_what_was_meant(settings_of, line, meant):

@@ -91,8 +91,8 @@ class EpisodeCollector(Collector):
         self._random_frames_left = random_frames
         self._policy_keys = [key for key in policy.out_keys if not key.startswith("_")]
         self._act = policy_function(policy, self._policy_keys, compile_policy)
-        # For policies whose samples exceed the bounds: frames keep the sample, the task gets this.
-        self._taken: Callable[[Tensor], Tensor] | None = getattr(policy, "taken", None)
+        # Samples may exceed the bounds: frames have the sample, the task gets the clipped action.
+        self._clip: Callable[[Tensor], Tensor] | None = getattr(policy, "clip_action", None)
         self._action_spec = self._simulation.env.action_spec
         continuous = self._action_spec.dtype.is_floating_point
         self._to_action = copy_to_numpy if continuous else self._simulation.env.read_action
@@ -125,8 +125,8 @@ class EpisodeCollector(Collector):
         if self._random_frames_left > 0:
             self._random_frames_left -= 1
             action.copy_(self._action_spec.rand())
-        taken = action if self._taken is None else self._taken(action)
-        return self._simulation.step(outputs, self._to_action(taken))
+        clipped = action if self._clip is None else self._clip(action)
+        return self._simulation.step(outputs, self._to_action(clipped))
 
     def reset(self, index: Any = None, **kwargs: Any) -> None:
         """Ends the current episode; the next frame starts another one."""

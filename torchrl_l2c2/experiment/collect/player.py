@@ -137,7 +137,7 @@ class Player:
         self.collector.reset()
 
     def _simulate(self, play: Callable[[], Played]) -> Played:
-        with simulator_errors(f"{self._env_id} failed beyond frame {self.frames}"):
+        with simulator_errors(f"{self._env_id} failed after frame {self.frames}"):
             return play()
 
     def _check_and_count(self, frames: TensorDictBase) -> None:

@@ -45,7 +45,7 @@ class Simulation:
         parts = split_environment(env)
         if parts is None:
             raise ValueError(
-                "Expected one Gymnasium environment with no transform but ObservationNoise, got "
+                "Expected one Gymnasium environment with no transform except ObservationNoise, got "
                 f"{env}. Use TorchRL's Collector for others."
             )
         self.env, self.noise = parts
