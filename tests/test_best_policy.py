@@ -140,7 +140,7 @@ def test_evaluate_records_its_first_episode(folder, tmp_path):
         ("--output=file/x.json", r"the folder '.*file' cannot be written to .*; choose another"),
         ("--output=.", "is a folder; name a file"),
         ("--record=file/x.mp4", r"the folder '.*file' cannot be written to"),
-        ("--record=x.foo", r"a video's file ends in .*\.mp4, got 'x.foo'"),
+        ("--record=x.foo", r"Expected a file with the ending .*\.mp4, got 'x.foo'"),
     ],
 )
 def test_what_could_not_be_written_is_refused_before_it_is_played(

@@ -1,13 +1,12 @@
-"""A policy to take away: its mean as ONNX and as a ``torch.export`` program, with a contract.
+"""Export of a policy's mean action: ONNX, a ``torch.export`` program, and a contract.
 
-``python -m torchrl_l2c2 export FOLDER`` makes them of a run's policy.
+``python -m torchrl_l2c2 export FOLDER`` exports the policy of a run.
 """
 
 from __future__ import annotations
 
 import io
 import logging
-import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -45,19 +44,18 @@ from torchrl_l2c2.experiment.run.policies import load_policy
 from torchrl_l2c2.experiment.run.process import ProcessState
 
 NEEDED = ("onnx", "onnxruntime", "onnxscript")
-# Of the largest action there is: float32 kernels that sum in another order stay far below.
+# Relative to the largest action; other orders of float32 sums differ far less.
 TOLERANCE = 1e-4
 
 
 class MeanPolicy(nn.Module):
     """A policy's mean as a function of tensors: observations ``[B, *F]`` to actions ``[B, A]``.
 
-    All that belongs to it is inside: layers, squashing, bounds. Discrete ones are numbers ``[B]``,
-    those of the task.
+    Layers, squashing and bounds are inside. Discrete actions are the task's numbers ``[B]``.
 
     Args:
-        policy (TensorDictModule): acts deterministically under ``ExplorationType.DETERMINISTIC``.
-        first (int, optional): the number of the first action, where actions are one-hot vectors.
+        policy (TensorDictModule): The policy; ``ExplorationType.DETERMINISTIC`` selects its mean.
+        first (int, optional): Number of the first action, if actions are one-hot vectors.
     """
 
     def __init__(self, policy: TensorDictModule, first: int | None = None) -> None:
@@ -66,7 +64,7 @@ class MeanPolicy(nn.Module):
         self.first = first
 
     def forward(self, observation: Tensor) -> Tensor:
-        """The mean actions at these observations."""
+        """Returns the mean actions at observations."""
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             batch = TensorDict({"observation": observation}, observation.shape[:1])
             action: Tensor = self.policy(batch)["action"]
@@ -75,11 +73,11 @@ class MeanPolicy(nn.Module):
 
 @dataclass(frozen=True)
 class Exported:
-    """What an export wrote.
+    """The files of an export.
 
     Attributes:
-        folder: with ``policy.onnx``, ``policy.pt2`` and ``contract.json``.
-        contract: what the last one says.
+        folder: the folder of ``policy.onnx``, ``policy.pt2`` and ``contract.json``.
+        contract: the content of ``contract.json``.
     """
 
     folder: Path
@@ -89,36 +87,39 @@ class Exported:
 def export_policy(
     run: str | Path, output: str | Path | None = None, *, best: bool = False, episodes: int = 1
 ) -> Exported:
-    """Writes the mean policy of a run for use without this package, and proves that it is the same.
+    """Writes the mean policy of a run for use without this package, and compares it with PyTorch.
 
     ``policy.onnx`` has an input ``observation`` ``[batch, *F]`` and an output ``action``
     ``[batch, A]``, float32, or ``[batch]`` of the task's own numbers where actions are discrete;
-    ``policy.pt2`` is the same as a ``torch.export`` program. ``contract.json`` says in which order
-    observations and actions come, the actions' bounds, how the task's image becomes an observation,
-    how often an action is due, what the run's test found, how far the exported policy is from
-    PyTorch's on recorded observations, and how long one action takes.
+    ``policy.pt2`` is the same as a ``torch.export`` program. ``contract.json`` has the order of
+    observations and actions, the bounds of the actions, the conversion of images, the control
+    rate, the results of the run's test, and the largest difference between the exported policy
+    and PyTorch on recorded observations.
 
     Args:
-        run (str or Path): a run's folder.
-        output (str or Path, optional): where the files go. Default: ``export/`` in the folder.
+        run (str or Path): The run's folder.
+        output (str or Path, optional): Folder of the files. Default: ``export/`` in the run's
+            folder.
 
     Keyword Args:
-        best (bool): whether to take ``policy_best.pt``. Default ``False``.
-        episodes (int): that are played to record observations, at least 1. Default 1.
+        best (bool): Whether to take ``policy_best.pt``. Default ``False``.
+        episodes (int): Number of episodes in which observations are recorded, at least 1.
+            Default 1.
 
     Returns:
-        Exported: the folder and the contract.
+        Exported: The folder and the contract.
 
     Raises:
         ImportError: a package of the ``export`` extra is missing.
         FileNotFoundError: the folder holds no run, or no policy yet.
         OSError: the files' folder cannot be written to; no episode is played.
-        UserError: the exported policy differs from PyTorch's; no file is written.
+        UserError: the exported policy differs from PyTorch; no file is written.
     """
     missing = [name for name in NEEDED if find_spec(name) is None]
     if missing:
         raise MissingPackageError(
-            f'{", ".join(missing)} is missing: pip install "torchrl-l2c2[export]" brings it.'
+            f"Expected the packages of the export extra, got none of {', '.join(missing)}. "
+            'Run pip install "torchrl-l2c2[export]".'
         )
     policy, env, max_steps = load_policy(run, best=best)
     folder = make_folder(output or Path(run) / "export")
@@ -126,7 +127,7 @@ def export_policy(
         played = play_episodes(policy, env, episodes, max_steps=max_steps)
         observations = torch.cat([episode["observation"] for episode in played])
     mean = MeanPolicy(policy, _first_action(env)).eval()
-    # Two rows, also of an episode of one step: torch takes a batch of 1 for a constant.
+    # Two rows, also for an episode of one step: torch treats a batch of 1 as a constant.
     program, content = _translate(mean, observations[[0, -1]])
     act = _onnx_function(content)
     agreement = _compare(mean, act, observations)
@@ -138,10 +139,6 @@ def export_policy(
         "longest_episode": max_steps,
         **_expected(Path(run), best),
         "agreement": agreement,
-        "microseconds_per_action": {
-            "onnxruntime": _microseconds(lambda: act(observations[:1].numpy())),
-            "torch": _microseconds(lambda: mean(observations[:1])),
-        },
     }
     env.close()
     write_atomically(folder / "policy.onnx", content)
@@ -173,7 +170,7 @@ def _onnx_function(content: bytes) -> Callable[[Any], Any]:
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1  # of one action there is nothing to share
+    options.intra_op_num_threads = 1  # A single action is too small for several threads.
     session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
     return lambda observation: session.run(["action"], {"observation": observation})[0]
 
@@ -187,21 +184,11 @@ def _compare(
     largest = float(np.abs(expected).max())
     if not difference <= TOLERANCE * max(1.0, largest):
         raise UserError(
-            f"the ONNX policy differs from PyTorch's by {difference:.3g} on {len(observations)} "
-            f"recorded observations, where actions go up to {largest:.3g}: it was not written."
+            f"Expected the actions of PyTorch from the ONNX policy, got a difference of "
+            f"{difference:.3g} on {len(observations)} recorded observations with actions up to "
+            f"{largest:.3g}. No file was written; report this policy."
         )
     return {"observations": len(observations), "largest_difference": difference}
-
-
-def _microseconds(function: Callable[[], Any]) -> float:
-    """The median time of a call, after some that are not counted."""
-    times = []
-    with torch.no_grad():
-        for _ in range(220):
-            started = time.perf_counter()
-            function()
-            times.append(time.perf_counter() - started)
-    return round(1e6 * float(np.median(times[20:])), 2)
 
 
 def _origin(run: Path, best: bool) -> dict[str, Any]:
@@ -213,14 +200,14 @@ def _origin(run: Path, best: bool) -> dict[str, Any]:
         "algorithm": config["algorithm"]["name"],
         "regularizer": config["regularizer"]["name"],
         "seed": config["seed"],
-        # Of a run that has not ended there is no other.
+        # An unfinished run has only checkpoints.
         "policy": policy if (run / policy).exists() else "the newest checkpoint",
         "versions": versions(),
     }
 
 
 def _expected(run: Path, best: bool) -> dict[str, Any]:
-    """What the run's own test found of the policy, where it had one."""
+    """The results of the run's own test of the policy, if it had one."""
     if best or not (run / "evaluation.json").exists():
         return {}
     summary = read_evaluation(run).get("summary", {})
@@ -240,7 +227,7 @@ def _describe_observation(env: EnvBase) -> dict[str, Any]:
 
 
 def _describe_image(env: EnvBase) -> dict[str, Any]:
-    """How the task's image becomes what the policy sees: scaled to 0..1, then its axes moved."""
+    """The conversion of the task's image for the policy: scaled to 0..1, then its axes moved."""
     seeing = _wrapper(env, TransformObservation)
     image: Any = seeing.env.observation_space
     moved = image.shape != seeing.observation_space.shape and len(image.shape) == 3
@@ -263,7 +250,7 @@ def _wrapper(env: EnvBase, kind: type) -> Any:
 
 
 def entry_names(space: Any, size: int) -> list[str]:
-    """What the numbers of an observation are called: by their keys, in the order of a vector.
+    """Names of the coordinates of an observation: keys, in the order of the vector.
 
     Examples:
         >>> space = spaces.Dict(speed=spaces.Box(0, 1, (2,)), angle=spaces.Box(0, 1, (1,)))
@@ -274,12 +261,12 @@ def entry_names(space: Any, size: int) -> list[str]:
     if isinstance(space, spaces.Dict):
         for key in sorted(space.spaces):
             names += [f"{key}[{i}]" for i in range(spaces.flatdim(space[key]))]
-    # A wrapper may have changed what the task shows.
+    # A wrapper may have changed the observation.
     return names if len(names) == size else [f"observation[{i}]" for i in range(size)]
 
 
 def _first_action(env: EnvBase) -> int | None:
-    """The number that the task gives its first action; ``None`` where these are no numbers."""
+    """The task's number of its first action; ``None`` if actions are not discrete."""
     counted = _wrapper(env, CountedFromZero)
     first = 0 if counted is None else counted.first
     return first if isinstance(env.action_spec, OneHot) else None

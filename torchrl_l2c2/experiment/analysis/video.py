@@ -1,4 +1,4 @@
-"""Test episodes as the simulator draws them, as a video.
+"""Videos of test episodes.
 
 ``python -m torchrl_l2c2 video FOLDER`` records a run's policy.
 """
@@ -27,15 +27,15 @@ from torchrl_l2c2.experiment.run.process import ProcessState
 from torchrl_l2c2.experiment.settings.tasks import TaskConfig
 
 Picture = NDArray[np.uint8]
-# Of the files that H.264, the encoder's default, fits into.
+# Formats that can contain H.264, the encoder's default.
 ENDINGS = (".avi", ".m4v", ".mkv", ".mov", ".mp4")
 
 
 def check_video(path: str | Path | None = None) -> None:
-    """Refuses to record what could not be written afterwards.
+    """Checks that a video can be written, before anything is played.
 
     Args:
-        path (str or Path, optional): of the file, where it is known; its folder is made.
+        path (str or Path, optional): The file, if it is known; its folder is made.
 
     Raises:
         ImportError: the ``video`` extra is missing.
@@ -44,21 +44,24 @@ def check_video(path: str | Path | None = None) -> None:
     """
     if find_spec("imageio_ffmpeg") is None:
         raise MissingPackageError(
-            'imageio-ffmpeg is missing: pip install "torchrl-l2c2[video]" brings it.'
+            "Expected the package imageio-ffmpeg, which is not installed. Run pip install "
+            '"torchrl-l2c2[video]".'
         )
     if path is None:
         return
     if Path(path).suffix.lower() not in ENDINGS:
-        raise UserError(f"a video's file ends in {', '.join(ENDINGS)}, got {str(path)!r}.")
+        raise UserError(
+            f"Expected a file with the ending {', '.join(ENDINGS)}, got {str(path)!r}. Rename it."
+        )
     make_folder_of(path)
 
 
 def check_pictures(task: TaskConfig) -> None:
-    """Refuses a task that draws no pictures, by drawing its first one.
+    """Checks that a task draws pictures, by drawing its first one.
 
     Raises:
-        ValueError: it has no pictures.
-        SimulatorError: it fails at drawing, for lack of a graphics library for example.
+        ValueError: the task has no pictures.
+        SimulatorError: the task cannot draw, for example without a graphics library.
     """
     with _without_a_screen(), ProcessState(0):
         make_env(task, 0, render=Drawing()).close()
@@ -76,19 +79,20 @@ def record_video(
     """Writes a video of test episodes with a run's mean policy, at the speed of simulated time.
 
     Args:
-        run (str or Path): a run's folder.
-        path (str or Path, optional): of the file; its ending, ``.mp4``, ``.m4v``, ``.mkv``,
-            ``.mov`` or ``.avi``, says what it is. Default: ``video.mp4`` in the folder.
+        run (str or Path): The run's folder.
+        path (str or Path, optional): The file; its ending, ``.mp4``, ``.m4v``, ``.mkv``, ``.mov``
+            or ``.avi``, is the format. Default: ``video.mp4`` in the folder.
 
     Keyword Args:
-        episodes (int): how many, one after the other, at least 1. Default 1.
-        seed (int, optional): of the environment and its noise. Default: that of the run's test, so
-            that these are its first episodes.
-        noise_scale (float, optional): of the environment's noise. Default: the task's.
-        best (bool): whether to take ``policy_best.pt``. Default ``False``.
+        episodes (int): Number of episodes, one after the other, at least 1. Default 1.
+        seed (int, optional): Random seed of the environment and its noise. Default: the seed of
+            the run's test, for the same episodes.
+        noise_scale (float, optional): Standard deviation of the environment's noise. Default: the
+            task's noise.
+        best (bool): Whether to take ``policy_best.pt``. Default ``False``.
 
     Returns:
-        Path: of the file.
+        Path: The file.
 
     Raises:
         ImportError: the ``video`` extra is missing.
@@ -99,7 +103,7 @@ def record_video(
     """
     check_video(path)
     if episodes < 1:
-        raise UserError(f"episodes must be at least 1, got {episodes}.")
+        raise UserError(f"Expected at least 1 episode, got {episodes}. Give a larger --episodes.")
     path = Path(path or Path(run) / "video.mp4")
     played = play_pictures(run, episodes, seed=seed, noise_scale=noise_scale, best=best)
     seen = [picture for each in played for picture in each.pictures]
@@ -138,7 +142,7 @@ def play_pictures(
     drawn. Default: all.
     """
     with _without_a_screen():
-        # Within, as some tasks draw from the global generators where they are made.
+        # Some tasks draw from the global generators when they are made.
         with ProcessState(seed_of_test(run, seed)):
             policy, env, max_steps = load_policy(
                 run, seed=seed, noise_scale=noise_scale, best=best, render=drawing
@@ -153,10 +157,10 @@ def play_pictures(
 
 
 def write_video(path: Path, pictures: Sequence[Picture], rate: float) -> None:
-    """Encodes pictures ``[H, W, 3]`` of bytes; the file is there when it is whole.
+    """Encodes pictures ``[H, W, 3]`` of bytes in one step.
 
     Raises:
-        OSError: it could not be written.
+        OSError: the file cannot be written.
     """
     import imageio_ffmpeg
 
@@ -181,14 +185,13 @@ def write_video(path: Path, pictures: Sequence[Picture], rate: float) -> None:
 
 @contextlib.contextmanager
 def _without_a_screen() -> Iterator[None]:
-    """MuJoCo and SDL look for a screen unless told otherwise."""
+    """Sets the variables with which MuJoCo and SDL draw without a screen."""
     known = {"MUJOCO_GL": "egl", "SDL_VIDEODRIVER": "dummy"}
-    told = (
-        {} if "DISPLAY" in os.environ else {k: v for k, v in known.items() if k not in os.environ}
-    )
-    os.environ.update(told)
+    added = {} if "DISPLAY" in os.environ else known
+    before = dict(os.environ)
+    os.environ.update(added | before)
     try:
         yield
     finally:
-        for name in told:
+        for name in added.keys() - before.keys():
             del os.environ[name]

@@ -64,7 +64,7 @@ def interquartile_mean(scores: Scores) -> Scores:
 
 
 def probability_of_improvement(scores: Scores, baseline: Scores) -> Scores:
-    """How probable it is that a run scores higher than one of the baseline, ties halved.
+    """Probability that a run scores higher than a run of the baseline; ties count half.
 
     It is the mean over tasks of the Mann-Whitney statistic over the number of pairs; .5 where
     neither is better, 1 where every run beats every one of the baseline. It needs no common scale
@@ -101,9 +101,9 @@ def bootstrap_interval(
     """Stratified bootstrap confidence interval: runs are drawn anew for each task by itself.
 
     Args:
-        statistic (Callable): of matrices ``[..., runs, tasks]``, to ``[...]``.
+        statistic (Callable): A function of matrices ``[..., runs, tasks]`` with results ``[...]``.
         *scores (array): a matrix ``[runs, tasks]`` for each of its arguments. A task with fewer
-            runs than others has NaN below them, and as many in what is drawn.
+            runs than others has NaN below them, also in every resample.
 
     Keyword Args:
         generator (numpy.random.Generator): draws the runs.
@@ -131,7 +131,7 @@ def bootstrap_interval(
         absent = np.arange(len(matrix))[:, None] >= runs
         drawn.append(np.where(absent, np.nan, np.take_along_axis(matrix[None], rows, 1)))
     tail = (1.0 - confidence) / 2.0
-    # Of every pair of runs there is a number in each resample: a few resamples at a time.
+    # Every pair of runs is a number in each resample, so only a few resamples are made at once.
     cuts = range(RESAMPLES_AT_ONCE, resamples, RESAMPLES_AT_ONCE)
     parts = zip(*(np.split(matrices, cuts) for matrices in drawn), strict=True)
     found = np.concatenate([statistic(*part) for part in parts])
