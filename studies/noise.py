@@ -1,4 +1,4 @@
-"""How finished runs bear noise on their observations: return and smoothness at each level.
+"""Return and smoothness of finished runs at several levels of noise on observations.
 
 ``python -m studies.noise FOLDER...`` plays test episodes with the policies of all
 runs below folders, and writes a table and pictures.
@@ -44,11 +44,11 @@ from torchrl_l2c2.transforms import ObservationNoise
 LEVELS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 LEGEND = (
     "Uniform noise on every feature of the observation, up to the level times the feature's "
-    "standard deviation either way, new at every step and in the place of the task's own; the "
+    "standard deviation either way, new at every step and instead of the task's own; the "
     "deviation is over the states that all runs of the task here visit without noise. Means over "
     "seeds of test episodes with mean actions, 95% intervals of the bootstrap over seeds in "
     "brackets. Sm is (2 / N) sum_i f_i |FFT_i|, a mean over the action's dimensions, as in the "
-    "report's table beside published rows."
+    "tables of results/field.md."
 )
 
 
@@ -88,19 +88,19 @@ def play_with_noise(
     episodes: int = 10,
     progress: bool = False,
 ) -> list[Played]:
-    """Plays the policies of runs at every level of noise, which is the same for all of a task.
+    """Plays the policies of runs at every level of noise, the same for all runs of a task.
 
     Each run has its own test's seed, at every level: at level 0 it plays its test again, where the
     task has no noise of its own.
 
     Args:
-        runs (sequence of FinishedRun): of any tasks.
-        levels (sequence of float): of the noise, in standard deviations of each feature, at least
-            0. Larger ones are harder.
+        runs (sequence of FinishedRun): Runs of any tasks.
+        levels (sequence of float): Levels of noise in standard deviations of each feature, at
+            least 0. Larger levels are harder.
 
     Keyword Args:
-        episodes (int): of each run at each level, at least 1. More give a surer mean.
-        progress (bool): whether to show a progress bar.
+        episodes (int): Episodes of each run at each level, at least 1. More: a smaller error.
+        progress (bool): Whether to show a progress bar.
 
     Raises:
         ValueError: a level below 0, fewer than one episode, or a single state in all of them.
@@ -124,7 +124,7 @@ def play_with_noise(
 
 
 def _observed(run: FinishedRun) -> tuple[Any, ...]:
-    """What is observed: a task's states may be shown in several ways."""
+    """The settings of the observation: runs with the same ones observe the same features."""
     return tuple(run.config["task"].get(name) for name in ("env_id", "flatten"))
 
 
@@ -151,8 +151,8 @@ def draw_noise(played: Sequence[Played], path: str | Path) -> None:
     """Draws every measure against the level, a line with its interval for every group of runs.
 
     Args:
-        played (sequence of Played): of one task and algorithm.
-        path (str or Path): of the file; its ending, ``.png`` or ``.svg``, decides what it is.
+        played (sequence of Played): Runs of one task and algorithm.
+        path (str or Path): The file; its ending, ``.png`` or ``.svg``, is the format.
     """
     groups, summaries = _grouped(played)
     looks, levels = styles(groups), list(played[0].summaries)
@@ -200,7 +200,7 @@ def write_noise(folder: str | Path, played: Sequence[Played]) -> list[Path]:
         for run, summaries in played
     ]
     write_json(folder / "noise.json", {"runs": tests})
-    # Last: whatever comes of them, what was played is there.
+    # Last: an error in a picture loses no results.
     for picture, together in kinds.items():
         draw_noise(together, picture)
     return [table, folder / "noise.json", *pictures]

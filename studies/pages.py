@@ -252,7 +252,7 @@ def reacher_by_seed(runs: pd.DataFrame) -> str:
             f"{r.late_sampled_return:.1f} / {r.late_sampled_action_variation:.3f}" for r in together
         )
         rows.append([str(together[0].seed), *cells])
-    return "\n".join(f"  | {' | '.join(row)} |" for row in rows)
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
 
 def draw_published(

@@ -1,4 +1,4 @@
-"""Scores of readings of the paper: their distance from its table, by studies/protocol.md.
+"""Scores of variants of the experiment: distances from the paper's table (studies/protocol.md).
 
 ``python -m studies.protocol FOLDER... --length 200 300`` prints the scores of the runs below
 folders, as if their training had ended after 200 and after 300 episodes.
@@ -35,12 +35,12 @@ from torchrl_l2c2.experiment.run.finished import QUANTITIES, TESTS, FinishedRun
 from torchrl_l2c2.experiment.settings.config import ExperimentConfig
 from torchrl_l2c2.experiment.settings.identity import length_dependent_settings
 
-METHODS = ("none", "caps")  # L2C2 is not looked at until a reading is taken.
+METHODS = ("none", "caps")  # L2C2 is not looked at until a variant is frozen.
 CAP = 5.0
 
 
 @dataclass(frozen=True)
-class Reading:
+class Variant:
     """A choice of the open details on one task: its runs of the baseline and of CAPS."""
 
     baseline: Group
@@ -79,7 +79,7 @@ class Reading:
         return float(both["updates"].mean())
 
 
-def readings(groups: Sequence[Group]) -> list[Reading]:
+def variants(groups: Sequence[Group]) -> list[Variant]:
     """Pairs the baseline and CAPS on the paper's tasks if their other settings are the same."""
     found: dict[tuple[Any, ...], dict[str, list[Group]]] = {}
     for group in groups:
@@ -88,33 +88,33 @@ def readings(groups: Sequence[Group]) -> list[Reading]:
             alike[group.first.method].append(group)
     # Groups of older defaults make further pairs.
     return [
-        Reading(*pair)
+        Variant(*pair)
         for alike in found.values()
         for pair in product(*(alike[method] for method in METHODS))
     ]
 
 
-def score_table(found: Sequence[Reading]) -> Table:
-    """The score of every reading, by late policies with mean and with sampled actions."""
-    columns = ["task", "reading", "length", "seeds", "updates", "actions", "score"]
+def score_table(found: Sequence[Variant]) -> Table:
+    """The score of every variant, by late policies with mean and with sampled actions."""
+    columns = ["task", "variant", "length", "seeds", "updates", "actions", "score"]
     columns += [
         f"{method_name(method)}: {name}" for method in METHODS for name in QUANTITIES.values()
     ]
     rows = []
-    for reading in found:
-        first = reading.baseline.first
-        others = [f"{name}={value}" for name, value in reading.baseline.settings.items()]
+    for variant in found:
+        first = variant.baseline.first
+        others = [f"{name}={value}" for name, value in variant.baseline.settings.items()]
         start = [first.task, " ".join(others) or "the defaults", first.length]
-        seeds = list(dict.fromkeys(number_range(g.seeds) for g in (reading.baseline, reading.caps)))
+        seeds = list(dict.fromkeys(number_range(g.seeds) for g in (variant.baseline, variant.caps)))
         for test in ("late_mean", "late_sampled"):
-            cells = reading.cells(test)
+            cells = variant.cells(test)
             if all(map(math.isnan, cells.values())):
                 continue
             rows.append(
                 [
                     *(*start, "; ".join(seeds)),
-                    *(f"{reading.updates:.0f}", TESTS[test].split(", ")[1]),
-                    or_dash(reading.score(test), ".2f"),
+                    *(f"{variant.updates:.0f}", TESTS[test].split(", ")[1]),
+                    or_dash(variant.score(test), ".2f"),
                     *(or_dash(cells[m, q], ".2f") for m in METHODS for q in QUANTITIES),
                 ]
             )
@@ -122,7 +122,7 @@ def score_table(found: Sequence[Reading]) -> Table:
         "Cells: the distance of the mean over seeds from the paper's mean, in the paper's standard "
         "deviations, at most 5; the score is their mean, smaller is nearer. Late policies."
     ]
-    return Table("Score of the readings", columns, rows, notes)
+    return Table("Score of the variants", columns, rows, notes)
 
 
 def until(run: FinishedRun, length: int) -> FinishedRun | None:
@@ -164,7 +164,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
             write_records(chosen.csv, merge(read_records(chosen.csv), records))
         groups = group_records(records)
         tables = [paper_table([group for group in groups if is_of_paper(group)])]
-        if found := readings(groups):
+        if found := variants(groups):
             tables.insert(0, score_table(found))
         print("\n\n".join([*(table.markdown() for table in tables), *notes]))
 

@@ -190,21 +190,13 @@ class TestWords:
         faint, strong = TermShare(True, 0.5, 1e-4), TermShare(True, 1e-5, 0.5)
         assert (
             "l2c2_actor 0.01% of the gradient"
-            in said(made_up(shares={**own, "l2c2_actor": faint}), "faint").text
+            in said(made_up(shares={**own, "l2c2_actor": faint}), "small").text
         )
-        assert "faint" not in kinds(made_up(shares={**own, "l2c2_actor": strong}))
-        by_size = said(made_up(shares={**own, "caps": TermShare(True, 5e-4)}), "faint")
+        assert "small" not in kinds(made_up(shares={**own, "l2c2_actor": strong}))
+        by_size = said(made_up(shares={**own, "caps": TermShare(True, 5e-4)}), "small")
         assert "caps 0.05% of the loss" in by_size.text and by_size.fault
-        both = said(made_up(shares={"a": faint, "b": strong}), "faint")
+        both = said(made_up(shares={"a": faint, "b": strong}), "small")
         assert both.text.startswith("Some") and not both.fault
-
-    def test_every_threshold_of_the_rules_is_documented(self):
-        """With the number that the rules use."""
-        from torchrl_l2c2.experiment.analysis.diagnosis import words
-
-        constants = {name: value for name, value in vars(words).items() if name.isupper()}
-        del constants["THRESHOLDS"]
-        assert {name: number for name, (number, _) in THRESHOLDS.items()} == constants
 
 
 def test_policies_are_compared_with_the_first():
@@ -585,7 +577,7 @@ class TestCommand:
         third = folder("none/seed_1", regularizer=NoRegularizerConfig(), seed=1)
         assert run_names([first, third]) == ["L2C2, means 10/seed_0", "baseline/seed_1"]
         other = folder("sigma-2/seed_0", regularizer=replace(tuned, sigma=2.0))
-        assert run_names([first, other]) == ["0ddc7233", "sigma-2"]
+        assert run_names([first, other]) == ["0ddc7233/seed_0", "sigma-2/seed_0"]
 
     def test_ctrl_c_is_one_line(self, run, monkeypatch, capsys):
         """Of every command that tells its errors so."""
@@ -622,5 +614,5 @@ class TestCommand:
         with pytest.raises(SystemExit):
             main([str(tmp_path / "above"), "--names", "one"])
         assert "--names must have 3 names, one per run" in capsys.readouterr().err
-        with pytest.raises(SystemExit, match=r"^error: A run is named twice"):
+        with pytest.raises(SystemExit, match=r"^error: Expected each run once"):
             main([str(run), str(run)])

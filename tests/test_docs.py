@@ -17,7 +17,7 @@ from torchrl.objectives import SACLoss
 
 import torchrl_l2c2
 from torchrl_l2c2 import affinities
-from torchrl_l2c2.experiment.analysis.diagnosis import words
+from torchrl_l2c2.experiment.analysis.diagnosis.words import threshold
 from torchrl_l2c2.experiment.learn.learner import MEASURE_AFTER, WARN_BELOW
 from torchrl_l2c2.presets import KINDS, PRESETS, presets_table
 
@@ -118,21 +118,21 @@ def test_the_pages_have_the_thresholds_of_diagnose() -> None:
     page = (FOLDER / "shaking.md").read_text()
     rows = dict(re.findall(r"^\| ([^|]+) \| ([^|]+) \|", page, re.M))
     for finding, thresholds in {
-        "flips from step to step": [words.FLIPS],
-        "moves like noise": [words.ROUGH, words.SMOOTH],
-        "bang-bang": [words.BANG_BANG, words.EITHER_BOUND],
-        "pinned": [words.BANG_BANG],
-        "sensitive to noise": [words.NOISY],
-        "steep spots": [words.STEEP],
-        "wide samples": [words.WIDE],
-        "small terms": [words.FAINT],
-        "stands still": [words.STILL],
-        "smooth": [words.SMOOTH],
+        "flips from step to step": [threshold("FLIPS")],
+        "moves like noise": [threshold("ROUGH"), threshold("SMOOTH")],
+        "bang-bang": [threshold("BANG_BANG"), threshold("EITHER_BOUND")],
+        "pinned": [threshold("BANG_BANG")],
+        "sensitive to noise": [threshold("NOISY")],
+        "steep spots": [threshold("STEEP")],
+        "wide samples": [threshold("WIDE")],
+        "small terms": [threshold("SMALL")],
+        "stands still": [threshold("STILL")],
+        "smooth": [threshold("SMOOTH")],
     }.items():
         assert {f"{each:g}" for each in thresholds} <= set(re.findall(r"-?[\d.]*\d", rows[finding]))
-    assert f"at least {words.CONCENTRATED:g} of a change" in page
+    assert f"at least {threshold('CONCENTRATED'):g} of a change" in page
     check = (FOLDER / "check.md").read_text()
-    assert f"| below {words.FAINT:g} |" in check and f"| below {WARN_BELOW:.4f} |" in check
+    assert f"| below {threshold('SMALL'):g} |" in check and f"| below {WARN_BELOW:.4f} |" in check
     assert f"after {MEASURE_AFTER} updates" in check
 
 

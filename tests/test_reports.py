@@ -46,6 +46,7 @@ from torchrl_l2c2.experiment.analysis.reports.statistics import (
 )
 from torchrl_l2c2.experiment.analysis.reports.table import known_tests
 from torchrl_l2c2.experiment.cli.report import main
+from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.run.finished import TESTS
 from torchrl_l2c2.experiment.run.folder import code_commit
 from torchrl_l2c2.experiment.settings.identity import differences, fingerprint
@@ -639,6 +640,11 @@ class TestPictures:
         draw_learning_curves(read_runs(tmp_path / "run"), tmp_path / "curves.svg")
         for picture in ("plane.svg", "curves.svg"):
             assert "$^$" in (tmp_path / picture).read_text()
+
+    def test_curves_of_different_tasks_are_refused(self, forty, tmp_path):
+        """Their frames and returns have no common scale."""
+        with pytest.raises(UserError, match=r"^Expected runs of one task .* got reacher, p"):
+            draw_learning_curves(read_runs(forty), tmp_path / "curves.svg")
 
     def test_a_single_run_is_drawn_as_png(self, forty, tmp_path):
         """As every run's folder has it."""

@@ -35,7 +35,7 @@ from studies.paper import (
     shown_groups,
 )
 from studies.protocol import main as score
-from studies.protocol import readings, until
+from studies.protocol import until, variants
 from studies.targets import gain_targets_table
 from tests.test_reports import METHODS, cells, make_config, make_run, table_of
 from torchrl_l2c2.experiment import (
@@ -404,18 +404,18 @@ class TestProtocol:
         make_run(tmp_path / "caps", make_config(regularizer="caps"), 239.57 - 79.68, 0.226)
         make_run(tmp_path / "l2c2", make_config(regularizer="l2c2"), -1e9, 9.0)
         records = read(tmp_path)
-        (reading,) = readings(group_records(table_of(records)))
-        assert reading.score("late_sampled") == pytest.approx((1 + 2 + 3 + 5) / 4)
+        (variant,) = variants(group_records(table_of(records)))
+        assert variant.score("late_sampled") == pytest.approx((1 + 2 + 3 + 5) / 4)
         # With mean actions, returns are 12 higher and variations .012.
         distances = (1 + 12 / 77.96, 2 - 0.012 / 0.011, 3 - 12 / 26.56, 5)
-        assert reading.score("late_mean") == pytest.approx(sum(distances) / 4, abs=1e-5)
+        assert variant.score("late_mean") == pytest.approx(sum(distances) / 4, abs=1e-5)
         # Vanilla of other defaults, when it was run, is another reading.
         then = [replace(r, settings="then") for r in records if r.method == "none"]
-        assert len(readings(group_records(table_of([*records, *then])))) == 2
+        assert len(variants(group_records(table_of([*records, *then])))) == 2
         # Nor are CAPS's of other settings beside it.
         other = [replace(r, differences="algorithm.replay_ratio=5") for r in records]
         caps = [r for r in other if r.method == "caps"]
-        assert not readings(group_records(table_of([*then, *caps])))
+        assert not variants(group_records(table_of([*then, *caps])))
 
     def test_a_run_can_be_read_as_if_it_had_ended_earlier(self, tmp_path):
         """Its own episodes up to there; what only its end was tested for is unknown."""

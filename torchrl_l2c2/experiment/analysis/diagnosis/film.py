@@ -18,7 +18,7 @@ from torchrl_l2c2.experiment.envs.pictures import USUAL_RATE
 
 WIDTH = 320  # of a policy's column, in pixels
 STRIP = 100  # height of its strip
-FASTEST = 30.0  # pictures a second; of more some are left out
+FASTEST = 30.0  # pictures a second; faster simulators lose some
 CURSOR = (194, 24, 43)
 
 
@@ -28,11 +28,11 @@ def film(diagnoses: Sequence[Diagnosis]) -> bytes:
     An episode that ends earlier than others stays at its last picture.
 
     Args:
-        diagnoses (sequence of Diagnosis): with pictures, of one rate of control.
+        diagnoses (sequence of Diagnosis): Diagnoses with pictures and the same control rate.
 
     Raises:
         ImportError: the ``video`` extra is missing.
-        OSError: it could not be written.
+        OSError: the film cannot be written.
     """
     rate = (diagnoses[0].rate or USUAL_RATE) / diagnoses[0].picture_every
     apart = max(1, round(rate / FASTEST))

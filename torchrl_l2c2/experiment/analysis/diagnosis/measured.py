@@ -1,4 +1,4 @@
-"""What is measured of a policy: what it does in test episodes, and how steep it is there."""
+"""Measurements of a policy: its test episodes, and its local Lipschitz constants there."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ STEPS_AT_ONCE = 128  # whose neighbors are in memory together: they may be image
 
 @dataclass(frozen=True)
 class TermShare:
-    """How much of a loss one of its terms is; NaN where it is not known.
+    """Share of a loss that one of its terms has; NaN if it is unknown.
 
     Attributes:
         added: whether a regularizer added the term.

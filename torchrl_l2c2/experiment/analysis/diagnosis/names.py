@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Sequence
 from itertools import compress
 from pathlib import Path
 
-from torchrl_l2c2.experiment.analysis.reports.names import method_name, name_with_settings
+from torchrl_l2c2.experiment.analysis.reports.names import name_with_settings
 from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.run.files import read_config
 from torchrl_l2c2.experiment.settings.identity import differences
@@ -19,37 +20,27 @@ def run_folders(folders: Iterable[str]) -> list[str]:
 
 
 def run_names(folders: Sequence[str]) -> list[str]:
-    """Names runs by what tells them apart: task, algorithm, method, seed, or the folders' paths.
+    """Names runs by the differences of their settings, or else by their folders.
 
     Examples:
-        >>> run_names(["a/sac/none/seed_0", "a/sac/caps/seed_0"])
-        ['baseline', 'CAPS']
-        >>> run_names(["a/sac/none/seed_0", "a/td3/none/seed_0", "b/sac/caps/seed_0"])
-        ['sac/baseline', 'td3/baseline', 'sac/CAPS']
-        >>> run_names(["/a/sac/none/seed_0"])
-        ['sac/baseline/seed_0']
+        >>> run_names(["outputs/none/seed_0", "outputs/caps/seed_0"])
+        ['none/seed_0', 'caps/seed_0']
+        >>> run_names(["outputs/none/seed_0"])
+        ['seed_0']
     """
-    paths = [Path(folder).resolve().parts for folder in folders]
+    paths = [str(Path(folder).resolve()) for folder in folders]
     if len(set(paths)) < len(paths):
-        raise UserError("A run is named twice. Name each run once.")
-    paths = [tuple(map(method_name, path)) for path in paths]
-    told = [each for each in map(_by_settings, map(Path, folders)) if each is not None]
-    # Settings that no method's name tells are in the folders' own.
-    if len(set(told)) == len(folders) > 1:
-        differing = [len(set(each)) > 1 for each in zip(*told, strict=True)]
-        return ["/".join(compress(each, differing)) for each in told]
-    if len(paths) == 1:
-        return ["/".join(paths[0][-3:])]
-    longest = max(map(len, paths))
-    length = next(n for n in range(1, longest + 1) if len({p[-n:] for p in paths}) == len(paths))
-    ends = [path[-length:] for path in paths]
-    while len({end[-1] for end in ends}) == 1:
-        ends = [end[:-1] for end in ends]
-    return ["/".join(end) for end in ends]
+        raise UserError("Expected each run once, got a run twice. Name each run once.")
+    described = [_description(Path(path)) for path in paths]
+    if None not in described and len(set(described)) == len(paths) > 1:
+        differing = [len(set(each)) > 1 for each in zip(*filter(None, described), strict=True)]
+        return ["/".join(compress(each, differing)) for each in filter(None, described)]
+    common = os.path.commonpath([os.path.dirname(path) for path in paths])
+    return [os.path.relpath(path, common) for path in paths]
 
 
-def _by_settings(folder: Path) -> tuple[str, ...] | None:
-    """Task, algorithm, method and seed; ``None`` of a folder without settings."""
+def _description(folder: Path) -> tuple[str, ...] | None:
+    """Task, algorithm, method and seed; ``None`` if the folder has no settings."""
     try:
         config = read_config(folder)
         groups = ("task", "algorithm", "regularizer")

@@ -1,4 +1,4 @@
-"""Pictures of diagnoses: one of each for every policy, on the same axes."""
+"""Pictures of diagnoses, one for each policy, on the same axes."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from torchrl_l2c2.experiment.analysis.reports.figures import drawn, subplots
 from torchrl_l2c2.metrics import amplitude_spectrum
 
 WIDTH = 4.6  # inches, of every picture
-ZOOM = 60  # steps that are shown close by
-MOST_ACTIONS = 4  # that are drawn: those that change most
+ZOOM = 60  # steps in the enlarged picture
+MOST_ACTIONS = 4  # drawn actions, which change most
 COLORS = ("#1f5fa8", "#c0562b", "#2a7f62", "#8a6d1d")
 WORST = "#c2182b"
 BINS = 40
 
 
 def draw_actions(diagnoses: Sequence[Diagnosis]) -> list[bytes]:
-    """Mean actions over an episode, and close by where they change most; SVG, one for each."""
+    """Mean actions over an episode, and enlarged where they change most, as SVG."""
     return [_draw(2, 3.6, _actions, one) for one in diagnoses]
 
 
@@ -46,7 +46,7 @@ def draw_together(diagnoses: Sequence[Diagnosis]) -> bytes:
 
 
 def draw_spectra(diagnoses: Sequence[Diagnosis]) -> list[bytes]:
-    """Amplitudes of the frequencies that the actions are made of, as shares of their range."""
+    """Amplitudes of the frequencies of the actions, as shares of their range."""
     spectra = [
         amplitude_spectrum(one.relative[:, busiest(one)], one.rate or 1.0) for one in diagnoses
     ]
@@ -59,7 +59,7 @@ def draw_spectra(diagnoses: Sequence[Diagnosis]) -> list[bytes]:
 
 
 def draw_steepness(diagnoses: Sequence[Diagnosis]) -> list[bytes]:
-    """Local Lipschitz constants along the episode, and where among its states; worst marked."""
+    """Local Lipschitz constants along the episode and among its states; the steepest are marked."""
     policy = _limits(one.policy_lipschitz for one in diagnoses)
     value = _limits(one.value_lipschitz for one in diagnoses if one.value_lipschitz is not None)
 
@@ -67,12 +67,12 @@ def draw_steepness(diagnoses: Sequence[Diagnosis]) -> list[bytes]:
 
 
 def draw_neighborhoods(diagnoses: Sequence[Diagnosis]) -> list[bytes]:
-    """Histograms of the neighbors' distances and of the gain that is applied there."""
+    """Histograms of the distances of neighbors and of the gain at these distances."""
     return [_draw(2, 3.8, _neighborhood, one) for one in diagnoses]
 
 
 def draw_shares(diagnoses: Sequence[Diagnosis]) -> list[bytes]:
-    """Bars of how much of the loss, and of its gradient, every term is."""
+    """Bars of the share of every term in the loss and in its gradient."""
     return [_draw(1, 0.9 + 0.32 * len(one.shares), _shares, one) for one in diagnoses]
 
 
@@ -135,22 +135,20 @@ def _along(
 ) -> None:
     axis.plot(range(len(constants)), constants.numpy(), color=COLORS[0], linewidth=0.7)
     for place, step in enumerate(one.worst(), 1):
-        axis.plot([step], [constants[step]], "o", color=WORST, markersize=4)
-        axis.annotate(
-            str(place),
-            (step, float(constants[step])),
-            xytext=(3, 3),
-            textcoords="offset points",
-            color=WORST,
-            fontsize=8,
-        )
+        _mark(axis, place, step, float(constants[step]))
     axis.set_yscale("log")
     axis.set_ylim(limits[0] / 2, limits[1] * 3)
     axis.set_ylabel(f"{name}, constant")
 
 
+def _mark(axis: Any, place: int, x: float, y: float) -> None:
+    axis.plot([x], [y], "o", mfc="none", color=WORST, markersize=6)
+    near = {"xytext": (5, 4), "textcoords": "offset points"}
+    axis.annotate(str(place), (x, y), color=WORST, fontsize=8, **near)
+
+
 def _plane(axis: Any, one: Diagnosis, limits: tuple[float, float]) -> None:
-    """The episode's states in the plane that holds most of them."""
+    """The states of the episode in the plane of their first two principal directions."""
     from matplotlib.colors import LogNorm
 
     states = one.observations
@@ -169,15 +167,7 @@ def _plane(axis: Any, one: Diagnosis, limits: tuple[float, float]) -> None:
         rasterized=True,
     )
     for place, step in enumerate(one.worst(), 1):
-        axis.plot(*([x[step]], [y[step]]), "o", mfc="none", color=WORST, markersize=7)
-        axis.annotate(
-            str(place),
-            (float(x[step]), float(y[step])),
-            xytext=(5, 4),
-            textcoords="offset points",
-            color=WORST,
-            fontsize=8,
-        )
+        _mark(axis, place, float(x[step]), float(y[step]))
     axis.set_xlabel("states, first principal direction")
     axis.set_ylabel("second")
     bar = axis.figure.colorbar(
@@ -247,7 +237,7 @@ def _draw(down: int, height: float, fill: Callable[..., None], *of: Any) -> byte
 
 
 def _limits(constants: Iterable[Tensor]) -> tuple[float, float]:
-    """Of all policies together; the lower hundredth is left out."""
+    """The smallest and the largest constant of all policies, without the lower hundredth."""
     known = [each[each.isfinite() & (each > 0.0)] for each in constants]
     together = torch.cat([*known, torch.empty(0)])
     if not len(together):

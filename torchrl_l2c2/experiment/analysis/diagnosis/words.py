@@ -1,4 +1,4 @@
-"""Findings about a policy in words: rules and thresholds on the measurements."""
+"""Findings about a policy in sentences: rules and thresholds on the measurements."""
 
 from __future__ import annotations
 
@@ -11,69 +11,25 @@ from torch import Tensor
 from torchrl_l2c2.experiment.analysis.diagnosis.measured import Diagnosis
 from torchrl_l2c2.metrics import previous_action_gain, roughness, saturation
 
-STILL = 0.005
-FLIPS = -0.5
-BANG_BANG = 0.5
-EITHER_BOUND = 0.05
-ROUGH = 0.2
-SMOOTH = 0.02
-NOISY = 0.5
-WIDE = 0.4
-STEEP = 10.0
-FAINT = 0.001
-CONCENTRATED = 0.3
-
+# Value and meaning; the signals that they were calibrated on are in tests/test_diagnosis.py.
 THRESHOLDS = {
-    "STILL": (
-        STILL,
-        "standard deviation of an action within the episode, of its range, up to which it "
-        "stands still",
-    ),
-    "FLIPS": (
-        FLIPS,
-        "gain on the action before up to which it flips from step to step; -1 is every step",
-    ),
-    "BANG_BANG": (
-        BANG_BANG,
-        "share of an action's steps at its bounds from which it is bang-bang, or pinned",
-    ),
-    "EITHER_BOUND": (
-        EITHER_BOUND,
-        "share of them at each of the two bounds from which it is the former",
-    ),
-    "ROUGH": (
-        ROUGH,
-        "roughness from which an action moves like noise: white noise has .25, the most is .5",
-    ),
-    "SMOOTH": (
-        SMOOTH,
-        "mean change from step to step, of the range, up to which a policy is smooth",
-    ),
-    "NOISY": (
-        NOISY,
-        "share of the mean squared change that noise on observations makes alone, from which "
-        "that is the reason",
-    ),
-    "WIDE": (
-        WIDE,
-        "standard deviation of samples, of half the range, from which a policy is wide; draws "
-        "from the whole range have .58",
-    ),
-    "STEEP": (
-        STEEP,
-        "largest local Lipschitz constant over the median from which there is a steep spot",
-    ),
-    "FAINT": (
-        FAINT,
-        "ratio of gradients, else share of the loss, below which a regularizer's terms are "
-        "too small",
-    ),
-    "CONCENTRATED": (
-        CONCENTRATED,
-        "share of something within a tenth of the episode from which it is said where",
-    ),
+    "STILL": (0.005, "largest standard deviation of an action that stands still, of its range"),
+    "FLIPS": (-0.5, "largest gain on the previous action of an action that flips; -1: every step"),
+    "BANG_BANG": (0.5, "smallest share of steps at the bounds of a bang-bang or pinned action"),
+    "EITHER_BOUND": (0.05, "smallest share of steps at each bound of a bang-bang action"),
+    "ROUGH": (0.2, "smallest roughness of an action that moves like noise; white noise has 0.25"),
+    "SMOOTH": (0.02, "largest mean change per step of a smooth policy, of the action's range"),
+    "NOISY": (0.5, "smallest share of the squared change that noise on observations explains"),
+    "WIDE": (0.4, "smallest standard deviation of wide samples, of half the range; uniform: 0.58"),
+    "STEEP": (10.0, "smallest ratio of the largest to the median local Lipschitz constant"),
+    "SMALL": (0.001, "share of the gradient, or else of the loss, below which a term is small"),
+    "CONCENTRATED": (0.3, "smallest share of a change in a tenth of the episode that is located"),
 }
-"""Value and meaning of every threshold."""
+
+
+def threshold(name: str) -> float:
+    """The value of a threshold."""
+    return THRESHOLDS[name][0]
 
 
 @dataclass(frozen=True)
@@ -97,13 +53,16 @@ def findings(diagnosis: Diagnosis) -> list[Finding]:
     Args:
         diagnosis (Diagnosis): Result of :func:`~.measured.diagnose`.
     """
-    if all(_still(diagnosis)):
-        told = [_stillness(diagnosis)]
-    else:
-        told = list(_actions(diagnosis))
-        told = [*told, *_steepest(diagnosis)] if told else [_plain(diagnosis)]
-        told += _reasons(diagnosis)
-    return [*told, *_training(diagnosis)]
+    if (diagnosis.relative.std(0) <= threshold("STILL")).all():
+        at = ", ".join(f"{value:.3g}" for value in diagnosis.actions.mean(0).tolist())
+        text = (
+            f"It stands still: every action stays within {threshold('STILL'):.1%} of its range "
+            f"around ({at}). This is smooth, but the policy does not react to its observations."
+        )
+        return [Finding("still", text), *_training(diagnosis)]
+    found = list(_actions(diagnosis))
+    found = [*found, *_steepest(diagnosis)] if found else [_movement(diagnosis)]
+    return [*found, *_reasons(diagnosis), *_training(diagnosis)]
 
 
 def summary(diagnosis: Diagnosis) -> str:
@@ -121,14 +80,14 @@ def comparison(diagnoses: Sequence[Diagnosis]) -> list[str]:
     """
     first, *others = diagnoses
     return [
-        _beside(first, other)
+        _compared(first, other)
         if other.task == first.task
         else f"{other.name} is of another task than {first.name} ({other.task}, {first.task})."
         for other in others
     ]
 
 
-def _beside(first: Diagnosis, other: Diagnosis) -> str:
+def _compared(first: Diagnosis, other: Diagnosis) -> str:
     (before, old), (now, new) = (
         (one.measures["action_variation"], one.measures["return"]) for one in (first, other)
     )
@@ -145,72 +104,55 @@ def _beside(first: Diagnosis, other: Diagnosis) -> str:
     )
 
 
-def _still(diagnosis: Diagnosis) -> list[bool]:
-    deviation = diagnosis.relative.std(0)
-    return [value <= STILL for value in deviation.tolist()]
-
-
-def _stillness(diagnosis: Diagnosis) -> Finding:
-    at = ", ".join(f"{value:.3g}" for value in diagnosis.actions.mean(0).tolist())
-    return Finding(
-        "still",
-        f"It stands still: every action stays within {STILL:.1%} of its range around ({at}). That "
-        "is smooth, but it answers to nothing that it observes.",
-    )
-
-
 def _actions(diagnosis: Diagnosis) -> Iterator[Finding]:
     """Findings about each action dimension that moves."""
-    relative, still = diagnosis.relative, _still(diagnosis)
-    for number in range(relative.shape[1]):
-        if still[number]:
+    for number, action in enumerate(diagnosis.relative.split(1, 1)):
+        if action.std() <= threshold("STILL"):
             continue
-        action, name = relative[:, number : number + 1], f"action[{number}]"
-        if diagnosis.bounded and (found := _at_bounds(name, action)):
-            yield found
-        gain = previous_action_gain(action).item()
-        if gain <= FLIPS:
+        name, change = f"action[{number}]", _change(action)
+        at_bounds = saturation(action, 0.0, 1.0).item()
+        if diagnosis.bounded and at_bounds >= threshold("BANG_BANG"):
+            yield _at_bounds(name, action, at_bounds)
+        gain, rough = previous_action_gain(action).item(), roughness(action).item()
+        if gain <= threshold("FLIPS"):
             yield _flips(name, action, gain, diagnosis.rate)
-        elif (rough := roughness(action).item()) >= ROUGH and _change(action) > SMOOTH:
-            yield Finding(
-                "rough",
-                f"{name} moves like noise: its roughness is {rough:.2f} of the control rate, where "
-                f"white noise has .25; it changes by {_change(action):.1%} of its range at a step, "
-                f"{_where(action.diff(dim=0).abs())}.",
+        elif rough >= threshold("ROUGH") and change > threshold("SMOOTH"):
+            text = (
+                f"{name} moves like noise: its roughness is {rough:.2f} of the control rate (white "
+                f"noise has 0.25); it changes by {change:.1%} of its range per step, "
+                f"{_where(action.diff(dim=0).abs())}."
             )
+            yield Finding("rough", text)
 
 
-def _at_bounds(name: str, action: Tensor) -> Finding | None:
-    share = saturation(action, 0.0, 1.0).item()
-    if share < BANG_BANG:
-        return None
-    ends = [(action <= 0.01).float().mean().item(), (action >= 0.99).float().mean().item()]
-    if min(ends) < EITHER_BOUND:
-        which = "lower" if ends[0] > ends[1] else "upper"
-        return Finding(
-            "pinned",
-            f"{name} is pinned at its {which} bound in {share:.0%} of the steps: the policy asks "
-            "for more than there is.",
+def _at_bounds(name: str, action: Tensor, share: float) -> Finding:
+    lower, upper = (action <= 0.01).float().mean(), (action >= 0.99).float().mean()
+    if min(lower, upper) < threshold("EITHER_BOUND"):
+        which = "lower" if lower > upper else "upper"
+        text = (
+            f"{name} is pinned at its {which} bound in {share:.0%} of the steps: the policy needs "
+            "wider bounds."
         )
+        return Finding("pinned", text)
     jumps = action.diff(dim=0).abs() > 0.5
     every = f", one in {len(action) / max(1, int(jumps.sum())):.0f} steps" if jumps.any() else ""
-    return Finding(
-        "bang-bang",
+    text = (
         f"{name} is bang-bang: it is at its bounds in {share:.0%} of the steps and jumps over more "
-        f"than half of its range {int(jumps.sum())} times{every}, {_where(jumps.float())}.",
+        f"than half of its range {int(jumps.sum())} times{every}, {_where(jumps.float())}."
     )
+    return Finding("bang-bang", text)
 
 
 def _flips(name: str, action: Tensor, gain: float, rate: float | None) -> Finding:
     change = action.diff(dim=0)
     back = (change[1:] * change[:-1] < 0).float()
     speed = "half the control rate" if rate is None else f"{rate / 2:.3g} Hz, half the control rate"
-    return Finding(
-        "flips",
-        f"{name} flips from step to step, which is shaking at {speed}: its gain on the action "
-        f"before is {gain:.2f} and it turns back at {back.mean():.0%} of the steps, by "
-        f"{_change(action):.1%} of its range on average; {_where(back * change[1:].abs())}.",
+    text = (
+        f"{name} flips from step to step, which is shaking at {speed}: its gain on the previous "
+        f"action is {gain:.2f}, and it turns back in {back.mean():.0%} of the steps, by "
+        f"{_change(action):.1%} of its range on average; {_where(back * change[1:].abs())}."
     )
+    return Finding("flips", text)
 
 
 def _steepest(diagnosis: Diagnosis) -> Iterator[Finding]:
@@ -219,85 +161,81 @@ def _steepest(diagnosis: Diagnosis) -> Iterator[Finding]:
         values = diagnosis.observations[step].tolist()
         seen = [f"{e} = {v:.2g}" for e, v in zip(diagnosis.entries, values, strict=True)]
         constants = diagnosis.policy_lipschitz
-        yield Finding(
-            "steepest",
+        text = (
             f"It is steepest at step {step}, where it observes {listed(seen)}: its local Lipschitz "
             f"constant is {constants[step]:.3g} there and {constants.nanmedian():.3g} in the "
-            "median.",
-            fault=False,
+            "median."
         )
+        yield Finding("steepest", text, fault=False)
 
 
 def _reasons(diagnosis: Diagnosis) -> Iterator[Finding]:
     """Causes of the movement."""
-    shaking = _change(diagnosis.relative) > SMOOTH
-    if diagnosis.noise_share >= NOISY and shaking:
-        yield Finding(
-            "noise",
-            f"It is sensitive to noise on what it observes: noise of {diagnosis.noise_scale:.2g} "
-            f"moves the action by {diagnosis.noise_action:.2g}, which alone makes "
-            f"{min(1.0, diagnosis.noise_share):.0%} of the squared change from step to step.",
+    shaking = _change(diagnosis.relative) > threshold("SMOOTH")
+    if shaking and diagnosis.noise_share >= threshold("NOISY"):
+        text = (
+            f"It is sensitive to noise on its observations: noise of {diagnosis.noise_scale:.2g} "
+            f"moves the action by {diagnosis.noise_action:.2g}, which explains "
+            f"{min(1.0, diagnosis.noise_share):.0%} of the squared change from step to step."
         )
+        yield Finding("noise", text)
     constants = diagnosis.policy_lipschitz
-    median, steps = constants.nanmedian().item(), diagnosis.worst(1)
-    if shaking and steps and median > 0.0:
-        ratio = constants[steps[0]].item() / median
-        if ratio >= STEEP:
-            yield Finding(
-                "steep",
-                f"The policy has steep spots: at step {steps[0]} its local Lipschitz constant is "
-                f"{constants[steps[0]]:.3g}, {ratio:.0f} times its median of {median:.3g}.",
+    median = constants.nanmedian().item()
+    for step in diagnosis.worst(1) if shaking and median > 0.0 else []:
+        if (ratio := constants[step].item() / median) >= threshold("STEEP"):
+            text = (
+                f"The policy has steep spots: at step {step} its local Lipschitz constant is "
+                f"{constants[step]:.3g}, {ratio:.0f} times its median of {median:.3g}."
             )
-    if diagnosis.spread >= WIDE:
-        yield Finding(
-            "wide",
+            yield Finding("steep", text)
+    if diagnosis.spread >= threshold("WIDE"):
+        text = (
             f"Its samples are wide: their standard deviation is {diagnosis.spread:.2f} of half the "
-            "range, where draws from all of it have .58, and more if they crowd at its ends. "
-            "However smooth the mean, what acts in training is not, and distances of policies "
-            "that are relative to the width are small.",
+            "range; uniform samples have 0.58. Training explores with large steps even if the mean "
+            "is smooth, and distances of policies that are relative to the width are small."
         )
+        yield Finding("wide", text)
 
 
 def _training(diagnosis: Diagnosis) -> Iterator[Finding]:
-    """Findings about the regularizer's terms, by their gradients if these are known."""
-    for measured, what in (
+    """Finding about the regularizer's terms, by their gradients if these are known."""
+    for measured, of in (
         ("gradient", "of the gradient of the loss's own terms"),
         ("size", "of the loss, late in training"),
     ):
-        added = {
-            n: getattr(share, measured) for n, share in diagnosis.shares.items() if share.added
+        shares = {
+            name: getattr(share, measured)
+            for name, share in diagnosis.shares.items()
+            if share.added and not math.isnan(getattr(share, measured))
         }
-        known = {name: value for name, value in added.items() if not math.isnan(value)}
-        faint = {name: value for name, value in known.items() if value < FAINT}
-        if faint:
-            each = ", ".join(f"{name} {100 * value:.2g}%" for name, value in faint.items())
-            every = len(faint) == len(known)
-            yield Finding(
-                "faint",
-                f"{'All' if every else 'Some'} of the regularizer's terms are small: {each} "
-                f"{what}. They change little; raise their gains.",
-                fault=every,
+        small = {name: share for name, share in shares.items() if share < threshold("SMALL")}
+        if small:
+            every = len(small) == len(shares)
+            each = ", ".join(f"{name} {100 * share:.2g}%" for name, share in small.items())
+            text = (
+                f"{'All' if every else 'Some'} of the regularizer's terms are small: {each} {of}. "
+                "They change little; raise their gains."
             )
-        if known:
+            yield Finding("small", text, fault=every)
+        if shares:
             return
 
 
-def _plain(diagnosis: Diagnosis) -> Finding:
+def _movement(diagnosis: Diagnosis) -> Finding:
+    """Finding about a policy whose actions have no fault."""
     change = _change(diagnosis.relative)
-    gain = diagnosis.measures["previous_action_gain"]
     numbers = (
-        f"the action changes by {change:.1%} of its range at a step, and its gain on the action "
-        f"before is {gain:.2f}"
+        f"the action changes by {change:.1%} of its range per step, and its gain on the previous "
+        f"action is {diagnosis.measures['previous_action_gain']:.2f}"
     )
-    if change <= SMOOTH:
+    if change <= threshold("SMOOTH"):
         return Finding("smooth", f"It is smooth: {numbers}.", fault=False)
-    moving = diagnosis.relative.diff(dim=0).abs().mean(1, keepdim=True)
-    return Finding(
-        "moves",
-        f"It moves much, but neither flips, nor jumps between its bounds, nor looks like noise: "
-        f"{numbers}; the change is {_where(moving)}.",
-        fault=False,
+    where = _where(diagnosis.relative.diff(dim=0).abs().mean(1, keepdim=True))
+    text = (
+        f"It moves much, but it does not flip, jump between its bounds or move like noise: "
+        f"{numbers}; the change is {where}."
     )
+    return Finding("moves", text, fault=False)
 
 
 def _change(relative: Tensor) -> float:
@@ -305,19 +243,19 @@ def _change(relative: Tensor) -> float:
 
 
 def _where(amount: Tensor) -> str:
-    """The tenth of an episode that has most of an amount ``[T, 1]``."""
+    """The tenth of an episode with the largest part of an amount ``[T, 1]``."""
     length = -(-len(amount) // 10)
     tenths = [part.sum().item() for part in amount.split(length)]
     most = max(range(len(tenths)), key=tenths.__getitem__)
     share = tenths[most] / total if (total := sum(tenths)) else 0.0
-    if share < CONCENTRATED or not math.isfinite(share):
+    if share < threshold("CONCENTRATED") or not math.isfinite(share):
         return "throughout the episode"
     start = most * length
     return f"{share:.0%} of it in steps {start} to {min(start + length, len(amount)) - 1}"
 
 
 def listed(texts: Sequence[str], most: int = 8) -> str:
-    """The first of them, with commas.
+    """The first texts, with commas.
 
     Examples:
         >>> listed(["a", "b", "c"], most=2)

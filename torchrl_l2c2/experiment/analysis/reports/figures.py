@@ -16,6 +16,7 @@ from torchrl_l2c2.experiment.analysis.reports.names import METHODS
 from torchrl_l2c2.experiment.analysis.reports.records import records_of
 from torchrl_l2c2.experiment.analysis.reports.statistics import curve_band, mean
 from torchrl_l2c2.experiment.analysis.reports.table import COMPARED, Estimate
+from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.run.files import write_atomically
 from torchrl_l2c2.experiment.run.finished import TESTS, FinishedRun
 
@@ -40,6 +41,11 @@ def draw_learning_curves(runs: Sequence[FinishedRun], path: str | Path) -> None:
         path (str or Path): The file; its ending, ``.png`` or ``.svg``, is the format.
     """
     groups = group_records(records_of(runs))
+    if len(by_task(groups)) > 1:
+        tasks = ", ".join(sorted({f"{run.task}, {run.algorithm}" for run in runs}))
+        raise UserError(
+            f"Expected runs of one task and algorithm, got {tasks}. Draw a picture for each."
+        )
     runs_of = {run.record.identity: run for run in runs}
     looks = styles(groups)
     known = [name for name in PANELS if any(np.isfinite(run.column(name)).any() for run in runs)]

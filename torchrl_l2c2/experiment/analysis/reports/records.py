@@ -114,7 +114,7 @@ def read_records(path: str | Path) -> pd.DataFrame:
     if columns and columns != list(TYPES):
         odd = ", ".join(sorted(set(columns) ^ TYPES.keys())) or "another order"
         raise UserError(
-            f"Expected the columns of records in {path}, got other ones ({odd}). "
+            f"Expected the columns of records in {path}, got missing or unknown columns: {odd}. "
             "Write the file with report --csv."
         )
     read: dict[str, Callable[[str], Any]] = {"int": int, "float": _number, "str": str}
