@@ -27,7 +27,6 @@ from torchrl_l2c2.experiment.settings.identity import (
     differences,
     differing,
     fingerprint,
-    read_differences,
     write_differences,
 )
 
@@ -92,34 +91,6 @@ class Record:
     def identity(self) -> tuple[str | int, ...]:
         """Two records with the same are the same run, made twice; the seed is the last of it."""
         return (self.task, self.algorithm, self.method, self.settings, self.length, self.seed)
-
-    def value(self, test: str, quantity: str) -> float:
-        """A quantity of a test, by their names in ``TESTS`` and ``QUANTITIES``; NaN if unknown.
-
-        ``sm_asap`` is known of ``last_mean`` only. ``policy_scale`` is of the late policies,
-        whatever the test.
-        """
-        if quantity == "sm_asap" and test != "last_mean":
-            return math.nan
-        known = quantity if quantity == "policy_scale" else f"{test}_{quantity}"
-        value: float = getattr(self, known)
-        return value
-
-    @property
-    def is_tested(self) -> bool:
-        """Tells if the last policy was tested, with mean or with sampled actions."""
-        tests = (self.last_mean_return, self.last_sampled_return)
-        return not all(map(math.isnan, tests))
-
-    @cached_property
-    def other_settings(self) -> dict[str, str]:
-        """The settings that differ from the defaults, by name."""
-        return read_differences(self.differences)
-
-    @cached_property
-    def settings_of_any_length(self) -> dict[str, str]:
-        """Of these all but how long is trained, which :attr:`length` says."""
-        return {k: v for k, v in self.other_settings.items() if k not in BUDGETS}
 
 
 @dataclass(frozen=True)
