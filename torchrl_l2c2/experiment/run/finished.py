@@ -27,7 +27,6 @@ from torchrl_l2c2.experiment.settings.identity import (
     differences,
     fingerprint,
     flatten_settings,
-    read_differences,
     write_differences,
 )
 
@@ -93,36 +92,6 @@ class Record:
     def identity(self) -> tuple[str | int, ...]:
         """Identity of the run, with the seed last. Records of repeated runs have the same."""
         return (self.task, self.algorithm, self.method, self.settings, self.length, self.seed)
-
-    def value(self, test: str, quantity: str) -> float:
-        """Returns a quantity of a test, or NaN if unknown.
-
-        Args:
-            test (str): Name of the test, a key of ``TESTS``.
-            quantity (str): A key of ``QUANTITIES``, ``"sm_asap"`` (known only for ``last_mean``),
-                or ``"policy_scale"`` (of the late policies for every test).
-        """
-        if quantity == "sm_asap" and test != "last_mean":
-            return math.nan
-        known = quantity if quantity == "policy_scale" else f"{test}_{quantity}"
-        value: float = getattr(self, known)
-        return value
-
-    @property
-    def is_tested(self) -> bool:
-        """Checks whether the last policy was tested, with mean or sampled actions."""
-        tests = (self.last_mean_return, self.last_sampled_return)
-        return not all(map(math.isnan, tests))
-
-    @cached_property
-    def other_settings(self) -> dict[str, str]:
-        """Settings that differ from the defaults, by name."""
-        return read_differences(self.differences)
-
-    @cached_property
-    def settings_without_length(self) -> dict[str, str]:
-        """Settings that differ from the defaults, without the length of training."""
-        return {k: v for k, v in self.other_settings.items() if k not in BUDGETS}
 
 
 @dataclass(frozen=True)

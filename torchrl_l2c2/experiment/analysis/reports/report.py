@@ -40,10 +40,13 @@ def result_lines(run: FinishedRun) -> str:
 
 
 def printed_table(records: pd.DataFrame) -> str:
-    """Returns the table of records as Markdown: the last policies' mean actions, if tested."""
+    """Returns the table of records and notes on their settings as Markdown.
+
+    The test is the last policy's with mean actions, or the first other one that was made.
+    """
     groups = group_records(records)
-    tables = [comparison_table(test, groups).markdown() for test in known_tests(groups)[:1]]
-    return "\n\n".join([*tables, *settings_notes(groups)])
+    table = comparison_table(known_tests(groups)[0], groups)
+    return "\n\n".join([table.markdown(), *settings_notes(groups)])
 
 
 def sweep_summary(folders: Sequence[str | Path]) -> str:
@@ -78,23 +81,22 @@ def write_report(
         Path: The page, which contains its pictures and needs no other file.
     """
     groups = group_records(records)
-    tests = known_tests(groups)
+    test = known_tests(groups)[0]
+    table = comparison_table(test, groups)
     notes = [*notes, *settings_notes(groups)]
-    tables = [comparison_table(test, groups) for test in tests]
     with TemporaryDirectory() as drawn:
         for task, algorithm in dict.fromkeys((run.task, run.algorithm) for run in runs):
             together = [run for run in runs if (run.task, run.algorithm) == (task, algorithm)]
             name = f"learning_curves_{plain(task)}_{algorithm}.svg"
             draw_learning_curves(together, Path(drawn) / name)
-        for test in tests:
-            tested = [group for group in groups if len(group.scores(test, "return"))]
-            draw_plane(tested, test, Path(drawn) / f"plane_{test}.svg")
+        tested = [group for group in groups if len(group.scores(test, "return"))]
+        draw_plane(tested, test, Path(drawn) / "plane.svg")
         pictures = {path.name: path.read_bytes() for path in sorted(Path(drawn).iterdir())}
     titles = {name: Path(name).stem.replace("_", " ") for name in pictures}
     shown = {titles[name]: data_uri(content) for name, content in pictures.items()}
-    page = render("report.html", title="Runs", notes=notes, tables=tables, pictures=shown)
+    page = render("report.html", title="Runs", notes=notes, table=table, pictures=shown)
     links = [f"![{title}]({name})" for name, title in titles.items()]
-    text = "\n\n".join(["# Runs", *notes, *(table.markdown() for table in tables), *links])
+    text = "\n\n".join(["# Runs", *notes, table.markdown(), *links])
     folder = make_folder(folder)
     for name, content in pictures.items():
         write_atomically(folder / name, content)
