@@ -545,7 +545,7 @@ def test_an_error_of_the_users_own_task_is_shown_with_its_lines(tmp_path, monkey
     assert 'broken_task.py", line 9, in step' in done.stderr and "lower_the_boom" in done.stderr
     assert "KeyError: 'boom'" in done.stderr
     told = done.stderr.splitlines()[-1]
-    assert told.startswith("error: broken_task:Broken-v0 failed beyond") and "'boom'" in told
+    assert told.startswith("error: broken_task:Broken-v0 failed after") and "'boom'" in told
 
 
 def test_a_sweep_gives_one_table(tmp_path):

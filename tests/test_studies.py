@@ -665,7 +665,10 @@ class TestForest:
                 for seed, result in enumerate(runs):
                     config = make_config(task=task, regularizer=method, seed=seed)
                     make_run(tmp_path / task / method / str(seed), config, *result)
-        groups = {(g.first.task, g.first.method): g for g in group_records(read(tmp_path))}
+        groups = {
+            (g.first.task, g.first.method): g
+            for g in group_records(records_of(read_runs(tmp_path)))
+        }
         # The smoother baseline first, to see that rows are sorted.
         return forest.rows(
             {task: (groups[task, "l2c2"], groups[task, "none"]) for task in ("reacher", "swingup")}

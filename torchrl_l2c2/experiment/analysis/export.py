@@ -119,7 +119,8 @@ def export_policy(
     missing = [name for name in NEEDED if find_spec(name) is None]
     if missing:
         raise MissingPackageError(
-            f'{", ".join(missing)} is missing: pip install "torchrl-l2c2[export]" brings it.'
+            f"Expected the packages of the export extra, got none of {', '.join(missing)}. "
+            'Run pip install "torchrl-l2c2[export]".'
         )
     policy, env, max_steps = load_policy(run, best=best)
     folder = make_folder(output or Path(run) / "export")

@@ -44,7 +44,8 @@ def check_video(path: str | Path | None = None) -> None:
     """
     if find_spec("imageio_ffmpeg") is None:
         raise MissingPackageError(
-            'imageio-ffmpeg is missing: pip install "torchrl-l2c2[video]" brings it.'
+            "Expected the package imageio-ffmpeg, which is not installed. Run pip install "
+            '"torchrl-l2c2[video]".'
         )
     if path is None:
         return
@@ -101,7 +102,7 @@ def record_video(
     """
     check_video(path)
     if episodes < 1:
-        raise UserError(f"episodes must be at least 1, got {episodes}.")
+        raise UserError(f"Expected at least 1 episode, got {episodes}. Give a larger --episodes.")
     path = Path(path or Path(run) / "video.mp4")
     played = play_pictures(run, episodes, seed=seed, noise_scale=noise_scale, best=best)
     seen = [picture for each in played for picture in each.pictures]
