@@ -180,7 +180,7 @@ def test_a_simulator_that_does_not_repeat_itself_is_told():
     """And begins another episode."""
     collector = collector_of(MOODY, [0], 10)
     collector.rollout()
-    with pytest.warns(UserWarning, match="plays an episode differently the second time"):
+    with pytest.warns(UserWarning, match="is not reproducible"):
         collector.set_generator_state(collector.generator_state())
     played(collector, 2)
     assert len(collector.finished_episodes[-1].transitions) == 20

@@ -141,13 +141,13 @@ def test_a_folder_that_hydra_cannot_make_ends_in_a_line(tmp_path):
         ("regularizer=cap", ", got 'cap'. Did you mean regularizer=caps?"),
         (
             "task=Pendulum-v1",
-            "task=pendulum? For an id of Gymnasium: task=gymnasium task.env_id=Pendulum-v1.",
+            "task=pendulum? For a Gymnasium id: task=gymnasium task.env_id=Pendulum-v1.",
         ),
         (
             "sigma=2",
             "sigma is not a setting; did you mean regularizer.sigma? --help lists every setting.",
         ),
-        ("outputs=~/runs", "No shell expands this ~: write $HOME."),
+        ("outputs=~/runs", "Shells do not expand ~ here: write $HOME."),
     ],
 )
 def test_what_cannot_be_composed_ends_with_what_was_meant(settings_of, line, meant):

@@ -32,10 +32,10 @@ class SimulatorError(RuntimeError):
 
 
 class CompilerError(RuntimeError):
-    """The compiler failed, perhaps because a signal ended it; the text has its reason."""
+    """The compiler failed or was ended by a signal. The message states the reason."""
 
 
-# What fails outside of the program: a simulator, a process, the numbers of a training, a disk.
+# Failures outside of the program: a simulator, a compiler, non-finite numbers, a disk.
 OUTSIDE = (SimulatorError, CompilerError, FloatingPointError, OSError)
 # PyTorch has no class for a lack of CPU memory.
 NO_MEMORY = ("DefaultCPUAllocator: can't allocate memory", "Storage size calculation overflowed")

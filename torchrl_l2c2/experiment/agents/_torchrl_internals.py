@@ -49,7 +49,7 @@ def add_noise(noise: ObservationNoise, observation: Tensor) -> Tensor:
 
 
 def clear_detached_parameters(loss: LossModule) -> None:
-    """Has TorchRL's losses detach their parameters anew: they keep detached ones if traced."""
+    """Clears the detached parameters that TorchRL's losses cache, also while they are traced."""
     for module in loss.modules():
         if isinstance(module, LossModule):
             module._erase_cache()

@@ -89,7 +89,7 @@ def clip_bounds(env: EnvBase) -> tuple[Tensor, Tensor]:
 
 
 def observation_size(env: EnvBase) -> int:
-    """Returns the number of entries of an observation."""
+    """Returns the length of an observation."""
     size: int = env.observation_spec["observation"].shape[-1]
     return size
 

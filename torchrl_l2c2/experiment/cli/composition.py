@@ -184,9 +184,9 @@ def composition_errors() -> Iterator[None]:
 
 
 def one_line_message(error: Exception) -> str:
-    """Returns the text of an error of Hydra or OmegaConf in one line, with what to write instead.
+    """Returns an error of Hydra or OmegaConf as one line, with a suggestion.
 
-    Reads the attributes of the errors, not their texts.
+    It uses the attributes of the errors, not their messages.
     """
     setting = getattr(error.__cause__, "full_key", None)
     if isinstance(error, ConfigCompositionException) and setting:
@@ -195,27 +195,27 @@ def one_line_message(error: Exception) -> str:
         group, _, name = error.missing_cfg_file.rpartition("/")
         return _unknown_choice(group, name, error.options)
     if isinstance(error, OverrideParseException):
-        home = " No shell expands this ~: write $HOME." if "=~" in error.override else ""
+        home = " Shells do not expand ~ here: write $HOME." if "=~" in error.override else ""
         return (
             f"cannot read {error.override!r}. Put a value with special characters in quotes within "
             f"quotes: 'name=\"a b\"'.{home}"
         )
-    said = " ".join(str(error).split())
+    message = " ".join(str(error).split())
     if isinstance(error, (ValueError, ConfigCompositionException)):
-        said += (
+        message += (
             f". Each of {', '.join(GROUPS)} takes one name (regularizer=none for none); -m runs "
             "several."
         )
-    return said
+    return message
 
 
 def _unknown_choice(group: str, name: str, choices: Sequence[str]) -> str:
-    """Returns the text about a choice that a group does not have."""
+    """Returns a message about a choice that a group does not have, with a similar name."""
     near = get_close_matches(name, choices, 1)
-    meant = f" Did you mean {group}={near[0]}?" if near else ""
-    gymnasium = f" For an id of Gymnasium: task=gymnasium task.env_id={name}."
+    suggestion = f" Did you mean {group}={near[0]}?" if near else ""
+    gymnasium = f" For a Gymnasium id: task=gymnasium task.env_id={name}."
     return (
-        f"Expected {group} to be one of {', '.join(choices)}, got {name!r}.{meant}"
+        f"Expected {group} to be one of {', '.join(choices)}, got {name!r}.{suggestion}"
         f"{gymnasium if group == 'task' else ''}"
     )
 

@@ -11,7 +11,7 @@ from torchrl_l2c2._version import __version__
 
 # Packages of the experiment extra, which the components do not need.
 PACKAGES = ("gymnasium", "hydra", "pydantic", "matplotlib", "pandas", "jinja2", "tqdm", "filelock")
-# Name: module and help. Each module has a ``main(arguments)``.
+# Name: module and help. Each module has a function ``main(arguments)``.
 COMMANDS = {
     "train": ("train", "trains a policy, for example: train task=hopper seed=1"),
     "evaluate": ("evaluate", "plays test episodes, also with noise on observations"),

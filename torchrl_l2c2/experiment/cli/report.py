@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from torchrl_l2c2.experiment.run.finished import FinishedRun
 
 DESCRIPTION = """\
-Reads every finished run below folders, prints a table of them, and writes a report: tables,
-and pictures, as one page, as Markdown and as SVG.
+Reads all finished runs below folders, prints a table, and writes a report with tables and pictures,
+as one HTML page and as Markdown and SVG.
 """
 EXAMPLES = """\
 examples:
@@ -81,7 +81,7 @@ def _report(chosen: argparse.Namespace) -> None:
     if chosen.output or not (chosen.records or chosen.csv):
         folder = Path(chosen.output or Path(chosen.folders[0]) / "report")
         written.append(f"report: {write_report(folder, records, runs, notes)}")
-    # Last, as in `report ... | head`: the files are there when the reader ends.
+    # Printed last: a closed output, as with head, must not prevent the files.
     print("\n\n".join([printed_table(records), *notes, *written]))
 
 

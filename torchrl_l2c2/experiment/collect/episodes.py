@@ -1,4 +1,4 @@
-"""A TorchRL collector for one simulator, nearly as fast as the simulator."""
+"""Fast collection of episodes from one Gymnasium simulator."""
 
 from __future__ import annotations
 
@@ -21,34 +21,34 @@ from torchrl_l2c2.experiment.envs.frames import Frame, stack_frames
 
 
 class EpisodeCollector(Collector):
-    """A TorchRL :class:`~torchrl.collectors.Collector` that is fast with one Gymnasium simulator.
+    """A fast TorchRL :class:`~torchrl.collectors.Collector` for one Gymnasium simulator.
 
-    It returns the batches of TorchRL's collector, bit for bit, without the ``collector`` entry. It
-    leaves out the work around every step: specs, nested TensorDicts and their copies. The frames
-    of an episode are stacked once.
+    It returns the same batches as TorchRL's collector, bit for bit, without the ``collector``
+    entry. Steps need no specs, nested TensorDicts or copies, and the frames of an episode are
+    stacked once.
 
     Args:
-        env (EnvBase): a ``GymEnv`` or ``GymWrapper``, also one transformed by
-            :class:`ObservationNoise`, with one observation tensor under ``"observation"``.
-        policy (TensorDictModule): reads ``"observation"``.
+        env (EnvBase): A ``GymEnv`` or ``GymWrapper`` with one tensor under ``"observation"``,
+            optionally transformed by :class:`ObservationNoise`.
+        policy (TensorDictModule): Policy that reads ``"observation"``.
 
     Keyword Args:
-        frames_per_batch (int): frames of a batch.
-        stop_at_done (bool): whether a batch ends with the episode, even if it is shorter. Learning
-            at the end of every episode needs this. Default ``True``.
-        compile_policy (bool): whether to compile the policy. The random numbers are the same.
-            Changes of its parameters in place are followed. Parameters or settings that are
-            replaced after the first frame are not. Default ``False``.
-        random_frames (int): number of first frames with actions drawn uniformly from the action's
-            bounds. Their log-likelihood is the one of the policy's own action. Default 0.
-        exploration_type (ExplorationType): default ``RANDOM``.
-        keep_previous (bool): whether frames also have the observation before theirs, as
-            ``"previous_observation"``. The first frame of an episode has its own observation there.
+        frames_per_batch (int): Number of frames in a batch.
+        stop_at_done (bool): Whether a batch ends with the episode, even with fewer frames. Updates
+            after every episode need this. Default ``True``.
+        compile_policy (bool): Whether to compile the policy. Random numbers stay the same. Later
+            in-place changes of parameters take effect, but parameters or settings must not be
+            replaced after the first frame. Default ``False``.
+        random_frames (int): Number of first frames with actions sampled uniformly from their
+            bounds. The stored log-likelihood remains the policy's. Default 0.
+        exploration_type (ExplorationType): Exploration type of the policy. Default ``RANDOM``.
+        keep_previous (bool): Whether frames contain the previous observation as
+            ``"previous_observation"``; the first frame of an episode repeats its own observation.
             Default ``False``.
 
     Raises:
-        ValueError: several environments at once, or one with other transforms. Use TorchRL's
-            ``Collector`` for these.
+        ValueError: If the environment is batched or has other transforms. Use TorchRL's
+            ``Collector`` instead.
 
     Examples:
         >>> from torchrl.envs import GymEnv
@@ -91,15 +91,15 @@ class EpisodeCollector(Collector):
         self._random_frames_left = random_frames
         self._policy_keys = [key for key in policy.out_keys if not key.startswith("_")]
         self._act = policy_function(policy, self._policy_keys, compile_policy)
-        # Samples may exceed the bounds: frames have the sample, the task gets the clipped action.
-        self._clip: Callable[[Tensor], Tensor] | None = getattr(policy, "clip_action", None)
+        # Samples may exceed the bounds: frames contain the samples, the task gets clipped actions.
+        self._clip_action: Callable[[Tensor], Tensor] | None = getattr(policy, "clip_action", None)
         self._action_spec = self._simulation.env.action_spec
         continuous = self._action_spec.dtype.is_floating_point
         self._to_action = copy_to_numpy if continuous else self._simulation.env.read_action
 
     @torch.no_grad()
     def rollout(self) -> TensorDictBase:
-        """Plays up to ``frames_per_batch`` frames; iterating over the collector calls this."""
+        """Plays up to ``frames_per_batch`` frames. Iterating over the collector calls this."""
         frames: list[Frame] = []
         try:
             with set_exploration_type(self.exploration_type):
@@ -125,22 +125,22 @@ class EpisodeCollector(Collector):
         if self._random_frames_left > 0:
             self._random_frames_left -= 1
             action.copy_(self._action_spec.rand())
-        clipped = action if self._clip is None else self._clip(action)
+        clipped = action if self._clip_action is None else self._clip_action(action)
         return self._simulation.step(outputs, self._to_action(clipped))
 
     def reset(self, index: Any = None, **kwargs: Any) -> None:
-        """Ends the current episode; the next frame starts another one."""
+        """Ends the current episode. The next frame starts a new one."""
         self._simulation.discard_episode()
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
-        """Seeds the simulator and, with a different seed, its noise; starts a new episode.
+        """Seeds the simulator and its noise, and ends the current episode.
 
         Args:
-            seed (int): at least 0.
-            static_seed (bool): whether to return the seed as it is.
+            seed (int): Seed of the simulator, at least 0. The noise's seed is derived from it.
+            static_seed (bool): Whether to return the same seed. Default ``False``.
 
         Returns:
-            int: a seed for another environment.
+            int: Seed for another environment.
         """
         next_seed = super().set_seed(seed, static_seed=static_seed)
         noise = self._simulation.noise
@@ -153,20 +153,20 @@ class EpisodeCollector(Collector):
         """Returns the states of the random generators between two episodes.
 
         Raises:
-            RuntimeError: during an episode; the simulator's state cannot be saved.
+            RuntimeError: If an episode is in progress: the simulator's state cannot be saved.
         """
         if self._simulation.next_observation is not None:
             raise RuntimeError("Expected the end of an episode. Save between two episodes.")
         return {**self._simulation.generators(), "random_frames_left": self._random_frames_left}
 
     def set_generator_state(self, state: dict[str, Any]) -> None:
-        """Restores what :meth:`generator_state` returned; the next frame starts an episode."""
+        """Restores a state of :meth:`generator_state`. The next frame starts a new episode."""
         self._simulation.set_generators(state)
         self._random_frames_left = state["random_frames_left"]
 
 
 def copy_to_numpy(action: Tensor) -> np.ndarray:
-    """Copies an action for the simulator, which may write into it."""
+    """Converts an action to a NumPy array, a copy: simulators may change it."""
     return action.numpy().copy()
 
 
@@ -179,13 +179,23 @@ def play_episodes(
     sampled: bool = False,
     compile_policy: bool = False,
 ) -> Iterator[TensorDictBase]:
-    """Plays episodes ``[T]`` with mean or sampled actions; the environment stays open.
+    """Yields episodes ``[T]`` of a policy. The environment stays open.
 
-    The arguments are as for :func:`~torchrl_l2c2.experiment.evaluate_policy`. For environments
-    that :class:`EpisodeCollector` refuses, it calls ``env.rollout``, without compiling the policy.
+    Environments that :class:`EpisodeCollector` does not support are played by their own
+    ``rollout``, without compilation.
+
+    Args:
+        policy (TensorDictModule): Policy that reads ``"observation"``.
+        env (EnvBase): Environment.
+        episodes (int): Number of episodes.
+
+    Keyword Args:
+        max_steps (int): Maximum frames per episode.
+        sampled (bool): Whether actions are sampled. Default ``False``: mean actions.
+        compile_policy (bool): Whether to compile the policy. Default ``False``.
 
     Raises:
-        SimulatorError: the environment or the policy failed; the text has the episode's number.
+        SimulatorError: If the environment or the policy fails; states the episode.
     """
     exploration = ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC
     collector: EpisodeCollector | None = None
@@ -205,7 +215,7 @@ def play_episodes(
                         episode = env.rollout(max_steps, policy)
                 else:
                     episode = collector.rollout()
-                    if not episode["next", "done"][-1].any():  # Cut at max_steps.
+                    if not episode["next", "done"][-1].any():  # Ended by max_steps only.
                         collector.reset()
             yield episode
     finally:

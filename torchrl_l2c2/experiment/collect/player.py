@@ -1,4 +1,4 @@
-"""Episodes and rollouts of a run, checked, counted and measured."""
+"""Playing and measuring an agent's training episodes."""
 
 from __future__ import annotations
 
@@ -22,23 +22,32 @@ from torchrl_l2c2.metrics import action_variation
 
 Played = TypeVar("Played")
 
-# Measures of an episode, by their names in metrics.csv.
+# Metrics of an episode, by their names in metrics.csv.
 EPISODE_COLUMNS = ("return", "action_variation", "policy_scale", "length")
-# Distance between the seeds of a run's simulators, so large that no two runs share one.
-SEEDS_APART = 15_485_863
+# Distance of the seeds of a run's simulators, large enough to differ from other runs' seeds.
+SEED_STRIDE = 15_485_863
 
 
 def make_collector(
     config: ExperimentConfig, env: EnvBase, agent: Agent, *, compile: bool
 ) -> EpisodeCollector | RolloutCollector:
-    """Makes the collector of a run: rollouts with ``algorithm.num_envs``, otherwise episodes."""
+    """Creates the collector of a run: rollouts with ``algorithm.num_envs``, otherwise episodes.
+
+    Args:
+        config (ExperimentConfig): Settings of the run.
+        env (EnvBase): Environment of the task, the first of ``num_envs``.
+        agent (Agent): Agent whose policy acts.
+
+    Keyword Args:
+        compile (bool): Whether to compile the policy.
+    """
     algorithm = config.algorithm
     options: dict[str, Any] = {
         "compile_policy": compile,
         "keep_previous": config.regularizer.reads_previous,
     }
     if algorithm.num_envs is not None:
-        seeds = (config.seed + SEEDS_APART * i for i in range(1, algorithm.num_envs))
+        seeds = (config.seed + SEED_STRIDE * i for i in range(1, algorithm.num_envs))
         envs = [env, *(make_env(config.task, seed) for seed in seeds)]
         return RolloutCollector(envs, agent.policy, frames_per_batch=algorithm.frames, **options)
     return EpisodeCollector(
@@ -52,13 +61,14 @@ def make_collector(
 
 @dataclass
 class Episode:
-    """An episode and its measures.
+    """An episode and its metrics.
 
     Attributes:
-        transitions: the whole episode, ``[T]``.
-        last_frame: number of the run's frames up to the end of the episode.
-        measures: return, smoothness of the mean actions, mean scale of the policy, length.
-        ends_round: whether it is the last episode that was played with the same policy.
+        transitions: Transitions ``[T]`` of the whole episode.
+        last_frame: Number of frames of the run at the end of the episode.
+        measures: Metrics by name: return, smoothness of the mean actions, mean scale of the policy,
+            length.
+        ends_round: Whether it is the last episode of this policy.
     """
 
     transitions: TensorDictBase
@@ -68,15 +78,15 @@ class Episode:
 
 
 class Player:
-    """Plays, measures and counts an agent's episodes.
+    """Plays an agent's episodes, measures them, and counts the frames.
 
     Args:
-        collector: the collector, from :func:`make_collector`.
-        agent (Agent): the agent whose policy acts.
-        env_id (str): the environment's id, for errors.
+        collector: Collector of :func:`make_collector`.
+        agent (Agent): Agent whose policy acts.
+        env_id (str): Id of the environment, for errors.
 
     Attributes:
-        frames: number of frames so far.
+        frames: Number of frames so far.
     """
 
     def __init__(
@@ -91,38 +101,38 @@ class Player:
         """Plays one episode.
 
         Raises:
-            FloatingPointError: NaN or infinity from the environment or the policy.
-            SimulatorError: the environment failed.
+            FloatingPointError: If the environment or the policy returns NaN or infinity.
+            SimulatorError: If the environment fails.
         """
-        assert isinstance(self.collector, EpisodeCollector)  # make_collector ensures it.
+        assert isinstance(self.collector, EpisodeCollector)  # Ensured by make_collector.
         transitions = self._simulate(self.collector.rollout)
         self._check_and_count(transitions)
         return self.measure(transitions, self.frames)
 
     def play_rollout(self) -> tuple[list[TensorDictBase], list[Episode]]:
-        """Plays a rollout: the next frames ``[T]`` of every simulator, and the ended episodes.
+        """Plays a rollout: the next frames ``[T]`` of every simulator, and the finished episodes.
 
         Raises:
-            FloatingPointError: as :meth:`play`.
-            SimulatorError: as :meth:`play`.
+            FloatingPointError: As :meth:`play`.
+            SimulatorError: As :meth:`play`.
         """
         assert isinstance(self.collector, RolloutCollector)
         first_frame, rollout = self.frames, self._simulate(self.collector.rollout)
         for frames in rollout:
             self._check_and_count(frames)
-        ended = self.collector.finished_episodes
+        finished = self.collector.finished_episodes
         episodes = [
-            self.measure(e.transitions, first_frame + e.frame, ends_round=e is ended[-1])
-            for e in ended
+            self.measure(e.transitions, first_frame + e.frame, ends_round=e is finished[-1])
+            for e in finished
         ]
         return rollout, episodes
 
     def step(self) -> Frame:
-        """Plays the next frame of an episode.
+        """Plays the next frame of the current episode.
 
         Raises:
-            FloatingPointError: as :meth:`play`.
-            SimulatorError: as :meth:`play`.
+            FloatingPointError: As :meth:`play`.
+            SimulatorError: As :meth:`play`.
         """
         assert isinstance(self.collector, EpisodeCollector)
         frame = self._simulate(self.collector.step)
@@ -132,7 +142,7 @@ class Player:
         return frame
 
     def discard_episode(self) -> None:
-        """Discards the episode that :meth:`step` has begun; the next frame starts another one."""
+        """Discards the unfinished episode of :meth:`step`. The next frame starts a new one."""
         assert isinstance(self.collector, EpisodeCollector)
         self.collector.reset()
 
@@ -153,10 +163,17 @@ class Player:
     def measure(
         self, transitions: TensorDictBase, last_frame: int, *, ends_round: bool = True
     ) -> Episode:
-        """Measures an episode: its return and the smoothness of the policy's mean at its states.
+        """Measures the return of an episode and the smoothness of the mean actions at its states.
 
-        The mean scale of a stochastic policy is logged too: the Hellinger distance is relative to
-        it, so a policy can reduce the penalty by becoming wider.
+        Also measures the mean scale of a stochastic policy: the Hellinger distance is relative to
+        it, so a larger scale also lowers the penalty of L2C2.
+
+        Args:
+            transitions (TensorDictBase): Transitions ``[T]`` of the whole episode.
+            last_frame (int): Number of frames of the run at the end of the episode.
+
+        Keyword Args:
+            ends_round (bool): Whether it is the last episode of this policy. Default ``True``.
         """
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             written = self._agent.policy(transitions.select("observation"))

@@ -1,4 +1,4 @@
-"""Rollouts of a fixed length from several simulators; episodes continue in the next rollout."""
+"""Rollouts of a fixed length from several simulators."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class FinishedEpisode(NamedTuple):
     """An episode that ended in a rollout.
 
     Attributes:
-        frame: number of the rollout's frames, over all simulators, up to the episode's end.
-        transitions: the whole episode, ``[T]``.
+        frame: Number of frames of the rollout, over all simulators, at the end of the episode.
+        transitions: Transitions ``[T]`` of the whole episode.
     """
 
     frame: int
@@ -30,33 +30,36 @@ class FinishedEpisode(NamedTuple):
 
 
 class RolloutCollector:
-    """Plays several Gymnasium simulators in this process with one policy, one frame each in turn.
+    """Steps several Gymnasium simulators in one process with one policy, in turn.
 
-    The policy is called once for all of them. A rollout has a fixed length, and the next one
-    continues the episodes. The last ``("next", "observation")`` of a simulator is the state to
-    bootstrap from. At the end of an episode it is that episode's last observation, not the first
-    observation of the next episode.
+    The policy is called once per step for all simulators. Episodes may extend over several
+    rollouts. ``("next", "observation")`` of a simulator's last frame is the observation for
+    bootstrapping. At the end of an episode it is the episode's last observation, not the first of
+    the next.
 
-    Unfinished episodes can be saved; see :class:`~.simulation.Simulation`.
+    Unfinished episodes can be saved, see :class:`~.simulation.Simulation`.
 
     Args:
-        envs (sequence of EnvBase): one environment for each simulator, with different seeds, as
-            for :class:`~torchrl_l2c2.experiment.EpisodeCollector`.
-        policy (TensorDictModule): reads ``"observation"`` ``[N, F]``. Its actions are clipped to
-            their bounds for the simulators, and stored unclipped.
+        envs (sequence of EnvBase): One environment per simulator, each with its own seed, as for
+            :class:`~torchrl_l2c2.experiment.EpisodeCollector`.
+        policy (TensorDictModule): Policy that reads ``"observation"`` ``[N, F]``. Simulators get
+            actions clipped to their bounds; frames contain the unclipped actions.
 
     Keyword Args:
-        frames_per_batch (int): frames of a rollout, a multiple of the number of environments.
-        compile_policy (bool): whether to compile the policy. Default ``False``.
-        exploration_type (ExplorationType): default ``RANDOM``.
-        keep_previous (bool): as for :class:`~torchrl_l2c2.experiment.EpisodeCollector`.
+        frames_per_batch (int): Frames per rollout over all simulators, a multiple of the number of
+            environments.
+        compile_policy (bool): Whether to compile the policy. Default ``False``.
+        exploration_type (ExplorationType): Exploration type of the policy. Default ``RANDOM``.
+        keep_previous (bool): Whether frames contain the previous observation, as for
+            :class:`~torchrl_l2c2.experiment.EpisodeCollector`. Default ``False``.
 
     Attributes:
-        finished_episodes: the episodes that ended in the last rollout, in the order of their ends.
+        finished_episodes: Episodes that ended in the last rollout, in the order of their ends.
 
     Raises:
-        ValueError: an environment with transforms other than
-            :class:`~torchrl_l2c2.ObservationNoise`, or a length that is not a multiple.
+        ValueError: If an environment is batched or has other transforms than
+            :class:`~torchrl_l2c2.ObservationNoise`, or ``frames_per_batch`` is not a multiple of
+            the number of environments.
 
     Examples:
         >>> from torchrl.envs import GymEnv
@@ -119,14 +122,14 @@ class RolloutCollector:
         return [stack_frames(frames) for frames in played]
 
     def generator_state(self) -> dict[str, Any]:
-        """Returns the states of the random generators and the unfinished episodes."""
+        """Returns the states of the random generators, and the unfinished episodes."""
         return {"streams": {str(i): s.state_dict() for i, s in enumerate(self._simulations)}}
 
     def set_generator_state(self, state: dict[str, Any]) -> None:
-        """Restores what :meth:`generator_state` returned, and replays the unfinished episodes.
+        """Restores a state of :meth:`generator_state` by repeating the unfinished episodes.
 
         Warns:
-            UserWarning: a simulator arrived at another observation; a new episode starts.
+            UserWarning: If a simulator reaches another observation. A new episode then starts.
         """
         for i, simulation in enumerate(self._simulations):
             simulation.load_state_dict(state["streams"][str(i)], self._to_action)

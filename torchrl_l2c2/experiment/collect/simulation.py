@@ -1,4 +1,4 @@
-"""One Gymnasium environment, stepped without TorchRL's work around every step."""
+"""A Gymnasium environment that is stepped without TorchRL's overhead."""
 
 from __future__ import annotations
 
@@ -20,25 +20,26 @@ from torchrl_l2c2.transforms import ObservationNoise
 class Simulation:
     """A Gymnasium environment, its observation noise, and the frames of its current episode.
 
-    An unfinished episode can be saved although the simulator cannot: it is replayed from the states
-    of the random generators at its start, with the recorded actions.
+    Unfinished episodes can be saved, although the state of the simulator cannot: on loading, the
+    simulator repeats the actions from the initial states of the random generators.
 
     Args:
-        env (EnvBase): a ``GymEnv`` or ``GymWrapper``, also one transformed by
-            :class:`~torchrl_l2c2.ObservationNoise`, with one observation tensor under
-            ``"observation"``.
+        env (EnvBase): A ``GymEnv`` or ``GymWrapper`` with one tensor under ``"observation"``,
+            optionally transformed by :class:`~torchrl_l2c2.ObservationNoise`.
 
     Keyword Args:
-        keep_previous (bool): whether frames also have the observation before theirs, as
-            ``"previous_observation"``. The first frame of an episode has its own observation there.
+        keep_previous (bool): Whether frames contain the previous observation as
+            ``"previous_observation"``; the first frame of an episode repeats its own observation.
+            Default ``False``.
 
     Attributes:
-        env: the ``GymEnv`` or ``GymWrapper``, without noise.
-        frames: frames of the current episode; after its end, until the next reset, of the last one.
-        next_observation: what the policy acts on next; ``None`` before a reset.
+        env: The ``GymEnv`` or ``GymWrapper``, without noise.
+        noise: Noise on observations; ``None`` without noise.
+        frames: Frames of the current episode, or of the last episode until the next reset.
+        next_observation: Next observation for the policy; ``None`` before a reset.
 
     Raises:
-        ValueError: several environments at once, or one with other transforms.
+        ValueError: If the environment is batched or has other transforms.
     """
 
     def __init__(self, env: EnvBase, *, keep_previous: bool = False) -> None:
@@ -46,7 +47,7 @@ class Simulation:
         if parts is None:
             raise ValueError(
                 "Expected one Gymnasium environment with no transform except ObservationNoise, got "
-                f"{env}. Use TorchRL's Collector for others."
+                f"{env}. Use TorchRL's Collector for other environments."
             )
         self.env, self.noise = parts
         self.frames: list[Frame] = []
@@ -57,9 +58,9 @@ class Simulation:
         self._started_from = self.generators()
 
     def observation(self) -> Tensor:
-        """Returns what the policy acts on; starts an episode after the end of the last one.
+        """Returns the current observation, after a reset if no episode is in progress.
 
-        It does not start one earlier: between episodes only the generators' states must be saved.
+        Resets are late: between episodes, the states of the random generators are the whole state.
         """
         if self.next_observation is None:
             self.frames = []
@@ -71,8 +72,8 @@ class Simulation:
         """Plays one frame.
 
         Args:
-            outputs (dict): what the policy wrote for :meth:`observation`.
-            action (numpy.ndarray): the action for the simulator.
+            outputs (dict): Outputs of the policy for :meth:`observation`, by key.
+            action (numpy.ndarray): Action for the simulator.
         """
         before = self.observation()
         if self._keep_previous:
@@ -85,7 +86,7 @@ class Simulation:
         return frame
 
     def discard_episode(self) -> None:
-        """Ends the current episode; the next frame starts another one."""
+        """Ends the current episode. The next frame starts a new one."""
         self.next_observation, self.frames = None, []
 
     def generators(self) -> dict[str, Any]:
@@ -97,7 +98,7 @@ class Simulation:
         }
 
     def set_generators(self, states: Mapping[str, Any]) -> None:
-        """Restores what :meth:`generators` returned; the next frame starts an episode."""
+        """Restores states of :meth:`generators`. The next frame starts a new episode."""
         generator = self._gymnasium.unwrapped.np_random.bit_generator
         generator.state = json.loads(states["simulator"])
         if self.noise is not None:
@@ -116,14 +117,14 @@ class Simulation:
         }
 
     def load_state_dict(self, state: Mapping[str, Any], to_action: Any) -> None:
-        """Restores what :meth:`state_dict` returned by playing the same actions again.
+        """Restores a state of :meth:`state_dict` by repeating the actions.
 
         Args:
-            state (Mapping): the state.
-            to_action (callable): makes the simulator's action from the policy's.
+            state (Mapping): State of :meth:`state_dict`.
+            to_action (callable): Function that converts the policy's action for the simulator.
 
         Warns:
-            UserWarning: the simulator arrived at another observation; a new episode starts.
+            UserWarning: If the simulator reaches another observation. A new episode then starts.
         """
         self.set_generators(state["generators"])
         outputs = state["outputs"]
@@ -133,21 +134,21 @@ class Simulation:
         after = self.next_observation
         if outputs and (after is None or not after.equal(state["following"])):
             warnings.warn(
-                f"{self.env} plays an episode differently the second time. A new episode starts, "
-                "and the run differs from an uninterrupted one.",
+                f"{self.env} is not reproducible: repeating an episode's actions led to another "
+                "observation. A new episode starts, and the run differs from an uninterrupted run.",
                 stacklevel=5,
             )
             self.discard_episode()
 
     def _observe(self, seen: np.ndarray) -> Tensor:
-        """Copies an observation, because simulators may write into theirs, and adds the noise."""
+        """Converts an observation to a tensor with noise, a copy: simulators may reuse arrays."""
         if self.noise is None:
             return torch.tensor(seen, dtype=self._dtype)
         return add_noise(self.noise, torch.as_tensor(seen, dtype=self._dtype))
 
 
 def split_environment(env: EnvBase) -> tuple[GymWrapper, ObservationNoise | None] | None:
-    """Returns the simulator and its noise; ``None`` for environments with other parts."""
+    """Returns the simulator and its noise; ``None`` if it is batched or has other transforms."""
     transforms: list[Transform] = []
     simulator = env
     if isinstance(env, TransformedEnv):

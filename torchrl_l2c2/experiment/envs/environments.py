@@ -72,7 +72,7 @@ def make_env(task: TaskConfig, seed: int, *, render: Drawing | None = None) -> E
 
     Raises:
         ValueError: If Gymnasium does not know the id, the task has no time limit or cannot render,
-            or its observations or actions have an unsupported type.
+            or its observations or actions are not vectors of numbers.
         SimulatorError: If the environment raises an error when it is created or reset.
     """
     simulator = with_vector_action(_make(task, render))

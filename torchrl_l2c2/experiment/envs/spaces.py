@@ -1,4 +1,4 @@
-"""Conversion of Gymnasium spaces to one vector of float32 each."""
+"""Conversion of a Gymnasium task's observations and actions to float32 vectors."""
 
 from __future__ import annotations
 

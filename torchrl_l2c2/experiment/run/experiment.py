@@ -300,7 +300,7 @@ class Experiment:
         return write_evaluation(self.folder, self.config, written)
 
     def close(self) -> None:
-        """Closes the environments; the experiment cannot train any further."""
+        """Closes environments, log and lock. The experiment cannot be used afterwards."""
         self.player.collector.shutdown()
         self._late_tests.close()
         self._log.close()

@@ -1,4 +1,4 @@
-"""State of the process that a run replaces: random generators, threads and memory."""
+"""Global state of the process: random generators, threads and memory."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torchrl.checkpoint import GlobalRNGState
 
-# Options of glibc's mallopt, in bytes, at most the largest int: blocks above MMAP_THRESHOLD are
-# mapped anew at every allocation, and free memory above TRIM_THRESHOLD is returned to the system.
+# Parameters of glibc's mallopt, in bytes: free memory above TRIM_THRESHOLD is returned to the
+# system, and blocks above MMAP_THRESHOLD are mapped again at every allocation.
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 _LARGEST = 2**31 - 1
 
@@ -21,22 +21,22 @@ _GENERATORS = GlobalRNGState()
 
 
 class ProcessState:
-    """A run's own state of the global random generators, and its own number of threads.
+    """Context manager with a run's own global random generators and number of threads.
 
-    Inside the context the process has the run's state, and outside its own state again. Networks
-    are initialized with the global generators, and policies sample from them.
+    The previous state of the process is restored at exit. The generators initialize networks and
+    sample actions.
 
     Args:
-        seed (int): seed of the generators of Python, NumPy and PyTorch.
-        threads (int): number of PyTorch's threads. Default 1.
+        seed (int): Seed of the generators of Python, NumPy and PyTorch.
+        threads (int): Number of PyTorch threads. Default 1.
 
     Examples:
         >>> import torch
-        >>> ours = ProcessState(seed=0)
-        >>> with ours:
+        >>> process = ProcessState(seed=0)
+        >>> with process:
         ...     first = torch.rand(())
         >>> _ = torch.rand(100)
-        >>> with ours:
+        >>> with process:
         ...     second = torch.rand(())
         >>> generator = torch.Generator().manual_seed(0)
         >>> both = [torch.rand((), generator=generator) for _ in range(2)]
@@ -72,25 +72,25 @@ class ProcessState:
         self._outside = None
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the states of the run's generators, as TorchRL's ``GlobalRNGState`` does."""
+        """Returns the states of the run's generators, as TorchRL's ``GlobalRNGState``."""
         return self._inside if self._outside is None else _GENERATORS.state_dict()
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restores what :meth:`state_dict` returned."""
+        """Restores a state of :meth:`state_dict`."""
         self._inside = dict(state)
         if self._outside is not None:
             _restore(self._inside)
 
 
 def keep_freed_memory() -> bool:
-    """Lets the process keep freed memory for the next update, which needs the same amount.
+    """Lets the process keep freed memory for the next update.
 
-    Otherwise the system hands out the memory of larger batches page by page at every update, which
-    is slow. The process then keeps the largest amount it has needed until it ends. ``train.py``
-    calls this, because its process trains and does little else.
+    Otherwise the system maps the tensors of large batches again at every update, which is slow. The
+    process then keeps its peak memory until its end. Intended for processes that mainly train:
+    ``train.py`` calls it.
 
     Returns:
-        bool: whether the C library has the setting; only glibc does.
+        bool: Whether the C library supports it; only glibc does.
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt
@@ -101,7 +101,7 @@ def keep_freed_memory() -> bool:
 
 
 def _restore(state: Mapping[str, Any]) -> None:
-    """Sets the generators; the GPUs' generators only if the number of GPUs is the same."""
+    """Sets the generators. GPU generators are set only if the number of GPUs is the same."""
     gpus = len(state.get("torch_cuda", ()))
     if gpus and gpus != torch.cuda.device_count():
         state = {name: each for name, each in state.items() if name != "torch_cuda"}

@@ -92,8 +92,8 @@ def stop_on_signals() -> Iterator[list[int]]:
 def keep_ctrl_c_from_children() -> None:
     """Blocks Ctrl-C in all later child processes: only this process receives it.
 
-    Terminals send Ctrl-C to all processes. Compilers, workers and jobs then finish their work, and
-    this process ends them. Call it first, before other threads start.
+    Terminals send Ctrl-C to all processes. Compilers and jobs then finish their work, and this
+    process ends them. Call it first, before other threads start.
     """
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         return
