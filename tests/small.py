@@ -60,7 +60,14 @@ def composed(*overrides: str) -> dict[str, Any]:
 
 @cache
 def _composed_once(overrides: tuple[str, ...]) -> Any:
+    with ready_to_compose():
+        return OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
+
+
+@contextmanager
+def ready_to_compose() -> Iterator[None]:
+    """Hydra as within the command."""
     with own_nodes():
         register()
         with initialize_config_dir(str(CONF), version_base="1.3"):
-            return OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
+            yield

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from omegaconf import OmegaConf
-from small import composed
+from small import composed, ready_to_compose
 
 import torchrl_l2c2
 from torchrl_l2c2 import PPORPELoss, make_actor, make_critic
@@ -32,10 +32,12 @@ from torchrl_l2c2.experiment.cli.composition import (
     check_folders,
     check_preset,
     describe_preset,
+    preset_defaults,
 )
 from torchrl_l2c2.experiment.cli.manual import manual, page
 from torchrl_l2c2.experiment.settings.config import GROUPS
 from torchrl_l2c2.experiment.settings.fields import SettingError, describe
+from torchrl_l2c2.experiment.settings.naming import run_name
 from torchrl_l2c2.experiment.settings.regularizers import (
     BEGIN_WITH_PRESET,
     REGULARIZERS,
@@ -280,12 +282,41 @@ def test_a_general_preset_gives_any_task_the_settings_of_a_named_one(preset, alg
     assert replace(own, task=known.task) == known and own.task.frames == known.task.frames
 
 
+@pytest.mark.parametrize(
+    ("preset", "task", "changed", "named"),
+    [
+        ("baselines", "gymnasium", ["task.env_id=Reacher-v5"], "Reacher-v5/ppo/l2c2/baselines"),
+        ("field", "hopper_v5", [], "hopper_v5/ppo/l2c2/baselines"),
+        (
+            "rl_zoo",
+            "pendulum",
+            ["algorithm.gamma=0.8", "optimizer=adaterm", "compile=false", "task.frames=9"],
+            "pendulum/ppo/l2c2/rl_zoo_gamma-0.8_optimizer-adaterm_compile-false",
+        ),
+        ("none", "pendulum", ["regularizer.sigma=2"], "pendulum/ppo/l2c2/sigma-2.0"),
+    ],
+)
+def test_a_folder_has_the_presets_name_and_the_settings_changed_from_it(
+    preset, task, changed, named
+):
+    """Also of a preset that takes another one's settings for the task."""
+    choices = {"task": task, "algorithm": "ppo", "regularizer": "l2c2", "preset": preset}
+    values = composed(*(f"{group}={name}" for group, name in choices.items()), *changed)
+    with ready_to_compose():
+        defaults = preset_defaults(values, choices)
+    config = ExperimentConfig.from_dict(values)
+    assert run_name(config, values["preset"], defaults) == f"{named}/seed_0"
+
+
 def test_episodes_beside_a_presets_frames_are_refused():
     """They would not be read; frames that are switched off leave them."""
     chosen = ["preset=rl_zoo", "task=pendulum", "algorithm=ppo", "task.episodes=5"]
     config = ExperimentConfig.from_dict(composed(*chosen))
     with pytest.raises(SettingError, match=r"task\.episodes has no effect .*500000: set task\."):
         check_budget(config, chosen)
+    for prefix in ("+", "++"):
+        with pytest.raises(SettingError, match=r"task\.episodes has no effect"):
+            check_budget(config, [*chosen[:-1], f"{prefix}task.episodes=5"])
     check_budget(config, chosen[:-1])
     check_budget(ExperimentConfig.from_dict(composed(*chosen, "task.frames=null")), chosen)
 

@@ -25,9 +25,10 @@ from torchrl_l2c2.experiment import (
 )
 from torchrl_l2c2.experiment.agents.build import make_agent
 from torchrl_l2c2.experiment.cli.train import run
-from torchrl_l2c2.experiment.envs.environments import time_limit
+from torchrl_l2c2.experiment.envs.environments import ActionRatePenalty, time_limit
 from torchrl_l2c2.experiment.envs.pictures import Drawing
 from torchrl_l2c2.experiment.errors import SimulatorError
+from torchrl_l2c2.experiment.run.evaluation import evaluate_task
 
 INF = float("inf")
 VECTOR = spaces.Box(-INF, INF, (2,), np.float32)
@@ -314,6 +315,27 @@ def test_a_task_without_pictures_is_not_trained_for_a_video(monkeypatch, tmp_pat
     with pytest.raises(ValueError, match="Still-v0 cannot render pictures"):
         run(ExperimentConfig(task=task(), record=True), tmp_path / "run", {"resume": None})
     assert not (tmp_path / "run").exists()
+
+
+def test_an_action_with_equal_bounds_has_no_action_rate_penalty(monkeypatch):
+    """Its range is 0; the other action moves over its whole range: 2 halves, squared, over 2."""
+    action = spaces.Box(np.float32([-1.0, 0.5]), np.float32([1.0, 0.5]))
+    env = ActionRatePenalty(Still(action=action), weight=3.0)
+    monkeypatch.setattr(Still, "step", lambda self, action: (self.seen, 0.0, False, False, {}))
+    env.reset()
+    rewards = [env.step(np.float32([u, 0.5]))[1] for u in (-1.0, 1.0, 1.0)]
+    assert rewards == [0.0, -3.0 * 2.0**2 / 2, 0.0]
+
+
+def test_a_failed_test_closes_its_environment(monkeypatch):
+    """Some simulators keep a window or a process."""
+    closed = []
+    monkeypatch.setattr(Still, "close", lambda self: closed.append(self))
+    policy = make_agent(ExperimentConfig(task=task()), make_env(task(), 0)).policy
+    monkeypatch.setattr(Still, "step", lambda self, action: 1 / 0)
+    with pytest.raises(SimulatorError, match="ZeroDivisionError"):
+        evaluate_task(policy, task(), 0, 1, threads=1)
+    assert len(closed) == 1
 
 
 def test_returns_that_are_no_number_are_not_averaged(monkeypatch):

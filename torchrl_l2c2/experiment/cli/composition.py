@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from itertools import product
 from pathlib import Path
 from typing import Any
 
+from hydra import compose
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import (
@@ -21,6 +22,7 @@ from hydra.errors import (
     OverrideParseException,
 )
 from hydra.types import RunMode
+from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_l2c2.experiment.settings.config import COMMAND_SETTINGS, GROUPS, ExperimentConfig
@@ -89,8 +91,28 @@ def read(values: dict[str, Any]) -> tuple[ExperimentConfig, Path]:
         check_folders(chosen, values["outputs"])
     folder = chosen.sweep.subdir if multirun else chosen.run.dir
     if folder == ".":
-        return config, Path(values["outputs"]) / run_name(config)
+        name = run_name(config, values["preset"], preset_defaults(values, chosen.runtime.choices))
+        return config, Path(values["outputs"]) / name
     return config, Path(chosen.runtime.output_dir)
+
+
+def preset_defaults(
+    values: Mapping[str, Any], choices: Mapping[str, Any]
+) -> ExperimentConfig | None:
+    """Returns the settings of the preset without other overrides; ``None`` without a preset.
+
+    Args:
+        values (Mapping): Configuration composed by Hydra.
+        choices (Mapping): Chosen name by group.
+    """
+    if values["preset"] is None:
+        return None
+    names = ("task", "algorithm", "regularizer", "preset")
+    composed = compose("config", [f"{name}={choices[name]}" for name in names])
+    if choices["task"] == "gymnasium":
+        composed.task.env_id = values["task"]["env_id"]
+    plain: Any = OmegaConf.to_container(composed, resolve=True)
+    return ExperimentConfig.from_dict(plain)
 
 
 def check_preset(values: dict[str, Any], name: str | None) -> None:
@@ -127,7 +149,7 @@ def check_budget(config: ExperimentConfig, given: Sequence[str]) -> None:
     Raises:
         SettingError: If ``task.episodes`` would be ignored.
     """
-    episodes = any(each.startswith("task.episodes=") for each in given)
+    episodes = any(each.lstrip("+").startswith("task.episodes=") for each in given)
     if episodes and config.task.frames is not None:
         raise SettingError(
             "task.episodes",

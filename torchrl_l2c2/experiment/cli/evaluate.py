@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -84,16 +85,15 @@ def _play(chosen: argparse.Namespace, noise: float | None) -> Evaluation:
         policy, env, max_steps = load_policy(
             chosen.folder, seed=chosen.seed, noise_scale=noise, best=chosen.best
         )
-        result = evaluate_policy(
-            policy,
-            env,
-            chosen.episodes,
-            max_steps=max_steps,
-            sampled=chosen.sampled,
-            progress=True,
-        )
-    env.close()
-    return result
+        with closing(env):
+            return evaluate_policy(
+                policy,
+                env,
+                chosen.episodes,
+                max_steps=max_steps,
+                sampled=chosen.sampled,
+                progress=True,
+            )
 
 
 def _table(played: dict[float | None, Evaluation]) -> str:

@@ -132,7 +132,10 @@ class ActionRatePenalty(gymnasium.Wrapper[Any, Any, Any, Any]):
                 f"Expected bounded actions with task.action_rate={weight:g}, got {space}. Set "
                 "task.action_rate=0."
             )
-        self._weight, self._half_range = weight, (space.high - space.low) / 2
+        half_range = (space.high - space.low) / 2
+        # An action whose bounds are equal cannot change.
+        self._half_range = np.where(half_range > 0.0, half_range, np.inf)
+        self._weight = weight
         self._previous: Any = None
 
     def reset(self, **options: Any) -> Any:

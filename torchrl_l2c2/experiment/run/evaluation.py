@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import Any
@@ -199,11 +200,9 @@ def evaluate_task(
     Returns:
         Evaluation: Results of all episodes.
     """
-    with ProcessState(seed, threads):  # Seeding an environment also seeds the process.
-        env = make_env(task.for_test(), seed)
-        result = evaluate_policy(policy, env, episodes, max_steps=time_limit(task), **options)
-        env.close()
-    return result
+    # Seeding an environment also seeds the process.
+    with ProcessState(seed, threads), closing(make_env(task.for_test(), seed)) as env:
+        return evaluate_policy(policy, env, episodes, max_steps=time_limit(task), **options)
 
 
 def _return(episode: TensorDictBase) -> float:

@@ -22,16 +22,22 @@ from torchrl_l2c2.experiment.settings.tasks import TaskConfig
 MAX_PART_LENGTH = 64
 
 
-def run_name(config: ExperimentConfig) -> str:
+def run_name(
+    config: ExperimentConfig, preset: str | None = None, defaults: ExperimentConfig | None = None
+) -> str:
     """Returns the path of a run's folder below ``outputs``.
 
     Args:
         config (ExperimentConfig): The run's settings.
+        preset (str, optional): Name of the preset.
+        defaults (ExperimentConfig, optional): Settings of the preset, without which the settings
+            are compared with the defaults of each choice.
 
     Returns:
-        str: ``task/algorithm/regularizer/setting-value_setting-value/seed_0`` of letters, digits
-        and ``.+-_``. The fourth part is left out if every setting has its default. A part longer
-        than 64 characters is cut and ends with a hash; the regularizer's settings then come first.
+        str: ``task/algorithm/regularizer/preset_setting-value_setting-value/seed_0`` of letters,
+        digits and ``.+-_``. The fourth part is left out without a preset if every setting has its
+        default. A part longer than 64 characters is cut and ends with a hash; the regularizer's
+        settings then come first.
 
     Examples:
         >>> from torchrl_l2c2.experiment import ExperimentConfig, L2C2Config
@@ -39,19 +45,18 @@ def run_name(config: ExperimentConfig) -> str:
         'swingup/ppo_rpe/l2c2/sigma-2.0_beta-0.2/seed_3'
     """
     chosen = [getattr(config, group).name for group in ("task", "algorithm", "regularizer")]
-    parts = [*map(plain, chosen), *_settings_part(config), f"seed_{config.seed}"]
-    return str(PurePosixPath(*map(_short, parts)))
-
-
-def _settings_part(config: ExperimentConfig) -> list[str]:
-    changed = list(_changed_settings(config))
+    changed = list(_changed_settings(config, defaults))
     if sum(len(_written(*each[1:])) + 1 for each in changed) > MAX_PART_LENGTH + 1:
         # Comparisons vary the regularizer's settings most often: keep these.
         changed.sort(key=lambda each: each[0] != "regularizer")
-    return ["_".join(_written(*each[1:]) for each in changed)] if changed else []
+    settings = [*([plain(preset)] if preset else []), *(_written(*each[1:]) for each in changed)]
+    parts = [*map(plain, chosen), "_".join(settings), f"seed_{config.seed}"]
+    return str(PurePosixPath(*map(_short, parts)))
 
 
-def _changed_settings(config: ExperimentConfig) -> Iterator[tuple[str, str, Any]]:
+def _changed_settings(
+    config: ExperimentConfig, of_preset: ExperimentConfig | None
+) -> Iterator[tuple[str, str, Any]]:
     """Yields group, name and value of each setting that differs from the defaults."""
     default_names = {
         "replay": config.algorithm.default_replay,
@@ -62,13 +67,15 @@ def _changed_settings(config: ExperimentConfig) -> Iterator[tuple[str, str, Any]
         chosen = getattr(config, group)
         if chosen.name != default_names.get(group, chosen.name):
             yield group, group, chosen.name
-        defaults = _defaults_of_choice(group, chosen, config.algorithm.name)
+        defaults = getattr(of_preset, group, None)
+        if defaults is None or defaults.name != chosen.name:
+            defaults = _defaults_of_choice(group, chosen, config.algorithm.name)
         for name, value in vars(chosen).items():
             ignored = name == "name" or may_change(f"{group}.{name}")
             if not ignored and value != getattr(defaults, name):
                 unique = group == "regularizer" or names[name] == 1
                 yield group, name if unique else f"{group}.{name}", value
-    default, gain_of = ExperimentConfig(), getattr(config.regularizer, "gain_of", None)
+    default, gain_of = of_preset or ExperimentConfig(), getattr(config.regularizer, "gain_of", None)
     for name in sorted(vars(config).keys() - GROUPS.keys() - {"seed"}):
         if not may_change(name, gain_of) and getattr(config, name) != getattr(default, name):
             yield "", name, getattr(config, name)
