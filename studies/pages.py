@@ -204,6 +204,7 @@ TD3_TESTED = {
     "none": "baseline",
     "l2c2_ramp": "L2C2, `lambda_min=10`, ramp",
     "cats": "CATS, `lambda_temporal=3`",
+    "caps": "CAPS, `lambda_temporal=1`, `lambda_spatial=5`",
 }
 
 
