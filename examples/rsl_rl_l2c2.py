@@ -48,7 +48,7 @@ def test(policy: Callable[[Any], Tensor], env: NoisyPoints) -> tuple[float, floa
     plays, rewards = torch.ones(env.num_envs, dtype=torch.bool), torch.zeros(env.num_envs)
     actions, mask = [], []
     for _ in range(env.max_episode_length):
-        actions.append(policy(env.get_observations()).clamp(-1, 1))
+        actions.append(policy(env.get_observations()).clamp(env.low, env.high))
         mask.append(plays)
         _, reward, ended, _ = env.step(actions[-1])
         rewards, plays = rewards + reward * plays, plays & ~ended.bool()

@@ -18,6 +18,7 @@ class NoisyPoints(VecEnv):
     """
 
     num_actions, max_episode_length = 1, 100
+    low, high = -1.0, 1.0
     cfg: ClassVar[dict[str, Any]] = {}
 
     def __init__(self, num_envs: int) -> None:
@@ -31,7 +32,7 @@ class NoisyPoints(VecEnv):
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Tensor]]:
         position, velocity = self.motion.unbind(-1)
-        velocity = velocity + 0.1 * actions.squeeze(-1).clamp(-1, 1)
+        velocity = velocity + 0.1 * actions.squeeze(-1).clamp(self.low, self.high)
         position = position + 0.1 * velocity
         self.motion = torch.stack((position, velocity), -1)
         self.episode_length_buf += 1

@@ -12,7 +12,7 @@ import argparse
 import csv
 import subprocess
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import product
 from pathlib import Path
 
@@ -172,14 +172,14 @@ def evaluate(actor: torch.nn.Module) -> tuple[float, float]:
     return torch.stack(returns).mean().item(), torch.stack(variations).mean().item()
 
 
-def table(path: Path) -> str:
+def table(path: Path, algorithms: Iterable[str] = ALGORITHMS) -> str:
     """Means with 95% intervals over the seeds that both methods have, and probabilities."""
     with path.open(newline="") as file:
         found = {(r["algorithm"], r["method"], r["seed"]): r for r in csv.DictReader(file)}
     columns = ["algorithm (seeds)", "action variation: baseline", "with `smooth`", "P(smoother)"]
     columns += ["return: baseline", "with `smooth`", "P(returns more)"]
     rows = [columns, ["---"] * len(columns)]
-    for algorithm in ALGORITHMS:
+    for algorithm in algorithms:
         both = [
             seed
             for seed in map(str, SEEDS)
@@ -210,24 +210,42 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
     parser.add_argument("--strengths", nargs="+", type=float, default=[1.0])
     chosen = parser.parse_args(arguments)
+    methods = {"baseline": None}
+    methods |= {"smooth" if each == 1.0 else f"smooth {each:g}": each for each in chosen.strengths}
+    add_runs(
+        chosen.file,
+        product(chosen.seeds, chosen.algorithms, methods),
+        lambda seed, algorithm, method: evaluate(ALGORITHMS[algorithm](seed, methods[method])),
+    )
+
+
+def add_runs(
+    path: Path,
+    runs: Iterable[tuple[int, str, str]],
+    train: Callable[[int, str, str], tuple[float, float]],
+) -> None:
+    """Makes the runs that the file lacks, and adds a line after each.
+
+    Args:
+        path (Path): CSV file, which may not exist yet.
+        runs (iterable of tuple): Seed, algorithm and method of each run.
+        train (callable): Returns the return and the action variation of a run.
+    """
     torch.set_num_threads(1)
     describe = ["git", "rev-parse", "--short=12", "HEAD"]
     commit = subprocess.run(describe, capture_output=True, text=True, check=True).stdout.strip()
-    methods = {"baseline": None}
-    methods |= {"smooth" if each == 1.0 else f"smooth {each:g}": each for each in chosen.strengths}
-    path, done = chosen.file, set()
+    done = set()
     if path.exists():
         with path.open() as file:
             done = {(r["algorithm"], r["method"], r["seed"]) for r in csv.DictReader(file)}
     else:
         with path.open("w", newline="") as file:
             csv.writer(file).writerow(COLUMNS)
-    for seed, algorithm, method in product(chosen.seeds, chosen.algorithms, methods):
+    for seed, algorithm, method in runs:
         if (algorithm, method, str(seed)) in done:
             continue
         started = time.monotonic()
-        actor = ALGORITHMS[algorithm](seed, methods[method])
-        total, variation = evaluate(actor)
+        total, variation = train(seed, algorithm, method)
         seconds = round(time.monotonic() - started)
         row = [algorithm, method, seed, f"{total:.3f}", f"{variation:.5f}", seconds, commit]
         with path.open("a", newline="") as file:

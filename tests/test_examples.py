@@ -18,6 +18,7 @@ ELSEWHERE = (
     "brax_ant",
     "mjlab_cartpole",
     "onnx_policy",
+    "rsl_rl_gymnasium",
     "rsl_rl_l2c2",
     "rsl_rl_points",
     "several_devices",

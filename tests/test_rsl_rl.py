@@ -12,6 +12,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import gymnasium
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -680,6 +682,50 @@ def test_the_example_trains_and_compares(
         assert difference[column] == pytest.approx(regularized[column] - plain[column], abs=2e-3)
     for script in (EXAMPLE, EXAMPLE.with_stem("rsl_rl_points")):
         assert len(script.read_text().splitlines()) < 80
+
+
+def test_gymnasium_for_rsl_rl_is_what_gymnasium_plays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Clipped actions, the first observation after an end, and ends by the time limit apart."""
+    monkeypatch.syspath_prepend(EXAMPLE.parent)
+    from rsl_rl_gymnasium import GymnasiumEnv
+
+    env, actions = GymnasiumEnv("Hopper-v5", 2, seed=3), 5.0 * torch.randn(60, 2, 3)
+    alone = [gymnasium.make("Hopper-v5") for _ in range(2)]
+    seen = [each.reset(seed=3 + i)[0] for i, each in enumerate(alone)]
+    ended, lengths = 0, [0, 0]
+    for each in actions:
+        torch.testing.assert_close(
+            env.get_observations()["policy"], torch.tensor(np.stack(seen)).float()
+        )
+        _, rewards, dones, extras = env.step(each)
+        for i, task in enumerate(alone):
+            seen[i], reward, terminated, _, _ = task.step(each[i].clamp(-1, 1).numpy())
+            assert rewards[i].item() == pytest.approx(reward)
+            assert dones[i] == terminated and not extras["time_outs"][i]
+            ended, lengths[i] = ended + terminated, 0 if terminated else lengths[i] + 1
+            if terminated:
+                seen[i] = task.reset()[0]
+        assert env.episode_length_buf.tolist() == lengths
+    assert ended > 0
+    late = GymnasiumEnv("Pendulum-v1", 2, seed=0)
+    for step in range(200):
+        _, _, dones, extras = late.step(torch.zeros(2, 1))
+        assert (dones == (step == 199)).all() and (extras["time_outs"] == dones).all()
+
+
+def test_the_gymnasium_example_trains(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """For an iteration, on any task."""
+    script = EXAMPLE.with_stem("rsl_rl_gymnasium")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(EXAMPLE.parent)
+    monkeypatch.setattr(sys, "argv", [str(script), "Pendulum-v1", "1"])
+    with torch.random.fork_rng():
+        runpy.run_path(str(script), run_name="__main__")
+    printed = capsys.readouterr().out
+    assert re.search(r"^Pendulum-v1 with L2C2: return -\d+.\d, action variation 0", printed, re.M)
+    assert len(script.read_text().splitlines()) < 80
 
 
 def trained_runner(folder: Path, algorithm: dict[str, Any], **runner: Any) -> Any:

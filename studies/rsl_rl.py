@@ -1,0 +1,38 @@
+"""Trains rsl_rl's PPO on a MuJoCo task, with and without L2C2.
+
+``python -m studies.rsl_rl FILE.csv`` adds a line to the file after each run; runs that the file has
+are skipped.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from collections.abc import Sequence
+from itertools import product
+from pathlib import Path
+
+from studies.front_door import METHODS, add_runs
+
+TASK = "HalfCheetah-v5"
+SEEDS = range(5)
+ITERATIONS = 489  # 1,001,472 frames
+CLASSES = dict(zip(METHODS, ("PPO", "torchrl_l2c2.rsl_rl:L2C2PPO"), strict=True))
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Makes the runs that the file lacks."""
+    (file,) = sys.argv[1:] if arguments is None else arguments
+    sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
+    from rsl_rl_gymnasium import train
+
+    def silent(seed: int, task: str, method: str) -> tuple[float, float]:
+        with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
+            return train(CLASSES[method], task, seed, ITERATIONS)
+
+    add_runs(Path(file), product(SEEDS, [TASK], METHODS), silent)
+
+
+if __name__ == "__main__":
+    main()
