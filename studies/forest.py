@@ -6,14 +6,13 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from studies.field import TEST
 from studies.pages import ROOT, SUMMARIZED, fill, headline_groups
-from torchrl_l2c2.experiment.analysis.reports.figures import subplots
+from torchrl_l2c2.experiment.analysis.reports.figures import save, subplots
 from torchrl_l2c2.experiment.analysis.reports.groups import Group
 from torchrl_l2c2.experiment.analysis.reports.table import Estimate, improvement
 from torchrl_l2c2.experiment.run.files import write_atomically
@@ -67,9 +66,7 @@ def table(shown: Sequence[Row]) -> str:
 
 
 def draw(shown: Sequence[Row], path: Path) -> None:
-    """Draws the plot, with letters as outlines, which look the same everywhere."""
-    from matplotlib import rc_context
-
+    """Draws the plot."""
     figure, axes = subplots(len(PANELS), 1, (9.5, 0.42 * len(shown) + 1.5))
     figure.set_facecolor("white")
     figure.suptitle("Probability that a run with L2C2 is better than a run of the baseline")
@@ -79,12 +76,7 @@ def draw(shown: Sequence[Row], path: Path) -> None:
         axis.set_yticks(heights, [row.label for row in shown] if number == 0 else [])
         for height, row in zip(heights, shown, strict=True):
             _draw_row(axis, height, row.better[number], overall=row is shown[-1])
-    content = io.BytesIO()
-    # Without these an SVG file has the date and random names in it.
-    metadata = {"Date": None, "Creator": None, "Description": table(shown)}
-    with rc_context({"svg.hashsalt": "torchrl_l2c2", "svg.fonttype": "path"}):
-        figure.savefig(content, format="svg", metadata=metadata)
-    write_atomically(path, content.getvalue())
+    save(figure, path, table(shown))
 
 
 def main() -> None:

@@ -46,6 +46,8 @@ FIELD_PAGES = ("field", "hopper", "sac_lunarlander", "sac_pendulum", "walker2d")
 # PPO's one setting of L2C2, and the methods that one page compares it with.
 OURS = "L2C2, mse 1, ramp"
 RIVALS = ("baseline", "CAPS", "CAPS, lambda_spatial=0.005", "CATS")
+# Methods of the pictures, each with more than two runs: more than six cannot be told apart.
+PICTURED = (*RIVALS, OURS, "L2C2, the paper's", "L2C2, means 10", "L2C2, means 10, ramp")
 TARGETS = ("targets", "runs", "sac_pendulum", "field", "walker2d", "hopper")
 HEADLINE = """\
 | | seeds | measure | baseline | with L2C2 | change | P(smoother) | return: baseline | with L2C2 | P(returns more) |
@@ -291,12 +293,15 @@ def _paper_page(runs: pd.DataFrame) -> Page:
 def _field_page(name: str, shown: pd.DataFrame) -> Page:
     first = [against_table(shown, OURS)] if name in ("hopper", "one_setting") else []
     tables = [field_table(shown), choice_table(shown), *pairwise_tables(shown)]
+    groups = [g for g in field_groups(shown) if g.name in PICTURED and len(g.runs) > 2]
+    picture = f"![Return against Sm of the main settings, and the published results]({name}.svg)"
     texts = [
         *(table.markdown() for table in first),
-        f"![Return against Sm of every method, and the published results]({name}.svg)",
+        *([picture] if groups else []),
         *(table.markdown() for table in tables),
     ]
-    groups = field_groups(shown)
+    if not groups:
+        return Page({"results": "\n\n".join(texts)})
     more = partial(draw_published, field.point, "hollow: published")
     about = description(groups)
     draw = partial(draw_plane, groups, TEST, measure="sm_asap", more=more, description=about)

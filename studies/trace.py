@@ -7,15 +7,13 @@ picture of the README.
 from __future__ import annotations
 
 import argparse
-import io
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from torchrl_l2c2.experiment.analysis.reports.figures import subplots
+from torchrl_l2c2.experiment.analysis.reports.figures import save, subplots
 from torchrl_l2c2.experiment.collect.episodes import play_episodes
-from torchrl_l2c2.experiment.run.files import write_atomically
 from torchrl_l2c2.experiment.run.policies import load_policy, seed_of_test
 from torchrl_l2c2.experiment.run.process import ProcessState
 
@@ -42,8 +40,6 @@ def draw(actions: Sequence[np.ndarray], names: Sequence[str], path: str | Path) 
         names (sequence of str): Titles of the rows.
         path (str or Path): SVG file.
     """
-    from matplotlib import rc_context
-
     figure, axes = subplots(1, len(actions), (9.0, 1.6 * len(actions)))
     figure.set_facecolor("white")
     for axis, each, name, color in zip(axes, actions, names, COLORS, strict=True):
@@ -54,10 +50,7 @@ def draw(actions: Sequence[np.ndarray], names: Sequence[str], path: str | Path) 
         axis.set_title(f"{name}: mean change per step {change:.2f}", loc="left", fontsize=11)
         axis.grid(alpha=0.25)
     axes[-1].set_xlabel("step")
-    content = io.BytesIO()
-    with rc_context({"svg.hashsalt": "torchrl_l2c2", "svg.fonttype": "path"}):
-        figure.savefig(content, format="svg", metadata={"Date": None, "Creator": None})
-    write_atomically(path, content.getvalue())
+    save(figure, path)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

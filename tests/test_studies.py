@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from studies import forest, pages, trace
+from studies import forest, pages, strength, trace
 from studies.cells import improvements_over_tasks, over_tasks
 from studies.field import BETTER, field_groups, field_table
 from studies.methods import against_table, choice_table, pairwise_tables
@@ -43,6 +43,7 @@ from torchrl_l2c2.experiment import (
     Experiment,
     ExperimentConfig,
     L2C2Config,
+    NoRegularizerConfig,
     PPOConfig,
     PPORPEConfig,
     SACConfig,
@@ -57,6 +58,7 @@ from torchrl_l2c2.experiment.analysis.reports import (
 from torchrl_l2c2.experiment.analysis.reports.records import merge
 from torchrl_l2c2.experiment.analysis.reports.table import improvement
 from torchrl_l2c2.experiment.settings.optimizers import AdamConfig
+from torchrl_l2c2.experiment.settings.regularizers import REGULARIZERS
 from torchrl_l2c2.experiment.settings.tasks import TASKS
 
 
@@ -710,6 +712,38 @@ class TestForest:
         assert [line for line in lines if line.startswith(tuple(starts))] == [
             next(line for line in lines if line.startswith(start)) for start in starts
         ]
+
+
+class TestStrength:
+    @pytest.fixture
+    def shown(self, tmp_path):
+        """Two seeds of the baseline and of two strengths; the third run is for choosing."""
+        l2c2 = REGULARIZERS["l2c2"]
+        sides = {
+            "none": (NoRegularizerConfig(), 0.4),
+            "weak": (replace(l2c2, strength=0.1), 0.3),
+            "one": (l2c2, 0.2),
+        }
+        for name, (regularizer, variation) in sides.items():
+            for seed in (0, 1, 100):
+                config = make_config(regularizer=regularizer, seed=seed)
+                make_run(tmp_path / name / str(seed), config, float(seed), variation)
+        return strength.curves(records_of(read_runs(tmp_path)))
+
+    def test_rows_by_hand(self, shown):
+        """Of the last policy with mean actions: 20 more, and 0.020."""
+        (curve,) = shown
+        assert list(curve.groups) == [0.0, 0.1, 1.0]
+        assert curve.means("action_variation") == pytest.approx([0.42, 0.32, 0.22])
+        assert [line.split(" | ")[:4] for line in strength.table(shown).splitlines()[2:]] == [
+            ["| swingup, ppo_rpe", name, "0, 1", "20.50"] for name in ("0 (baseline)", "0.1", "1")
+        ]
+
+    def test_the_picture_has_its_numbers(self, shown, tmp_path):
+        """And no letter that needs a font."""
+        strength.draw(shown, tmp_path / "a.svg")
+        text = (tmp_path / "a.svg").read_text()
+        assert strength.table(shown) in text and "<text" not in text
 
 
 class TestTrace:

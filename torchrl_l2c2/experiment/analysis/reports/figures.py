@@ -218,13 +218,16 @@ def save(figure: Any, path: str | Path, description: str | None = None) -> None:
 
 
 def drawn(figure: Any, kind: str = "svg", description: str | None = None) -> bytes:
-    """Returns a picture as the content of a file; the same picture gives the same bytes."""
+    """Returns a picture as the content of a file; the same picture gives the same bytes.
+
+    Letters in SVG files are outlines, which look the same without the font.
+    """
     from matplotlib import rc_context
 
     content = io.BytesIO()
     # Without these an SVG file contains the date and random names.
     dated = ("Date", "Creator") if kind == "svg" else ("Software",)
     metadata = {**dict.fromkeys(dated), "Description": description}
-    with rc_context({"svg.hashsalt": "torchrl_l2c2", "svg.fonttype": "none"}):
+    with rc_context({"svg.hashsalt": "torchrl_l2c2", "svg.fonttype": "path"}):
         figure.savefig(content, dpi=110, format=kind, metadata=metadata)
     return content.getvalue()

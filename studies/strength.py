@@ -1,0 +1,112 @@
+"""Picture and table of the strength against the action variation and the return.
+
+``python -m studies.strength`` reads ``results/strength.csv``. It writes ``results/strength.svg``
+and the table of ``results/strength.md``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from studies.cells import number_range
+from studies.field import TEST
+from studies.pages import ROOT, fill, records
+from torchrl_l2c2.experiment.analysis.reports.figures import save, subplots
+from torchrl_l2c2.experiment.analysis.reports.groups import Group, group_records
+from torchrl_l2c2.experiment.analysis.reports.table import COMPARED, number
+from torchrl_l2c2.experiment.run.files import write_atomically
+
+PAGE = ROOT / "results" / "strength.md"
+PICTURE = ROOT / "results" / "strength.svg"
+MEASURES = ("action_variation", "return")
+SEEDS = 3  # Seeds from 100 on choose a preset.
+SETTING = "regularizer.strength"
+
+
+class Curve(NamedTuple):
+    """The runs of a task, from the baseline to the largest strength.
+
+    Attributes:
+        label: Task and algorithm.
+        groups: Groups by strength; 0 is the baseline.
+    """
+
+    label: str
+    groups: dict[float, Group]
+
+    def means(self, measure: str) -> list[float]:
+        """The mean over seeds for each strength."""
+        return [float(group.scores(TEST, measure).mean()) for group in self.groups.values()]
+
+
+def curves(found: pd.DataFrame) -> list[Curve]:
+    """A curve for each task and algorithm, on the first seeds."""
+    by_task: dict[str, dict[float, Group]] = {}
+    for group in group_records(found[found["seed"] < SEEDS]):
+        first = group.first
+        strength = 0.0 if first.method == "none" else float(group.settings.get(SETTING, 1.0))
+        by_task.setdefault(f"{first.task}, {first.algorithm}", {})[strength] = group
+    return [Curve(label, dict(sorted(groups.items()))) for label, groups in by_task.items()]
+
+
+def table(shown: Sequence[Curve]) -> str:
+    """A row for each task and strength: the means over seeds."""
+    columns = ["task", "strength", "seeds", *(COMPARED[name][0] for name in COMPARED)]
+    lines = [columns, ["---"] * len(columns)]
+    for curve in shown:
+        for strength, group in curve.groups.items():
+            cells = [curve.label, f"{strength:g}" if strength else "0 (baseline)"]
+            cells.append(number_range(group.seeds))
+            for name in COMPARED:
+                cells.append(number(float(group.scores(TEST, name).mean()), name))
+            lines.append(cells)
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
+def draw(shown: Sequence[Curve], path: Path) -> None:
+    """Draws a row of two panels for each task."""
+    size = (4.2 * len(MEASURES), 2.5 * len(shown) + 0.6)
+    figure, axes = subplots(len(MEASURES), len(shown), size)
+    figure.set_facecolor("white")
+    for row, curve in enumerate(shown):
+        for column, measure in enumerate(MEASURES):
+            axis = axes[row * len(MEASURES) + column]
+            _draw_panel(axis, curve, measure)
+            axis.set_title(curve.label, fontsize=10)
+            axis.set_ylabel(COMPARED[measure][0])
+            if row == len(shown) - 1:
+                axis.set_xlabel("strength (0: baseline)")
+    save(figure, path, table(shown))
+
+
+def _draw_panel(axis: Any, curve: Curve, measure: str) -> None:
+    places = np.arange(len(curve.groups))
+    for place, group in zip(places, curve.groups.values(), strict=True):
+        values = group.scores(TEST, measure).ravel()
+        axis.plot([place] * len(values), values, "o", color="#1f6fb4", alpha=0.35, markersize=5)
+    means = curve.means(measure)
+    axis.axhline(means[0], color="#777777", linewidth=1, linestyle="--")
+    axis.plot(places, means, color="#1f6fb4", linewidth=2)
+    axis.set_xticks(places, [f"{strength:g}" for strength in curve.groups])
+    axis.grid(axis="y", alpha=0.25)
+    if measure == "action_variation":
+        axis.set_ylim(bottom=0.0)
+    for side in ("top", "right"):
+        axis.spines[side].set_visible(False)
+
+
+def main() -> None:
+    """Writes the picture and the table."""
+    shown = curves(records("strength"))
+    write_atomically(PAGE, fill(PAGE.read_text(), "strength", table(shown)).encode())
+    draw(shown, PICTURE)
+    print(table(shown))
+
+
+if __name__ == "__main__":
+    main()
