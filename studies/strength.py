@@ -1,7 +1,7 @@
 """Picture and table of the strength against the action variation and the return.
 
-``python -m studies.strength`` reads ``strength.csv`` in ``results/``. It writes ``strength.svg``, and
-the table of ``results/strength.md``.
+``python -m studies.strength`` reads ``strength.csv`` in ``results/``. It writes ``strength.svg``,
+and the table of ``results/strength.md``.
 """
 
 from __future__ import annotations
