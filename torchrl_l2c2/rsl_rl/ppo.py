@@ -95,7 +95,8 @@ class RegularizedPPO(PPO):
         if not self.gpu_global_rank:
             settings = {"method": method, **chosen.settings, "strength": strength}
             hint = ramp_updates is None and chosen.ramp is not None
-            print(_told(type(self).__name__, settings, ramp_updates, hint, bool(regularizer_cfg)))
+            name, given = type(self).__name__, bool(regularizer_cfg)
+            print(_settings_line(name, settings, ramp_updates, hint, given))
 
     @staticmethod
     def construct_algorithm(obs: TensorDict, env: VecEnv, cfg: dict[str, Any], device: str) -> PPO:
@@ -166,8 +167,8 @@ def _check_groups(names: Iterable[str], taken: Iterable[NestedKey]) -> None:
     first = {key if isinstance(key, str) else key[0] for key in taken}
     if clash := sorted(first.intersection(names)):
         raise ValueError(
-            f"the observation groups {clash} have names that batches need for something else: "
-            "have the environment give them others."
+            f"Expected observation groups with names that batches do not use, got {clash}. Rename "
+            "these groups in the environment."
         )
 
 
@@ -175,15 +176,15 @@ def _check_final(final: Any, obs: TensorDict) -> None:
     groups = list(obs.keys())
     if missing := [group for group in groups if group not in final.keys()]:
         raise KeyError(
-            f"extras[{FINAL!r}] lacks the groups {missing}: let the environment give all that it "
-            f"observes, {groups}, or leave {FINAL!r} out."
+            f"Expected all observation groups in extras[{FINAL!r}], {groups}, got none of "
+            f"{missing}. Add these groups in the environment, or leave {FINAL!r} out."
         )
     for group in groups:
         if final[group].shape != obs[group].shape:
             raise ValueError(
-                f"extras[{FINAL!r}] must have the shapes of the observations, all environments' "
-                f"rows among them: {group!r} has {tuple(final[group].shape)}, where they have "
-                f"{tuple(obs[group].shape)}."
+                f"Expected extras[{FINAL!r}][{group!r}] with the shape of the observations, "
+                f"{tuple(obs[group].shape)}, got {tuple(final[group].shape)}. Include the rows of "
+                "all environments."
             )
 
 
@@ -292,7 +293,7 @@ def _check_options(method: str, options: Iterable[str]) -> None:
         )
 
 
-def _told(
+def _settings_line(
     name: str, settings: Mapping[str, Any], ramp_updates: int | None, hint: bool, given: bool
 ) -> str:
     """The line with the settings in use."""

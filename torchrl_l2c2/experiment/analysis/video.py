@@ -116,7 +116,7 @@ class PlayedPictures(NamedTuple):
     Attributes:
         episode: transitions ``[T]``.
         pictures: pictures ``[H, W, 3]``, from the reset on.
-        rate: actions per second of simulated time; ``None`` if the simulator does not tell it.
+        rate: actions per second of simulated time; ``None`` if the simulator does not have it.
         every: steps from one picture to the next.
     """
 
@@ -184,14 +184,14 @@ def write_video(path: Path, pictures: Sequence[Picture], rate: float) -> None:
 
 @contextlib.contextmanager
 def _without_a_screen() -> Iterator[None]:
-    """MuJoCo and SDL look for a screen unless told otherwise."""
+    """Lets MuJoCo and SDL render without a screen if there is none."""
     known = {"MUJOCO_GL": "egl", "SDL_VIDEODRIVER": "dummy"}
-    told = (
+    added = (
         {} if "DISPLAY" in os.environ else {k: v for k, v in known.items() if k not in os.environ}
     )
-    os.environ.update(told)
+    os.environ.update(added)
     try:
         yield
     finally:
-        for name in told:
+        for name in added:
             del os.environ[name]

@@ -1,4 +1,4 @@
-"""Folders of runs below a path, and names that tell the runs apart."""
+"""Folders of runs below a path, and different names for them."""
 
 from __future__ import annotations
 

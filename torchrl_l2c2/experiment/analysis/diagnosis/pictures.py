@@ -211,8 +211,8 @@ def _shares(axes: Sequence[Any], one: Diagnosis) -> None:
         axis.barh(names, values, height, align="edge", label=label, color=color)
         for place, value in enumerate(values):
             if not math.isnan(value):
-                told = f" {_percent(value)}"
-                axis.annotate(told, (value, place + height / 2), va="center", fontsize=8)
+                text = f" {_percent(value)}"
+                axis.annotate(text, (value, place + height / 2), va="center", fontsize=8)
     axis.margins(x=0.2)
     axis.set_xlabel("share")
     axis.legend(frameon=False, fontsize=8, loc="best")

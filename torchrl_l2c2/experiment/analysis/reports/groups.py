@@ -144,8 +144,8 @@ def _named(groups: list[Group]) -> list[Group]:
     """Groups of one task and algorithm, each named by its differences from the others."""
     methods = [name_with_settings(group.first.method, group.settings) for group in groups]
     differing = [
-        {key: value for key, value in _differing(group, groups).items() if key not in told}
-        for group, (_, told) in zip(groups, methods, strict=True)
+        {key: value for key, value in _differing(group, groups).items() if key not in contained}
+        for group, (_, contained) in zip(groups, methods, strict=True)
     ]
     keys = {key for values in differing for key in values}
     endings = Counter(key.rpartition(".")[2] for key in keys)
