@@ -573,8 +573,8 @@ class TestProse:
         more, smoother = map(by_methods, pairwise_tables(one_setting()))
         weak = "CAPS, lambda_spatial=0.005"
         page = (ROOT / "results" / "one_setting.md").read_text()
-        said = " ".join(page.partition("a run with L2C2 has a smaller Sm")[2].split())
-        start = said.partition(". ")[0]
+        said = " ".join(page.partition("<!-- results: end -->")[2].split())
+        start = said.partition(" * ")[0]
         for table in (more, smoother):
             assert table[OURS]["CATS"] in start and table[OURS]["CAPS"] in start
         assert smoother[OURS][weak] in said and more[weak][OURS] in said
@@ -606,7 +606,7 @@ class TestProse:
                 assert f"| {task} | {group.name} | {row}" in page
             for quantity in ("return", "sm_asap"):
                 better = improvement([ours], [cats], "last_mean", quantity).text("{:.2f}".format)
-                assert better.replace("0.", ".") in page
+                assert better in page
 
     @pytest.mark.parametrize(
         "name", ["field", "walker2d", "hopper", "sac_pendulum", "sac_pendulum_100000"]
