@@ -59,7 +59,7 @@ def main(arguments: list[str] | None = None) -> None:
 
     from benchmarks.run_rows import work
     from benchmarks.setups import QUICK, Effort
-    from benchmarks.timing import machine, to_markdown, to_text
+    from benchmarks.timing import fill_page, machine, to_markdown, to_text
     from torchrl_l2c2.experiment.run.process import keep_freed_memory
 
     for chatty in ("torchrl", "torch"):
@@ -92,7 +92,8 @@ def main(arguments: list[str] | None = None) -> None:
     if options.markdown:
         given = sys.argv[1:] if arguments is None else arguments
         command = " ".join(("python -m benchmarks.speed", *given))
-        options.markdown.write_text(to_markdown(rows, where, command))
+        page = options.markdown.read_text() if options.markdown.exists() else ""
+        options.markdown.write_text(fill_page(page, to_markdown(rows, where, command)))
 
 
 if __name__ == "__main__":

@@ -131,12 +131,8 @@ def machine() -> dict[str, Any]:
 
 
 def to_markdown(rows: list[Row], where: Mapping[str, Any], command: str) -> str:
-    """The table with its command, its commit and the machine, for ``results/``."""
+    """The table with its commit, its machine and its command, for a page in ``results/``."""
     lines = [
-        "# Speed",
-        "",
-        f"`{command}`, commit {where['commit']}",
-        "",
         "| row | value | limit | met | from |",
         "| --- | --- | --- | --- | --- |",
         *(
@@ -144,12 +140,24 @@ def to_markdown(rows: list[Row], where: Mapping[str, Any], command: str) -> str:
             for row in rows
         ),
         "",
-        f"{where['cpu']}, {where['cores']} cores, load {where['load']:.1f} at the start; "
+        f"Commit {where['commit']}: {where['cpu']}, {where['cores']} cores, load "
+        f"{where['load']:.1f} at the start; "
         f"{where['threads']} thread; "
         + ", ".join(f"{name} {found}" for name, found in where["versions"].items())
         + f", Python {where['python']}.",
+        "",
+        *("```bash", command, "```"),
     ]
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines)
+
+
+def fill_page(page: str, table: str) -> str:
+    """The page with a table between its marks; the table itself if the page has none."""
+    start, end = "<!-- speed: start -->", "<!-- speed: end -->"
+    before, marked, rest = page.partition(start)
+    if not marked:
+        return table + "\n"
+    return f"{before}{start}\n{table}\n{end}{rest.partition(end)[2]}"
 
 
 def to_text(row: Row) -> str:

@@ -47,7 +47,7 @@ FIELD_PAGES = ("field", "hopper", "sac_lunarlander", "sac_pendulum", "walker2d")
 OURS = "L2C2, mse 1, ramp"
 RIVALS = ("baseline", "CAPS", "CAPS, lambda_spatial=0.005", "CATS")
 # Methods of the pictures, each with more than two runs: more than six cannot be told apart.
-PICTURED = (*RIVALS, OURS, "L2C2, the paper's", "L2C2, means 10", "L2C2, means 10, ramp")
+PICTURED = (*RIVALS, OURS, "L2C2 as in the paper", "L2C2, means 10", "L2C2, means 10, ramp")
 TARGETS = ("targets", "runs", "sac_pendulum", "field", "walker2d", "hopper")
 HEADLINE = """\
 | | seeds | measure | baseline | with L2C2 | change | P(smoother) | return: baseline | with L2C2 | P(returns more) |
@@ -82,7 +82,7 @@ PARTS = {
     ),
     f"{OURS}, beta=0": "with neighbors in the box",
     f"{OURS}, neighbors=line": "with the value term",
-    "L2C2, the paper's": "the paper's L2C2",
+    "L2C2 as in the paper": "the paper's L2C2",
     "L2C2, Hellinger 1": "the paper's, at a hundred times its gain",
 }
 

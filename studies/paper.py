@@ -134,7 +134,7 @@ def paper_table(groups: Sequence[Group]) -> Table:
     """Late and last policies of each group with sampled actions, next to the paper's results."""
     columns = ["task", "method", "seeds"]
     for quantity, better in BETTER.items():
-        columns += [QUANTITIES[quantity], "the paper's", "last policy", better]
+        columns += [QUANTITIES[quantity], "in the paper", "last policy", better]
     rows = []
     for group in groups:
         cells = [group.first.task, group.name, number_range(group.seeds)]
@@ -221,7 +221,7 @@ def faster_targets_table(records: pd.DataFrame) -> Table:
                 improvement_cell([group], without[:1] or [None], FIRST, "return"),
             ]
         )
-    columns = ["task", "method", "seeds", "return", "last policy", "the paper's"]
+    columns = ["task", "method", "seeds", "return", "last policy", "in the paper"]
     columns += ["P(returns more than beta=0)"]
     return Table("Faster target networks", columns, rows, [FASTER_LEGEND])
 

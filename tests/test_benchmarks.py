@@ -13,7 +13,7 @@ import torch
 from benchmarks import cost
 from benchmarks import gpu as benchmarks_gpu
 from benchmarks.setups import matrix_products
-from benchmarks.timing import Row, alternate, to_markdown
+from benchmarks.timing import Row, alternate, fill_page, to_markdown
 from benchmarks.zoo import arguments
 from studies import cost as studies_cost
 from studies import gpu
@@ -111,8 +111,20 @@ def test_a_row_meets_its_limit_or_not(row, met):
 
 def test_a_table_has_its_command_and_its_commit():
     """So that it can be made again, and with the same code."""
-    head = to_markdown([], WHERE, "python -m benchmarks.speed").splitlines()[2]
-    assert head == "`python -m benchmarks.speed`, commit abc1234"
+    *_, where, _, fence, command, _ = to_markdown([], WHERE, "python -m benchmarks.speed").split(
+        "\n"
+    )
+    assert where.startswith("Commit abc1234: ") and (fence, command) == (
+        "```bash",
+        "python -m benchmarks.speed",
+    )
+
+
+def test_a_table_replaces_the_one_between_the_marks():
+    """The texts of the page stay."""
+    page = "# Speed\n<!-- speed: start -->\nold\n<!-- speed: end -->\nLimits.\n"
+    assert fill_page(page, "new") == page.replace("old", "new")
+    assert fill_page("", "new") == "new\n"
 
 
 def test_a_preset_goes_to_stable_baselines_as_the_zoo_has_it():

@@ -12,7 +12,7 @@ METHODS = {
     "none": ("baseline", "#777777"),
     "caps": ("CAPS", "#d95f02"),
     "l2c2": ("L2C2", "#1b6ca8"),
-    "l2c2_paper": ("L2C2, the paper's", "#6fa8dc"),
+    "l2c2_paper": ("L2C2 as in the paper", "#6fa8dc"),
     "l2c2_policy": ("L2C2, beta=0", "#7570b3"),
     "l2c2_mean": ("L2C2, means", "#2a9d8f"),
     "l2c2_ramp": ("L2C2, means, ramp", "#0b3d66"),
