@@ -513,7 +513,7 @@ class TestPages:
         monkeypatch.setattr(pages, "ROOT", tmp_path)
         page, picture = tmp_path / "page.md", tmp_path / "page.svg"
         page.write_text("before\n  <!-- a: start -->\n  old\n  <!-- a: end -->\nafter\n")
-        shown = field_groups(records("walker2d"))
+        shown = field_groups(records("sac_pendulum"))
         made = {"page.md": pages.Page({"a": "  new"}, shown, lambda path: path.write_text("drawn"))}
         monkeypatch.setattr(pages, "pages", lambda: made)
         pages.main()
@@ -521,7 +521,8 @@ class TestPages:
         assert page.read_text() == (
             "before\n  <!-- a: start -->\n  new\n  <!-- a: end -->\nafter\n"
         )
-        picture.write_bytes((pages.Path(__file__).parents[1] / "results/walker2d.svg").read_bytes())
+        drawn = pages.Path(__file__).parents[1] / "results" / "sac_pendulum.svg"
+        picture.write_bytes(drawn.read_bytes())
         pages.main()
         assert capsys.readouterr().out == ""
 
