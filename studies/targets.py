@@ -47,7 +47,7 @@ def gain_targets_table(records: pd.DataFrame) -> Table:
 
 def _asked(group: Group) -> float | None:
     own = group.settings
-    if own.get("regularizer.gain") != "target" or "regularizer.gain_of" in own:
+    if own.get("regularizer.gain") != "target":
         return None
     return float(own["regularizer.gain_target"])
 

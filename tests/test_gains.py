@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import re
 import statistics
 import warnings
 from copy import deepcopy
@@ -32,7 +31,6 @@ from torchrl_l2c2.experiment import (
     PPORPEConfig,
     RolloutReplayConfig,
     TaskConfig,
-    TD3Config,
     UniformReplayConfig,
 )
 from torchrl_l2c2.experiment.settings.fields import SettingError
@@ -153,7 +151,7 @@ TASK = TaskConfig("pendulum", "Pendulum-v1", episodes=6, max_steps=40)
 FEW_UPDATES = dataclasses.replace(ALGORITHMS["ppo_rpe"], replay_ratio=1.0)
 KINDS = {
     "ramp": {"gain": "ramp"},
-    "target": {"gain": "target", "gain_target": 0.05, "gain_of": "l2c2_hellinger"},
+    "target": {"gain": "target", "gain_target": 0.05},
 }
 
 
@@ -350,40 +348,6 @@ class TestRollouts:
 
 class TestRefusals:
     @pytest.mark.parametrize(
-        ("column", "settings"),
-        [
-            ("jerk", {}),
-            ("test_return", {"late_share": 0.0}),
-            ("policy_scale", {"algorithm": TD3Config(hidden=(8,), random_frames=10)}),
-        ],
-    )
-    def test_a_column_without_numbers_is_refused(self, column, settings):
-        """Before anything is played, with those that have some."""
-        regularizer = L2C2Config(gain="target", gain_target=1.0, gain_of=column)
-        told = rf"gain_of must be one of .*'action_variation'.*got '{column}' \(test_\* need late"
-        with pytest.raises(SettingError, match=told):
-            Experiment(small(regularizer, **settings))
-
-    def test_every_column_that_may_be_followed_is_there(self):
-        """Those of a refusal are logged, with numbers from the first update on."""
-        with pytest.raises(SettingError) as refused:
-            Experiment(small(L2C2Config(gain="target", gain_target=1.0, gain_of="jerk")))
-        named = set(re.findall(r"'(\w+)'", str(refused.value))) - {"jerk"}
-        row = Experiment(small(late_share=1.0)).train(1)[0]
-        assert {"return", "test_return", "loss_l2c2_actor", "policy_scale"} <= named
-        assert all(math.isfinite(row[name]) for name in named)
-
-    @pytest.mark.parametrize("column", ["test_return", "return"])
-    def test_a_column_that_has_no_fitting_number_yet_is_told_once(self, column):
-        """NaN before the policies are late, and returns below 0."""
-        run = Experiment(small(L2C2Config(gain="target", gain_target=1.0, gain_of=column)))
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            run.train(3)
-        told = [str(w.message) for w in caught if f"gain_of={column} is" in str(w.message)]
-        assert len(told) == 1 and "Choose a nonnegative metric" in told[0]
-
-    @pytest.mark.parametrize(
         ("settings", "message"),
         [
             ({"gain": "target"}, "gain_target must be given with gain=target, got null"),
@@ -394,10 +358,6 @@ class TestRefusals:
             ({"gain_length": 0.5}, "gain_length works only with gain=ramp, got 0.5 .* at 1.0"),
             ({"gain": "ramp", "gain_rate": 0.5}, "gain_rate works only with gain=target"),
             ({"gain_limit": 10.0}, "gain_limit works only with gain=target"),
-            (
-                {"gain": "ramp", "gain_of": "return"},
-                "gain_of works only with gain=target, got return with gain=ramp",
-            ),
             ({"gain": "pid"}, "gain must be 'constant', 'ramp' or 'target'"),
         ],
     )

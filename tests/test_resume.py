@@ -45,8 +45,6 @@ from torchrl_l2c2.experiment.run.files import write_json
 from torchrl_l2c2.experiment.run.policies import load_policy
 from torchrl_l2c2.experiment.run.progress import show_and_log
 from torchrl_l2c2.experiment.settings.config import GROUPS
-from torchrl_l2c2.experiment.settings.identity import fingerprint
-from torchrl_l2c2.experiment.settings.naming import run_name
 
 ROOT = Path(__file__).parent.parent
 SWINGUP = TaskConfig(episodes=6, max_steps=60)
@@ -58,7 +56,6 @@ def contents(folder):
     return {p: p.read_bytes() for p in folder.iterdir() if not p.name.startswith(".lock")}
 
 
-OF_TESTS = L2C2Config(gain="target", gain_target=1.0, gain_of="test_action_variation")
 # A tenth of the usual updates: two or so after each episode.
 FEW_UPDATES = PPORPEConfig(replay_ratio=1.0)
 
@@ -449,7 +446,6 @@ def test_the_episodes_of_the_last_rollout_may_be_more_than_were_asked_for(tmp_pa
     [
         ({"optimizer": AdamConfig(linear=True)}, "optimizer.linear=true"),
         ({"regularizer": L2C2Config(gain="ramp")}, "regularizer.gain=ramp"),
-        ({"regularizer": OF_TESTS}, "regularizer.gain_of=test_action_variation"),
     ],
 )
 def test_what_followed_another_length_is_told(tmp_path, setting, told):
@@ -469,15 +465,6 @@ def test_what_changes_no_number_may_change(trained):
         logger=GROUPS["logger"]["tensorboard"], late_share=0.5, test_episodes=3, checkpoint_keep=5
     )
     assert len(Experiment(other, trained).metrics) == 6
-
-
-def test_which_policies_are_tested_may_not_change_where_a_gain_follows_the_tests():
-    """Nor are such runs pooled, or share a folder."""
-    now, other = (small(regularizer=OF_TESTS, late_share=share) for share in (0.1, 0.5))
-    with pytest.raises(OtherRunError, match=r"late_share=0.1, not 0.5: .*line, outputs=FOLDER"):
-        check_same_settings(now.to_dict(), other.to_dict())
-    assert fingerprint(now.to_dict()) != fingerprint(other.to_dict())
-    assert run_name(now) != run_name(other)
 
 
 def test_a_setting_that_a_checkpoint_does_not_know_is_named(tmp_path):

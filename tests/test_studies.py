@@ -378,7 +378,6 @@ def test_targets_have_what_came_of_them_and_what_they_cost(tmp_path):
         ("low", asked(0.02), 0, 0.02),
         ("none", "none", 0, 0.1),
         ("constant", "l2c2", 0, 0.08),
-        ("other measure", asked(0.3, gain_of="policy_scale"), 0, 0.07),
     ):
         config = make_config(regularizer=regularizer, seed=seed)
         make_run(tmp_path / name, config, 100.0 * (seed + 1), varied)

@@ -1,22 +1,20 @@
-"""Schedules of the regularizer's gain: a ramp, or a target for a metric."""
+"""Schedules of the regularizer's gain: a ramp, or a target for the action variation."""
 
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from statistics import fmean
 from typing import Any
 
-from torchrl_l2c2.experiment.collect.player import EPISODE_COLUMNS
 from torchrl_l2c2.experiment.learn.learner import Learner
-from torchrl_l2c2.experiment.run.evaluation import TEST_COLUMNS
 from torchrl_l2c2.experiment.settings.config import ExperimentConfig
-from torchrl_l2c2.experiment.settings.fields import SettingError
 from torchrl_l2c2.experiment.settings.regularizers import GainConfig
 from torchrl_l2c2.experiment.settings.tasks import Budget
 from torchrl_l2c2.gains import ConstantGain, RampGain, TargetGain
+
+MEASURE = "action_variation"  # Metric that a target limits.
 
 
 class GainControl:
@@ -28,15 +26,11 @@ class GainControl:
 
     Attributes:
         gain: Schedule of the gain; ``None`` for a constant gain.
-
-    Raises:
-        SettingError: If the run does not have the metric of the target.
     """
 
     def __init__(self, config: ExperimentConfig, learner: Learner) -> None:
         self._learner = learner
         self._updates = 0
-        self._warns_of_measure = True
         # Values since the last step: several episodes may end in a rollout.
         self._seen: list[float] = []
         self.gain: ConstantGain | None = None
@@ -48,7 +42,6 @@ class GainControl:
             learner.at_full_gain = self._at_full_gain
         elif self._config.gain == "target":
             assert self._config.gain_target is not None
-            self._check_column(self._config.gain_of, tested=config.late_share > 0)
             self.gain = TargetGain(
                 self._config.gain_target, self._config.gain_rate, self._config.gain_limit
             )
@@ -62,8 +55,8 @@ class GainControl:
         """Sets the gain after an episode, and returns metrics of the gain.
 
         The gain changes only if there was an update since its last change. A target uses the mean
-        of its metric over the episodes since then. With rollouts, these are the episodes that ended
-        in the last rollout; without any, the gain does not change.
+        action variation over the episodes since then. With rollouts, these are the episodes that
+        ended in the last rollout; without any, the gain does not change.
 
         Args:
             row (Mapping): Metrics of the episode. After a rollout without a finished episode, only
@@ -78,7 +71,7 @@ class GainControl:
             dict: The gain during the episode, the measured value and the target; empty for a
             constant gain.
         """
-        if self.gain is None or (self._config.gain == "target" and self._config.gain_of not in row):
+        if self.gain is None or (self._config.gain == "target" and MEASURE not in row):
             return {}
         measured = self._measure(row, training)
         logged = {"gain": self.gain.value, "gain_measured": measured}
@@ -88,8 +81,6 @@ class GainControl:
             self._updates, self._seen = self._learner.updates, []
             self.gain.step(measured)
             self._apply()
-            if self._config.gain == "target":
-                self._warn_of_measure(self._config.gain_of, measured)
         return logged
 
     def state_dict(self) -> dict[str, Any]:
@@ -121,31 +112,6 @@ class GainControl:
         if self._config.gain == "ramp":
             spent = training.spent(int(row["episode"]), int(row["frames"]))
             return min(1.0, spent / training.total)  # The last round may exceed the total.
-        self._seen.append(row[self._config.gain_of])
+        self._seen.append(row[MEASURE])
         numbers = [measured for measured in self._seen if math.isfinite(measured)]
         return fmean(numbers) if numbers else self._seen[-1]
-
-    def _check_column(self, name: str, *, tested: bool) -> None:
-        """Checks that the run will have a metric."""
-        columns = {*EPISODE_COLUMNS, *self._learner.report(0), *(TEST_COLUMNS if tested else ())}
-        if "scale" not in self._learner.agent.policy.out_keys:
-            columns.remove("policy_scale")
-        if name not in columns:
-            raise SettingError(
-                "regularizer.gain_of",
-                f"must be one of {sorted(columns)}, got {name!r} (test_* need late_share > 0, and "
-                "policy_scale needs a stochastic policy).",
-            )
-
-    def _warn_of_measure(self, column: str, measured: float) -> None:
-        """Warns once if the metric of a target is negative or not finite."""
-        if 0.0 <= measured < math.inf or not self._warns_of_measure:
-            return
-        self._warns_of_measure = False
-        warnings.warn(
-            f"regularizer.gain_of={column} is {measured:g} after update {self._updates}: the gain "
-            "does not change if this is NaN, and decreases for every gain_target if it is "
-            "negative. Choose a nonnegative metric. test_* metrics exist only in the last "
-            "late_share of training.",
-            stacklevel=4,
-        )

@@ -35,16 +35,12 @@ def _metadata() -> dict[str, dict[str, Any]]:
     }
 
 
-def may_change(name: str, gain_of: str | None = None) -> bool:
+def may_change(name: str) -> bool:
     """Checks whether a setting may differ between a run and its continuation.
 
     Args:
         name (str): Name with the group, such as ``"task.solved_at"``.
-        gain_of (str, optional): The regularizer's ``gain_of``. Settings that affect this metric may
-            not differ.
     """
-    if name == "late_share" and str(gain_of).startswith("test_"):
-        return False
     return "changes_no_numbers" in _metadata().get(name, {})
 
 
@@ -90,11 +86,10 @@ def changed_settings(
     before, after = flatten_settings(saved), flatten_settings(now)
     # Names of choices first: they explain the differences in their settings.
     names = sorted(before.keys() | after.keys(), key=lambda n: (not n.endswith(".name"), n))
-    followed = after.get("regularizer.gain_of")
     pairs = {
         name: (before.get(name, NEWER_SETTING), after.get(name, NEWER_SETTING))
         for name in names
-        if not may_change(name, followed)
+        if not may_change(name)
     }
     return {
         name: (was, is_now)
@@ -105,9 +100,7 @@ def changed_settings(
 
 def length_dependent_settings(config: ExperimentConfig) -> list[str]:
     """Returns the settings whose effect during training depends on the training's length."""
-    gain_of = str(getattr(config.regularizer, "gain_of", None))
     length_dependent = {
-        f"regularizer.gain_of={gain_of}": gain_of.startswith("test_"),
         "optimizer.linear=true": config.optimizer.linear,
         "regularizer.gain=ramp": config.regularizer.ramped,
     }
@@ -135,7 +128,7 @@ def fingerprint(config: Mapping[str, Any]) -> str:
     compared = {
         name: value
         for name, value in own.items()
-        if _counts(name, own) and name != "task.name" and not is_neutral(name, value)
+        if _counts(name) and name != "task.name" and not is_neutral(name, value)
     }
     return hashlib.sha256(json.dumps(compared, sort_keys=True).encode()).hexdigest()[:10]
 
@@ -165,7 +158,7 @@ def differences(config: Mapping[str, Any]) -> dict[str, str]:
     return {
         name: _word(value)
         for name, value in sorted(own.items())
-        if (_counts(name, own) or name in BUDGETS)
+        if (_counts(name) or name in BUDGETS)
         and value != (defaults if name.endswith(".name") else chosen)[name]
     }
 
@@ -194,8 +187,8 @@ def _names(config: Mapping[str, Any], groups: Any) -> dict[str, Any]:
     return named
 
 
-def _counts(name: str, settings: Mapping[str, Any]) -> bool:
-    return name != "seed" and not may_change(name, settings.get("regularizer.gain_of"))
+def _counts(name: str) -> bool:
+    return name != "seed" and not may_change(name)
 
 
 def _word(value: Any) -> str:

@@ -75,9 +75,9 @@ def _changed_settings(
             if not ignored and value != getattr(defaults, name):
                 unique = group == "regularizer" or names[name] == 1
                 yield group, name if unique else f"{group}.{name}", value
-    default, gain_of = of_preset or ExperimentConfig(), getattr(config.regularizer, "gain_of", None)
+    default = of_preset or ExperimentConfig()
     for name in sorted(vars(config).keys() - GROUPS.keys() - {"seed"}):
-        if not may_change(name, gain_of) and getattr(config, name) != getattr(default, name):
+        if not may_change(name) and getattr(config, name) != getattr(default, name):
             yield "", name, getattr(config, name)
 
 

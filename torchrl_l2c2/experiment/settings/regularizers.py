@@ -13,7 +13,6 @@ from torchrl_l2c2.presets import KINDS, METHODS, preset
 # Setting -> values of ``gain`` for which the setting has an effect.
 USED_WITH_GAIN = {
     "gain_target": ("target",),
-    "gain_of": ("target",),
     "gain_rate": ("target",),
     "gain_limit": ("target",),
     "gain_length": ("ramp",),
@@ -57,17 +56,14 @@ class GainConfig(RegularizerConfig):
     gain: Literal["constant", "ramp", "target"] = Field(
         default="constant",
         description="schedule of the gain, applied after every episode: constant, ramp (linear "
-        "from 0 to 1), or target (keeps gain_of at or below gain_target)",
+        "from 0 to 1), or target (keeps the action variation of training episodes at or below "
+        "gain_target)",
         json_schema_extra=neutral("constant"),
     )
     gain_target: float | None = Field(
-        default=None, gt=0, description="largest value of gain_of with gain=target"
-    )
-    gain_of: str = Field(
-        default="action_variation",
-        description="column of metrics.csv that gain=target keeps at or below gain_target; must be "
-        "a nonnegative metric",
-        json_schema_extra=neutral("action_variation"),
+        default=None,
+        gt=0,
+        description="largest action variation with gain=target; smaller values smooth more",
     )
     gain_rate: float = Field(
         default=0.1,
