@@ -124,39 +124,45 @@ def test_without_a_seed_evaluate_plays_the_runs_own_test(folder):
         assert evaluated(folder, *arguments)["episodes"]["returns"] == returns
 
 
-def test_evaluate_records_its_first_episode(folder, tmp_path):
-    """Of 40 steps; of mean actions alone."""
-    ffmpeg = pytest.importorskip("imageio_ffmpeg")
-    pytest.importorskip("pygame")
-    evaluated(folder, "--record", str(tmp_path / "test.mp4"))
-    assert ffmpeg.count_frames_and_secs(str(tmp_path / "test.mp4"))[0] == 41
-    with pytest.raises(SystemExit):
-        evaluated(folder, "--record", str(tmp_path / "other.mp4"), "--sampled")
-
-
 @pytest.mark.parametrize(
     ("option", "told"),
     [
         ("--output=file/x.json", r"the folder '.*file' cannot be written to .*; choose another"),
         ("--output=.", "expected a file, got the folder"),
-        ("--record=file/x.mp4", r"the folder '.*file' cannot be written to"),
-        ("--record=x.foo", r"Expected a file that ends in .*\.mp4, got 'x.foo'"),
     ],
 )
 def test_what_could_not_be_written_is_refused_before_it_is_played(
     folder, tmp_path, monkeypatch, option, told
 ):
     """By all commands that write what they played."""
-    pytest.importorskip("imageio_ffmpeg")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
     for name in LOADS:
         monkeypatch.setattr(f"torchrl_l2c2.experiment.{name}", None)
     with pytest.raises(SystemExit, match=f"error: .*{told}"):
         main([str(folder), option])
-    other = diagnose if option.startswith("--output") else video
     with pytest.raises(SystemExit, match=f"error: .*{told}"):
-        other.main([str(folder), option.replace("--record", "--output")])
+        diagnose.main([str(folder), option])
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("file/x.mp4", r"the folder '.*file' cannot be written to"),
+        ("x.foo", r"Expected a file that ends in .*\.mp4, got 'x.foo'"),
+    ],
+)
+def test_a_video_that_could_not_be_written_is_refused_before_it_is_played(
+    folder, tmp_path, monkeypatch, name, told
+):
+    """With the endings that are possible."""
+    pytest.importorskip("imageio_ffmpeg")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    for loads in LOADS:
+        monkeypatch.setattr(f"torchrl_l2c2.experiment.{loads}", None)
+    with pytest.raises(SystemExit, match=f"error: .*{told}"):
+        video.main([str(folder), f"--output={name}"])
 
 
 def test_the_summary_is_json_and_is_told_before_anything_is_written(folder, capsys, monkeypatch):

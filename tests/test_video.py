@@ -7,7 +7,6 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
-from processes import run_train
 
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig, PPORPEConfig, TaskConfig
 from torchrl_l2c2.experiment.analysis.video import play_pictures, record_video
@@ -114,14 +113,3 @@ def test_a_task_that_draws_nothing_is_refused(tmp_path):
     with pytest.raises(SystemExit, match=r"error: .*Bare-v0"):
         main([str(folder)])
     assert not list(folder.glob("*video*"))
-
-
-@pytest.mark.parametrize("tests", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_recording_is_a_setting(tmp_path, tests):
-    """After training, with a test or without; the command says where it is."""
-    task = ("task=gymnasium", "task.env_id=Pendulum-v1", "task.episodes=1", "task.max_steps=20")
-    settings = (f"test_episodes={tests}", "record=true", f"outputs={tmp_path}", "compile=false")
-    done = run_train(*task, *settings, cwd=tmp_path)
-    (video,) = tmp_path.rglob("video.mp4")
-    assert f"video: {video}" in done.stdout
-    assert imageio_ffmpeg.count_frames_and_secs(str(video))[0] == 21

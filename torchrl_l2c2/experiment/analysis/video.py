@@ -18,13 +18,12 @@ from tensordict import TensorDictBase
 
 from torchrl_l2c2.experiment.agents._torchrl_internals import simulator_of
 from torchrl_l2c2.experiment.collect.episodes import play_episodes
-from torchrl_l2c2.experiment.envs.environments import make_env, untransformed
+from torchrl_l2c2.experiment.envs.environments import untransformed
 from torchrl_l2c2.experiment.envs.pictures import USUAL_RATE, Drawing, control_rate
 from torchrl_l2c2.experiment.errors import MissingPackageError, UserError
 from torchrl_l2c2.experiment.run.files import make_parent_folder
 from torchrl_l2c2.experiment.run.policies import load_policy, seed_of_test
 from torchrl_l2c2.experiment.run.process import ProcessState
-from torchrl_l2c2.experiment.settings.tasks import TaskConfig
 
 Picture = NDArray[np.uint8]
 # File endings that H.264, the encoder's default, supports.
@@ -54,17 +53,6 @@ def check_video(path: str | Path | None = None) -> None:
             f"Expected a file that ends in {', '.join(ENDINGS)}, got {str(path)!r}. Rename it."
         )
     make_parent_folder(path)
-
-
-def check_pictures(task: TaskConfig) -> None:
-    """Checks that a task can be rendered, by rendering its first picture.
-
-    Raises:
-        ValueError: If the task does not render.
-        SimulatorError: If rendering fails, for example without a graphics library.
-    """
-    with _without_a_screen(), ProcessState(0):
-        make_env(task, 0, render=Drawing()).close()
 
 
 def record_video(

@@ -18,18 +18,12 @@ COLUMNS = ("return_mean", "return_std", "action_variation_mean", "action_variati
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Plays test episodes and prints their summary, as JSON or as a table of noise levels."""
-    parser = _parser()
-    chosen = parser.parse_args(arguments)
-    if chosen.record and chosen.sampled:
-        parser.error("--record shows mean actions: leave out --record or --sampled")
+    chosen = _parser().parse_args(arguments)
     levels = chosen.noise or [None]
     with one_line_errors():
-        from torchrl_l2c2.experiment.analysis.video import check_video, record_video
         from torchrl_l2c2.experiment.run.files import make_parent_folder, to_json, write_json
 
         # Before the episodes, whose results could otherwise be lost.
-        if chosen.record:
-            check_video(chosen.record)
         if chosen.output:
             make_parent_folder(chosen.output)
         played = {level: _play(chosen, level) for level in levels}
@@ -37,14 +31,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
             print(to_json(played[levels[0]].summary()), flush=True)
         else:
             print(_table(played), flush=True)
-        if chosen.record:
-            record_video(
-                chosen.folder,
-                chosen.record,
-                seed=chosen.seed,
-                noise_scale=levels[0],
-                best=chosen.best,
-            )
         if chosen.output:
             tests = [{"noise": level, **test.to_dict()} for level, test in played.items()]
             written = tests[0] if len(tests) == 1 else {"tests": tests}
@@ -71,7 +57,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--sampled", action="store_true", help="sampled actions, as in training")
     add("--best", action="store_true", help="policy_best.pt instead of policy.pt")
     add("--output", help="JSON file for the summary and all episodes")
-    add("--record", metavar="VIDEO", help="file for a video of the first episode, such as test.mp4")
     return parser
 
 

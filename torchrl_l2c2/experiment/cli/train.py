@@ -277,15 +277,9 @@ def run(
     if (description := describe_preset(config)) is not None:
         print(description, flush=True)
     from torchrl_l2c2.experiment.agents.build import check_device_found
-    from torchrl_l2c2.experiment.analysis.video import check_pictures, check_video, record_video
 
     if not (folder / "evaluation.json").exists():
         check_device_found(config.device)
-    video = folder / "video.mp4"
-    records = config.record and not video.exists()
-    if records:
-        check_video()
-        check_pictures(config.task)
     _silence_libraries()
     wait_for_folder(folder, patience)
     with _log_errors(folder):
@@ -299,12 +293,8 @@ def run(
             )
             with warnings_as_lines(partial(show_and_log, folder)):
                 warn_ignored_settings(finished.config, config.to_dict())
-        if records:
-            record_video(folder, video)
         if finished is not None:
             _show(finished)
-    if video.exists():
-        print(f"video: {video}", flush=True)
     return finished
 
 

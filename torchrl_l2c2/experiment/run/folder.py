@@ -30,7 +30,7 @@ evaluations.json      tests during training (evaluate_every)
 evaluation.json       test episodes after training
 learning_curves.png   plot of metrics.csv
 diagnosis.html        why the policy shakes (command diagnose)
-video.mp4             test episode (record)
+video.mp4             test episode (the command video)
 export/               policy as ONNX and as a torch.export program (command export)
 
 Load the policy, a TorchRL actor, and an environment of its task:

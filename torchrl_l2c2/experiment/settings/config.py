@@ -138,11 +138,6 @@ class ExperimentConfig:
         "with the best test; 0: no tests during training",
         json_schema_extra=CHANGES_NO_NUMBERS,
     )
-    record: bool = Field(
-        default=False,
-        description="video.mp4 of a test episode after training (requires the extra video)",
-        json_schema_extra=CHANGES_NO_NUMBERS,
-    )
     late_share: float = Field(
         default=0.1,
         ge=0,
