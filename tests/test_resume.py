@@ -242,7 +242,6 @@ def test_what_changes_no_number_leaves_a_run_finished(ended):
         {"test_episodes": 0},
         {"threads": 2},
         {"logger": GROUPS["logger"]["tensorboard"]},
-        {"record": True},
         {"checkpoint_interval": 5.0},
         {"task": replace(small().task, solved_at=1e6)},
     ):

@@ -24,7 +24,6 @@ from torchrl_l2c2.experiment import (
     make_env,
 )
 from torchrl_l2c2.experiment.agents.build import make_agent
-from torchrl_l2c2.experiment.cli.train import run
 from torchrl_l2c2.experiment.envs.environments import ActionRatePenalty, time_limit
 from torchrl_l2c2.experiment.envs.pictures import Drawing
 from torchrl_l2c2.experiment.errors import SimulatorError
@@ -307,14 +306,6 @@ def test_a_task_that_cannot_draw_says_so(monkeypatch, modes):
     with pytest.raises(ValueError, match="Drawn-v0 cannot render pictures: it has no render_mode"):
         make_env(task("Drawn-v0"), 0, render=Drawing())
     make_env(task("Drawn-v0"), 0).close()
-
-
-def test_a_task_without_pictures_is_not_trained_for_a_video(monkeypatch, tmp_path):
-    """It would be found out at the end."""
-    still(monkeypatch)
-    with pytest.raises(ValueError, match="Still-v0 cannot render pictures"):
-        run(ExperimentConfig(task=task(), record=True), tmp_path / "run", {"resume": None})
-    assert not (tmp_path / "run").exists()
 
 
 def test_an_action_with_equal_bounds_has_no_action_rate_penalty(monkeypatch):
