@@ -37,7 +37,12 @@ from torchrl_l2c2.experiment.analysis.reports.groups import (
 )
 from torchrl_l2c2.experiment.analysis.reports.records import merge, read_records
 from torchrl_l2c2.experiment.analysis.reports.statistics import mean
-from torchrl_l2c2.experiment.analysis.reports.table import COMPARED, Estimate, improvement_cell
+from torchrl_l2c2.experiment.analysis.reports.table import (
+    COMPARED,
+    Estimate,
+    comparison_table,
+    improvement_cell,
+)
 from torchrl_l2c2.experiment.run.files import write_atomically
 
 ROOT = Path(__file__).parents[1]
@@ -121,6 +126,7 @@ def pages() -> dict[str, Page]:
         "results/paper.md": _paper_page(runs),
         **{f"results/{name}.md": _field_page(name, records(name)) for name in FIELD_PAGES},
         "results/one_setting.md": _field_page("one_setting", one_setting()),
+        "results/other_methods.md": _other_methods_page(),
         "results/batch_mean.md": Page({"results": paper_table(averaged).markdown()}),
         "results/reacher_3000.md": Page({"results": paper_table(short).markdown()}),
         "results/parts.md": Page({"parts": parts()}),
@@ -143,6 +149,14 @@ def one_setting() -> pd.DataFrame:
     """The records of PPO's one setting and of its rivals."""
     groups = group_records(records("field", "walker2d", "hopper"))
     return regrouped(group for group in groups if group.name in (OURS, *RIVALS))
+
+
+def other_methods() -> pd.DataFrame:
+    """The records of four more methods, and of the same seeds of three methods of the table."""
+    own = records("other_methods")
+    known = [g for g in group_records(records("field")) if g.name in ("baseline", OURS, "CATS")]
+    shown = regrouped(known)
+    return merge(own, shown[shown["seed"].isin(own["seed"])])
 
 
 def headline_groups(label: str) -> tuple[Group, Group]:
@@ -288,6 +302,14 @@ def _paper_page(runs: pd.DataFrame) -> Page:
     more = partial(draw_published, paper.point, "hollow: the paper")
     draw = partial(draw_plane, groups, "late_sampled", more=more, description=description(groups))
     return Page({"results": "\n\n".join(texts)}, groups, draw)
+
+
+def _other_methods_page() -> Page:
+    groups = group_records(other_methods())
+    picture = "![Return against Sm of Grad-CAPS, ASAP, SR2L and LCP](other_methods.svg)"
+    table = comparison_table(TEST, groups).markdown()
+    draw = partial(draw_plane, groups, TEST, measure="sm_asap", description=description(groups))
+    return Page({"results": f"{picture}\n\n{table}"}, groups, draw)
 
 
 def _field_page(name: str, shown: pd.DataFrame) -> Page:

@@ -6,6 +6,7 @@ from torch._inductor import config as inductor_config
 from torch._inductor.utils import run_and_get_code
 
 from torchrl_l2c2.experiment.errors import CompilerError
+from torchrl_l2c2.experiment.learn import compilation
 from torchrl_l2c2.experiment.learn.compilation import compiled, compiler_available
 
 pytestmark = pytest.mark.skipif(not compiler_available(), reason="no C++ compiler")
@@ -132,3 +133,27 @@ def test_a_compiler_that_fails_is_one_line(tmp_path, monkeypatch):
     with inductor_config.patch(options), pytest.raises(CompilerError, match=why) as told:
         compiled(lambda x: x.sin() + 7.5)(torch.rand(3))
     assert "In file included" in str(told.value.__cause__)
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_an_incomplete_library_in_the_cache_is_compiled_again(tmp_path, monkeypatch, inside):
+    """A process that was killed while it compiled left it; files elsewhere are not touched."""
+    cache = tmp_path / "cache"
+    library = (cache if inside else tmp_path) / "abc.main.so"
+    cache.mkdir()
+    library.touch()
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(cache))
+
+    def load(*args):
+        if library.exists():
+            raise RuntimeError(f"ImportError: {library}: file too short")
+        return lambda x: [x.sin()]
+
+    monkeypatch.setattr(compilation, "compile_graph", load)
+    x = torch.rand(3)
+    if inside:
+        assert torch.equal(compiled(torch.sin)(x), x.sin())
+    else:
+        with pytest.raises(CompilerError, match="file too short"):
+            compiled(torch.sin)(x)
+    assert library.exists() is not inside

@@ -82,6 +82,13 @@ _PPO_TASKS = "Pendulum, LunarLander, Walker2d and Hopper"
 
 _SR2L = {"coeff": 0.1, "epsilon": 0.05, "steps": 10}
 
+
+def _of_authors(**settings: Any) -> dict[str, Preset]:
+    """The settings of a method's authors for every kind of loss; runs are recorded with PPO."""
+    ran = Preset(settings, evidence="results/other_methods.md", tasks="Pendulum and LunarLander")
+    return {kind: ran if kind == "ppo" else Preset(settings) for kind in KINDS}
+
+
 PRESETS: dict[str, dict[str, Preset]] = {
     "l2c2": {
         "ppo": Preset(
@@ -165,18 +172,15 @@ PRESETS: dict[str, dict[str, Preset]] = {
         ),
         "ppo_rpe": Preset({"lambda_temporal": 0.1}, ramp=1.0),
     },
-    "grad_caps": {kind: Preset({"lambda_temporal": 0.01, "epsilon": 0.1}) for kind in KINDS},
-    "asap": {
-        kind: Preset({"lambda_spatial": 0.3, "lambda_temporal": 2.0, "lambda_grad": 0.05})
-        for kind in KINDS
-    },
+    "grad_caps": _of_authors(lambda_temporal=0.01, epsilon=0.1),
+    "asap": _of_authors(lambda_spatial=0.3, lambda_temporal=2.0, lambda_grad=0.05),
     # "mean": a learned deviation would grow, because that lowers the likelihood's gradient or KL.
     "lcp": {
-        **{kind: Preset({"coeff": 0.002, "of": "mean"}) for kind in KINDS},
+        **_of_authors(coeff=0.002, of="mean"),
         "ppo_rpe": Preset({"coeff": 0.002, "of": "log_prob"}),
     },
     "sr2l": {
-        **{kind: Preset({**_SR2L, "policy_distance": "mean"}) for kind in KINDS},
+        **_of_authors(**_SR2L, policy_distance="mean"),
         "ppo_rpe": Preset({**_SR2L, "policy_distance": "jeffreys"}),
     },
 }

@@ -7,10 +7,13 @@ bytecode instead: it takes several times longer at the start of a run and checks
 
 from __future__ import annotations
 
+import os
+import re
 import shutil
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -200,10 +203,29 @@ def _compile(
     }
     try:
         with torch.no_grad():
-            return compile_graph(module, inputs, mode, options)
+            try:
+                return compile_graph(module, inputs, mode, options)
+            except Exception as error:
+                if not _remove_damaged_library(str(error)):
+                    raise
+                return compile_graph(module, inputs, mode, options)
     # Inductor's own bugs raise errors of any class.
     except Exception as error:
         raise CompilerError(_failure(str(error).splitlines())) from error
+
+
+def _remove_damaged_library(message: str) -> bool:
+    """Removes the library that an error names from the compiler's cache, if there is one.
+
+    A process that is killed while it compiles may leave an incomplete library, which every later
+    process would fail to load.
+    """
+    named = re.search(r"(/\S+\.so): ", message)
+    cache = os.environ.get("TORCHINDUCTOR_CACHE_DIR")  # Inductor sets it, too.
+    if named is None or cache is None or not Path(named[1]).is_relative_to(cache):
+        return False
+    Path(named[1]).unlink(missing_ok=True)
+    return True
 
 
 def _failure(lines: Sequence[str]) -> str:
