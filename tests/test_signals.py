@@ -2,6 +2,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 
 import pytest
 
@@ -43,3 +45,23 @@ def test_a_compiler_that_fails_without_a_signal_is_told():
     """Nobody wanted the run to end."""
     with pytest.raises(CompilerError, match="no compiler"), stop_on_signals():
         raise CompilerError("no compiler")
+
+
+CTRL_C = """
+import os, signal, time
+from torchrl_l2c2.experiment.run.signals import keep_ctrl_c_from_children
+keep_ctrl_c_from_children()
+received = []
+signal.signal(signal.SIGUSR1, lambda *_: received.append(time.monotonic()))
+for pause in (0.2, 0.2, 2.5, 0.5):
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(pause)
+print(len(received))
+"""
+
+
+def test_ctrl_c_that_is_repeated_within_a_second_is_one():
+    """As of a program that sends it to a process and to its group; the fourth is another one."""
+    command = [sys.executable, "-c", CTRL_C]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=100)
+    assert done.stdout == "2\n"

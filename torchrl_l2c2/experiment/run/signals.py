@@ -112,6 +112,11 @@ def keep_ctrl_c_from_children() -> None:
             signal.sigwait({signal.SIGINT})
             # Another signal wakes the main thread even while it waits for a compiler.
             signal.pthread_kill(main, signal.SIGUSR1)
+            # Repetitions, such as to a process and to its group, are dropped here: the main thread
+            # may handle them much later.
+            time.sleep(SAME_SIGNAL_SECONDS)
+            if signal.SIGINT in signal.sigpending():
+                signal.sigwait({signal.SIGINT})
 
     signal.signal(signal.SIGUSR1, as_ctrl_c)
     # All later threads and processes inherit the blocked signal.
