@@ -1,4 +1,4 @@
-"""Picture and table of the strength against the action variation and the return.
+"""Picture and table of the strength against smoothness and return.
 
 ``python -m studies.strength`` reads ``strength.csv`` in ``results/``. It writes ``strength.svg``,
 and the table of ``results/strength.md``.
@@ -18,12 +18,13 @@ from studies.field import TEST
 from studies.pages import ROOT, fill, records
 from torchrl_l2c2.experiment.analysis.reports.figures import save, subplots
 from torchrl_l2c2.experiment.analysis.reports.groups import Group, group_records
+from torchrl_l2c2.experiment.analysis.reports.records import merge
 from torchrl_l2c2.experiment.analysis.reports.table import COMPARED, number
 from torchrl_l2c2.experiment.run.files import write_atomically
 
 PAGE = ROOT / "results" / "strength.md"
 PICTURE = ROOT / "results" / "strength.svg"
-MEASURES = ("action_variation", "return")
+MEASURES = ("action_variation", "sm_asap", "return")
 SEEDS = 3  # Seeds from 100 on choose a preset.
 SETTING = "regularizer.strength"
 
@@ -44,6 +45,14 @@ class Curve(NamedTuple):
         return [float(group.scores(TEST, measure).mean()) for group in self.groups.values()]
 
 
+def shown() -> pd.DataFrame:
+    """The records of the strengths, and of the baselines of other tables with the same settings."""
+    own, others = records("strength"), records("field", "hopper", "sac_pendulum")
+    settings = ["task", "algorithm", "length"]
+    same = pd.MultiIndex.from_frame(others[settings]).isin(pd.MultiIndex.from_frame(own[settings]))
+    return merge(own, others[same & (others["method"] == "none") & (others["seed"] < SEEDS)])
+
+
 def curves(found: pd.DataFrame) -> list[Curve]:
     """A curve for each task and algorithm, on the first seeds."""
     by_task: dict[str, dict[float, Group]] = {}
@@ -54,11 +63,11 @@ def curves(found: pd.DataFrame) -> list[Curve]:
     return [Curve(label, dict(sorted(groups.items()))) for label, groups in by_task.items()]
 
 
-def table(shown: Sequence[Curve]) -> str:
+def table(drawn: Sequence[Curve]) -> str:
     """A row for each task and strength: the means over seeds."""
     columns = ["task", "strength", "seeds", *(COMPARED[name][0] for name in COMPARED)]
     lines = [columns, ["---"] * len(columns)]
-    for curve in shown:
+    for curve in drawn:
         for strength, group in curve.groups.items():
             cells = [curve.label, f"{strength:g}" if strength else "0 (baseline)"]
             cells.append(number_range(group.seeds))
@@ -68,20 +77,20 @@ def table(shown: Sequence[Curve]) -> str:
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
-def draw(shown: Sequence[Curve], path: Path) -> None:
-    """Draws a row of two panels for each task."""
-    size = (4.2 * len(MEASURES), 2.5 * len(shown) + 0.6)
-    figure, axes = subplots(len(MEASURES), len(shown), size)
+def draw(drawn: Sequence[Curve], path: Path) -> None:
+    """Draws a row of three panels for each task."""
+    size = (3.4 * len(MEASURES), 2.5 * len(drawn) + 0.6)
+    figure, axes = subplots(len(MEASURES), len(drawn), size)
     figure.set_facecolor("white")
-    for row, curve in enumerate(shown):
+    for row, curve in enumerate(drawn):
         for column, measure in enumerate(MEASURES):
             axis = axes[row * len(MEASURES) + column]
             _draw_panel(axis, curve, measure)
             axis.set_title(curve.label, fontsize=10)
             axis.set_ylabel(COMPARED[measure][0])
-            if row == len(shown) - 1:
+            if row == len(drawn) - 1:
                 axis.set_xlabel("strength (0: baseline)")
-    save(figure, path, table(shown))
+    save(figure, path, table(drawn))
 
 
 def _draw_panel(axis: Any, curve: Curve, measure: str) -> None:
@@ -94,7 +103,7 @@ def _draw_panel(axis: Any, curve: Curve, measure: str) -> None:
     axis.plot(places, means, color="#1f6fb4", linewidth=2)
     axis.set_xticks(places, [f"{strength:g}" for strength in curve.groups])
     axis.grid(axis="y", alpha=0.25)
-    if measure == "action_variation":
+    if measure != "return":
         axis.set_ylim(bottom=0.0)
     for side in ("top", "right"):
         axis.spines[side].set_visible(False)
@@ -102,10 +111,10 @@ def _draw_panel(axis: Any, curve: Curve, measure: str) -> None:
 
 def main() -> None:
     """Writes the picture and the table."""
-    shown = curves(records("strength"))
-    write_atomically(PAGE, fill(PAGE.read_text(), "strength", table(shown)).encode())
-    draw(shown, PICTURE)
-    print(table(shown))
+    found = curves(shown())
+    write_atomically(PAGE, fill(PAGE.read_text(), "strength", table(found)).encode())
+    draw(found, PICTURE)
+    print(table(found))
 
 
 if __name__ == "__main__":

@@ -745,6 +745,11 @@ class TestStrength:
         text = (tmp_path / "a.svg").read_text()
         assert strength.table(shown) in text and "<text" not in text
 
+    def test_page_and_picture_are_of_the_records(self):
+        """``python -m studies.strength`` would change nothing."""
+        table = strength.table(strength.curves(strength.shown()))
+        assert table in strength.PAGE.read_text() and table in strength.PICTURE.read_text()
+
 
 class TestTrace:
     def test_a_row_shows_one_joint_and_its_mean_change(self, tmp_path):
