@@ -59,7 +59,10 @@ def curves(found: pd.DataFrame) -> list[Curve]:
     for group in group_records(found[found["seed"] < SEEDS]):
         first = group.first
         strength = 0.0 if first.method == "none" else float(group.settings.get(SETTING, 1.0))
-        by_task.setdefault(f"{first.task}, {first.algorithm}", {})[strength] = group
+        label = f"{first.task}, {first.algorithm}"
+        if strength in by_task.setdefault(label, {}):
+            raise ValueError(f"Expected one setting of {label} with strength {strength:g}, got two.")
+        by_task[label][strength] = group
     return [Curve(label, dict(sorted(groups.items()))) for label, groups in by_task.items()]
 
 

@@ -739,6 +739,13 @@ class TestStrength:
             ["| swingup, ppo_rpe", name, "0, 1", "20.50"] for name in ("0 (baseline)", "0.1", "1")
         ]
 
+    def test_two_settings_of_one_strength_are_refused(self, tmp_path):
+        """One would replace the other."""
+        for name, regularizer in (("one", "l2c2"), ("two", L2C2Config(beta=0.5))):
+            make_run(tmp_path / name, make_config(regularizer=regularizer), 1.0, 0.1)
+        with pytest.raises(ValueError, match="Expected one setting of swingup, ppo_rpe with"):
+            strength.curves(records_of(read_runs(tmp_path)))
+
     def test_the_picture_has_its_numbers(self, shown, tmp_path):
         """And no letter that needs a font."""
         strength.draw(shown, tmp_path / "a.svg")
