@@ -61,7 +61,7 @@ def curves(found: pd.DataFrame) -> list[Curve]:
         strength = 0.0 if first.method == "none" else float(group.settings.get(SETTING, 1.0))
         label = f"{first.task}, {first.algorithm}"
         if strength in by_task.setdefault(label, {}):
-            raise ValueError(f"Expected one setting of {label} with strength {strength:g}, got two.")
+            raise ValueError(f"Expected one setting of {label} at strength {strength:g}, got two.")
         by_task[label][strength] = group
     return [Curve(label, dict(sorted(groups.items()))) for label, groups in by_task.items()]
 

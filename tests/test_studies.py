@@ -743,7 +743,7 @@ class TestStrength:
         """One would replace the other."""
         for name, regularizer in (("one", "l2c2"), ("two", L2C2Config(beta=0.5))):
             make_run(tmp_path / name, make_config(regularizer=regularizer), 1.0, 0.1)
-        with pytest.raises(ValueError, match="Expected one setting of swingup, ppo_rpe with"):
+        with pytest.raises(ValueError, match="Expected one setting of swingup, ppo_rpe at"):
             strength.curves(records_of(read_runs(tmp_path)))
 
     def test_the_picture_has_its_numbers(self, shown, tmp_path):
