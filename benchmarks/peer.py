@@ -41,15 +41,6 @@ def td3_here(settings: Settings) -> Callable[[], object]:
     return _train_here(settings, algorithm, replay)
 
 
-def dqn_here(settings: Settings) -> Callable[[], object]:
-    """This package's DQN: one update a frame, uniform replay."""
-    from torchrl_l2c2.experiment import DQNConfig, UniformReplayConfig
-
-    algorithm = DQNConfig(hidden=tuple(settings["layers"]), random_frames=0)
-    replay = UniformReplayConfig(capacity=10_000, batch_size=settings["batch"])
-    return _train_here(settings, algorithm, replay)
-
-
 def paper_here(settings: Settings) -> Callable[[], object]:
     """The paper's algorithm with L2C2: one update a frame on average, prioritized replay."""
     from torchrl_l2c2.experiment import L2C2Config, PPORPEConfig, PrioritizedReplayConfig
@@ -115,14 +106,6 @@ def td3_sbx(settings: Settings) -> Callable[[], object]:
     return _learn(settings, TD3, _off_policy(settings))
 
 
-def dqn_sbx(settings: Settings) -> Callable[[], object]:
-    """The DQN of SBX, whose target follows slowly, as here."""
-    from sbx import DQN
-
-    slow = {"tau": 0.005, "target_update_interval": 1}
-    return _learn(settings, DQN, {**_off_policy(settings), **slow})
-
-
 def ppo_sbx(settings: Settings) -> Callable[[], object]:
     """The PPO of SBX."""
     from sbx import PPO
@@ -174,12 +157,10 @@ PEERS = {
     "sac": sac_here,
     "ppo": ppo_here,
     "td3": td3_here,
-    "dqn": dqn_here,
     "paper": paper_here,
     "sbx sac": sac_sbx,
     "sbx td3": td3_sbx,
     "sbx ppo": ppo_sbx,
-    "sbx dqn": dqn_sbx,
     "sb3 sac": sac_sb3,
     "sb3 ppo": ppo_sb3,
 }

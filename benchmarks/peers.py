@@ -42,10 +42,6 @@ def peer_rows(effort: Effort) -> Iterable[Row]:
     yield from against(what, "ppo", "sb3 ppo", same, at_most=0.4, **how)
     what = "PPO here / SBX PPO, layers of 64, batch 64"
     yield from against(what, "ppo", "sbx ppo", same, **how)
-    # Short episodes: a turn here ends with one.
-    same = {**same, "env_id": "CartPole-v1", "frames": min(64, steps)}
-    what = "DQN here / SBX DQN, layers of 64, batch 64"
-    yield from against(what, "dqn", "sbx dqn", same, **how)
 
 
 class Peer:

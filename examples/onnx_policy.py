@@ -46,9 +46,6 @@ def play(folder: Path, episodes: int) -> None:
             actions.append(action)
             over = terminated or truncated
         returns.append(sum(rewards))
-        if "choices" in contract["action"]:  # labels without an order: one-hot
-            kinds = np.eye(contract["action"]["choices"])
-            actions = kinds[np.array(actions) - contract["action"]["first"]]
         changes.append(np.linalg.norm(np.diff(actions, axis=0), axis=-1).mean())
     env.close()
     print(f"return {np.mean(returns):.1f}")

@@ -11,7 +11,6 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
 from torchrl_l2c2.experiment import (
-    DQNConfig,
     PPOConfig,
     PPORPEConfig,
     RolloutReplayConfig,
@@ -27,18 +26,12 @@ ALGORITHMS = {
     "sac": SACConfig(random_frames=10, hidden=(8,)),
     "td3": TD3Config(random_frames=10, hidden=(8,)),
     "ppo": PPOConfig(frames=30, epochs=2, hidden=(8,)),
-    "dqn": DQNConfig(random_frames=10, hidden=(8,)),
 }
 
 
 def replay_of(name):
     """What an algorithm learns from, in batches of 16."""
     return (RolloutReplayConfig if name == "ppo" else UniformReplayConfig)(batch_size=16)
-
-
-def env_id_of(name):
-    """A task that it can learn."""
-    return "CartPole-v1" if name == "dqn" else "Pendulum-v1"
 
 
 @contextmanager

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from small import ALGORITHMS, replay_of
 from tensordict.nn import TensorDictModule
 from torchrl.envs import GymEnv
 
@@ -19,11 +18,9 @@ from torchrl_l2c2.experiment import (
     evaluate_policy,
     load_policy,
 )
-from torchrl_l2c2.experiment.agents.agent import exploration_module
 from torchrl_l2c2.experiment.cli import diagnose, export, video
 from torchrl_l2c2.experiment.cli.evaluate import main
 from torchrl_l2c2.experiment.run.evaluation import Evaluation
-from torchrl_l2c2.experiment.settings.regularizers import REGULARIZERS
 
 # What each command begins with.
 LOADS = (
@@ -243,22 +240,6 @@ def test_the_folder_says_how_to_load_its_policy(folder):
     for path in folder.iterdir():
         if not path.name.startswith((".", "checkpoint", "result", "README")):
             assert path.name in text
-
-
-def test_a_policy_of_a_checkpoint_explores_as_the_run_does(tmp_path):
-    """Not as at its beginning, where DQN takes any action."""
-    chosen = replace(ALGORITHMS["dqn"], random_frames=0, epsilon_end=0.25, epsilon_frames=20)
-    task = TaskConfig("cartpole", "CartPole-v1", episodes=6, max_steps=40)
-    settings = {
-        "algorithm": chosen,
-        "replay": replay_of("dqn"),
-        "regularizer": REGULARIZERS["none"],
-    }
-    experiment = Experiment(ExperimentConfig(task=task, compile=False, **settings), tmp_path)
-    experiment.train()
-    rate = exploration_module(load_policy(tmp_path)[0]).eps.item()
-    assert rate == exploration_module(experiment.agent.policy).eps.item() == 0.25
-    experiment.close()
 
 
 def test_a_policy_is_loaded_without_a_draw_from_the_global_generator(folder):

@@ -21,7 +21,6 @@ from torchrl_l2c2.experiment import (
     AdamConfig,
     AdaTermConfig,
     CAPSConfig,
-    DQNConfig,
     Experiment,
     ExperimentConfig,
     L2C2Config,
@@ -401,7 +400,6 @@ ALGORITHMS = {
     "sac": SACConfig(random_frames=60),
     "td3": TD3Config(random_frames=60),
     "ppo": PPOConfig(frames=60, epochs=2),
-    "dqn": DQNConfig(random_frames=100),
 }
 
 
@@ -409,12 +407,10 @@ ALGORITHMS = {
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_every_algorithm_learns_from_its_batches(name, regularizer):
     """Updates happen, every parameter group moves, and the regularizer's terms are there."""
-    discrete = name == "dqn"
-    task = TaskConfig("cartpole", "CartPole-v1", 0.01, 8, 40) if discrete else PENDULUM
     batches = (
         RolloutReplayConfig(batch_size=32) if name == "ppo" else UniformReplayConfig(batch_size=32)
     )
-    config = small(task=task, algorithm=ALGORITHMS[name], replay=batches, regularizer=regularizer)
+    config = small(algorithm=ALGORITHMS[name], replay=batches, regularizer=regularizer)
     experiment = Experiment(config)
     before = [p.clone() for p in experiment.agent.loss.parameters()]
     metrics = experiment.train()
@@ -423,8 +419,8 @@ def test_every_algorithm_learns_from_its_batches(name, regularizer):
     assert all(p.isfinite().all() for p in after)
     assert all(not torch.equal(a, b) for a, b in zip(before, after, strict=True))
     added = {key for key in metrics[-1] if key.startswith("loss_l2c2")}
-    values = {"sac": "qvalue", "td3": "qvalue", "ppo": "critic", "dqn": "value"}[name]
-    expected = {f"loss_l2c2_{values}"} | (set() if discrete else {"loss_l2c2_actor"})
+    values = {"sac": "qvalue", "td3": "qvalue", "ppo": "critic"}[name]
+    expected = {f"loss_l2c2_{values}", "loss_l2c2_actor"}
     assert added == (expected if regularizer.name == "l2c2" else set())
     assert len(experiment.test().returns) == 2
     with pytest.raises(ValueError, match="episodes must be at least 1, got 0"):
@@ -439,12 +435,6 @@ def test_what_sac_keeps_is_there_before_it_is_compiled(regularizer):
     )
     # Not state_dict, which would make it.
     assert Experiment(config).agent.loss._buffers["_target_entropy"] == -1.0
-
-
-def test_a_discrete_task_is_refused_by_algorithms_for_continuous_ones():
-    """And the other way round; the error says which kind is needed."""
-    with pytest.raises(ValueError, match="dqn needs discrete actions"):
-        Experiment(small(algorithm=DQNConfig()))
 
 
 def run_train(*overrides, folder, check=True):
@@ -598,19 +588,11 @@ def test_a_wrong_setting_ends_with_one_clear_line(tmp_path):
     [
         (
             {"task": TaskConfig("cartpole", "CartPole-v1")},
-            "ppo_rpe needs continuous actions, got OneHot",
+            "actions are a Discrete; they must be one vector of floats",
         ),
         (
             {"algorithm": TD3Config(), "regularizer": LCPConfig()},
             "regularizer=lcp: LCPLoss needs a stochastic policy",
-        ),
-        (
-            {
-                "task": TaskConfig("cartpole", "CartPole-v1"),
-                "algorithm": DQNConfig(),
-                "regularizer": CAPSConfig(),
-            },
-            "regularizer=caps: CAPSLoss needs a policy",
         ),
         (
             {"algorithm": TD3Config(), "regularizer": L2C2Config(policy_distance="kl")},

@@ -13,7 +13,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from small import ALGORITHMS, env_id_of, replay_of
+from small import ALGORITHMS, replay_of
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs import ExplorationType, GymWrapper, set_exploration_type
@@ -37,7 +37,7 @@ ROOT = Path(__file__).parents[1]
 def finished_run(folder, name="ppo_rpe", algorithm=None, **task):
     config = ExperimentConfig(
         task=TaskConfig(
-            "task", **{"env_id": env_id_of(name), "episodes": 2, "max_steps": 20, **task}
+            "task", **{"env_id": "Pendulum-v1", "episodes": 2, "max_steps": 20, **task}
         ),
         algorithm=algorithm or ALGORITHMS[name],
         replay=replay_of(name),
@@ -100,7 +100,7 @@ def test_the_contract_says_what_the_simulator_says(pendulum):
 
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_every_algorithms_policy_is_the_same_in_all_three_forms(tmp_path, name):
-    """In batches of any size; discrete actions are their numbers."""
+    """In batches of any size."""
     folder = finished_run(tmp_path, name)
     exported = export_policy(folder)
     policy, env, _ = load_policy(folder)
@@ -110,9 +110,6 @@ def test_every_algorithms_policy_is_the_same_in_all_three_forms(tmp_path, name):
     program = torch.export.load(exported.folder / "policy.pt2").module()(observations)
     with torch.no_grad():
         expected = torch.stack([mean_action(policy, each) for each in observations])
-    if name == "dqn":
-        expected = expected.argmax(-1)
-        assert onnx.dtype == np.int64 and exported.contract["action"]["choices"] == 2
     torch.testing.assert_close(program, expected, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(onnx, expected.numpy(), rtol=1e-4, atol=1e-5)
 
@@ -142,9 +139,9 @@ gymnasium.register("Named-v0", Named)
 
 
 class Clock(gymnasium.Env):
-    """Every episode is the same but for its actions, the numbers of which are its rewards."""
+    """Every episode is the same but for its actions, which are its rewards."""
 
-    action_space = gymnasium.spaces.Discrete(3, start=5)
+    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
 
     def __init__(self, observation_space):
         self.observation_space = observation_space
@@ -159,9 +156,9 @@ class Clock(gymnasium.Env):
         return self.see(), {}
 
     def step(self, action):
-        assert self.action_space.contains(np.int64(action))
+        assert self.action_space.contains(action)
         self.time += 1
-        return self.see(), float(action), False, False, {}
+        return self.see(), float(action[0]), False, False, {}
 
 
 gymnasium.register("Clock-v0", Clock)
@@ -178,9 +175,9 @@ NESTED = OrderedDict(b=ANGLE, a=gymnasium.spaces.Dict(label=gymnasium.spaces.Dis
     ids=["vector", "nested"],
 )
 def test_the_example_plays_what_the_run_tested(tmp_path, monkeypatch, capsys, space, task):
-    """Numbers of actions, their variation and what is observed are those of training."""
+    """Return, action variation and observations are those of the run's policy."""
     monkeypatch.setitem(gymnasium.registry["Clock-v0"].kwargs, "observation_space", space)
-    folder = finished_run(tmp_path, "dqn", env_id="Clock-v0", **task)
+    folder = finished_run(tmp_path, "sac", env_id="Clock-v0", **task)
     # A policy of a few updates does the same at all times.
     weights = torch.load(folder / "policy.pt", weights_only=True)
     torch.manual_seed(0)
@@ -193,7 +190,7 @@ def test_the_example_plays_what_the_run_tested(tmp_path, monkeypatch, capsys, sp
     np.testing.assert_allclose(env.reset()["observation"], seen, rtol=1e-6)
     example["play"](exported.folder, 1)
     told = dict(re.findall(r"^([a-z ]+) (\S+)$", capsys.readouterr().out, re.M))
-    assert float(told["return"]) == expected["return_mean"]
+    assert float(told["return"]) == pytest.approx(expected["return_mean"], abs=0.05)
     variation = expected["action_variation_mean"]
     assert float(told["action variation"]) == pytest.approx(variation, abs=1e-3)
     assert variation > 0

@@ -13,7 +13,6 @@ from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl_l2c2 import action_variation, make_actor
 from torchrl_l2c2.experiment import (
     AdamConfig,
-    DQNConfig,
     EpisodeCollector,
     Experiment,
     ExperimentConfig,
@@ -215,17 +214,6 @@ def test_the_policy_is_updated_at_every_so_many_updates(delay):
     run.learner.update = lambda with_policy: turns.append(with_policy) or update(with_policy)
     run.learner.learn(2 * delay)
     assert turns == ([False] * (delay - 1) + [True]) * 2
-
-
-def test_epsilon_falls_with_the_frames_of_an_episode():
-    """And not by one step for each."""
-    algorithm = DQNConfig(hidden=(8,), schedule="episode", epsilon_end=0.0, epsilon_frames=1000)
-    task = replace(PENDULUM, name="cartpole", env_id="CartPole-v1")
-    others = {"replay": UniformReplayConfig(), "optimizer": AdamConfig()}
-    none = NoRegularizerConfig()
-    run = Experiment(small(task=task, algorithm=algorithm, regularizer=none, **others))
-    run.player.play()
-    assert run.agent.exploration.eps.item() == pytest.approx(1 - run.player.frames / 1000)
 
 
 def test_a_late_share_is_one_episode_at_least():

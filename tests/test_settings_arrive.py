@@ -11,7 +11,6 @@ from torchrl_l2c2.experiment import (
     AdaTermConfig,
     CAPSConfig,
     CATSConfig,
-    DQNConfig,
     GradCAPSConfig,
     L2C2Config,
     NoRegularizerConfig,
@@ -24,7 +23,7 @@ from torchrl_l2c2.experiment import (
     TD3Config,
     make_env,
 )
-from torchrl_l2c2.experiment.agents.agent import Agent
+from torchrl_l2c2.experiment.agents.agent import Agent, exploration_module
 from torchrl_l2c2.experiment.agents.build import make_algorithm
 from torchrl_l2c2.experiment.agents.optimizers import make_optimizer
 from torchrl_l2c2.experiment.agents.regularizers import add_regularizer, make_neighborhood
@@ -81,15 +80,15 @@ def test_td3s_noise():
     """As a share of half the range, which is 2 for Pendulum."""
     settings = {"policy_noise": 0.3, "noise_clip": 0.7, "exploration_noise": 0.4}
     agent = agent_of(TD3Config(hidden=(8,), policy_delay=3, **settings))
-    found = (agent.loss.policy_noise, agent.loss.noise_clip, agent.exploration.sigma.item())
+    sigma = exploration_module(agent.policy).sigma.item()
+    found = (agent.loss.policy_noise, agent.loss.noise_clip, sigma)
     assert (*found, agent.policy_delay) == pytest.approx((0.6, 1.4, 0.8, 3))
 
 
-@pytest.mark.parametrize("kind", [SACConfig, TD3Config, DQNConfig])
+@pytest.mark.parametrize("kind", [SACConfig, TD3Config])
 def test_the_discount_and_the_pace_of_the_targets(kind):
     """After a step of .25 the targets are a quarter of the way."""
-    env_id = "CartPole-v1" if kind is DQNConfig else "Pendulum-v1"
-    agent = agent_of(kind(hidden=(8,), gamma=0.5, tau=0.25), env_id)
+    agent = agent_of(kind(hidden=(8,), gamma=0.5, tau=0.25))
     assert float(agent.loss.value_estimator.gamma) == 0.5
     updater = agent.target_updater
     before = [target.clone() for target in updater._targets.values(True, True)]
@@ -98,8 +97,6 @@ def test_the_discount_and_the_pace_of_the_targets(kind):
     updater.step()
     for old, new in zip(before, updater._targets.values(True, True), strict=True):
         torch.testing.assert_close(new, old + 0.25)
-    if kind is DQNConfig:
-        assert agent.loss.double_dqn
 
 
 def test_those_of_replay_and_optimizers():

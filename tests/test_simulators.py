@@ -6,7 +6,6 @@ import pytest
 
 from torchrl_l2c2.experiment import (
     AdamConfig,
-    DQNConfig,
     Experiment,
     ExperimentConfig,
     PPOConfig,
@@ -26,7 +25,7 @@ def needs(package):
 
 BULLET = "pybullet_envs_gymnasium:{}BulletEnv-v0"
 MUJOCO, BOX2D, BUILT_IN = needs("mujoco"), needs("Box2D"), ()
-CONTINUOUS = {
+TASKS = {
     "Pendulum-v1": BUILT_IN,
     "Hopper-v5": MUJOCO,
     "HalfCheetah-v5": MUJOCO,
@@ -35,30 +34,19 @@ CONTINUOUS = {
     BULLET.format("Walker2D"): BUILT_IN,
     BULLET.format("HalfCheetah"): BUILT_IN,
 }
-DISCRETE = {"CartPole-v1": BUILT_IN, "Acrobot-v1": BUILT_IN, "LunarLander-v3": BOX2D}
 ALGORITHMS = {
     "ppo_rpe": PPORPEConfig(replay_ratio=2.0),
     "sac": SACConfig(random_frames=250, hidden=(32,)),
     "td3": TD3Config(random_frames=250, hidden=(32,)),
     "ppo": PPOConfig(frames=100, epochs=2),
-    "dqn": DQNConfig(random_frames=250, hidden=(32,)),
 }
-PAIRS = [
-    *(
-        (name, task, marks)
-        for name in ALGORITHMS
-        if name != "dqn"
-        for task, marks in CONTINUOUS.items()
-    ),
-    *(("dqn", task, marks) for task, marks in DISCRETE.items()),
-]
+PAIRS = [(name, task, marks) for name in ALGORITHMS for task, marks in TASKS.items()]
 # One task of each simulator, and each algorithm once.
 QUICK = {
     ("ppo_rpe", "Hopper-v5"),
     ("sac", "LunarLanderContinuous-v3"),
     ("td3", "HalfCheetah-v5"),
     ("ppo", BULLET.format("Walker2D")),
-    ("dqn", "Acrobot-v1"),
 }
 
 

@@ -187,14 +187,14 @@ def test_a_launcher_says_what_it_needs(name, monkeypatch):
     [
         ("seed=range(3,0)", "error: the sweep has no jobs: one of -m seed=range"),
         (
-            "experiment=cartpole,pendulum",
-            "error: experiment=cartpole,pendulum: each ",
+            "experiment=filters,pendulum",
+            "error: experiment=filters,pendulum: each ",
         ),
         (
             "+experiment=glob(table3*)",
             "error: +experiment=glob(table3*): each ",
         ),
-        ("experiment=[cartpole,pendulum]", "error: experiment=[cartpole,pendulum]: each "),
+        ("experiment=[filters,pendulum]", "error: experiment=[filters,pendulum]: each "),
         (
             "optimizer.lr=interval(0,1)",
             "error: sweeps do not support intervals: use examples",
@@ -205,7 +205,7 @@ def test_a_sweep_of_nothing_says_so(sweep, told):
     """It ended as if all were done; what a glob is, Hydra alone knows."""
     with pytest.raises(SystemExit, match=re.escape(told)):
         check_sweep(["-m", sweep])
-    check_sweep(["-m", "regularizer=glob(l2c2*)", "seed=0,1", "experiment=cartpole"])
+    check_sweep(["-m", "regularizer=glob(l2c2*)", "seed=0,1", "experiment=filters"])
     with begin_sweep(["-m", "regularizer=glob(l2c2*)"]) as begun:
         assert begun.status(2, {}) == "run 2"
 

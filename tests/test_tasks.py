@@ -149,9 +149,6 @@ def test_an_image_is_refused_with_the_setting_that_flattens_it(monkeypatch):
         make_env(task(), 0)
 
 
-CONTINUOUS = [name for name in ALGORITHMS if name != "dqn"]
-
-
 def experiment(name, chosen, folder=None, **settings):
     return Experiment(
         ExperimentConfig(
@@ -174,7 +171,7 @@ def actions(run):
     return np.array(run.player.collector._simulation._gymnasium.unwrapped.taken)
 
 
-@pytest.mark.parametrize("name", CONTINUOUS)
+@pytest.mark.parametrize("name", ALGORITHMS)
 def test_actions_fill_asymmetric_bounds_and_stay_within(monkeypatch, name):
     """Of every algorithm, in the dtype that the task takes."""
     low, high = np.array([-1.0, 2.0]), np.array([3.0, 2.5])
@@ -189,7 +186,7 @@ def test_actions_fill_asymmetric_bounds_and_stay_within(monkeypatch, name):
 
 
 @pytest.mark.parametrize("low", [-INF, 0.0])
-@pytest.mark.parametrize("name", CONTINUOUS)
+@pytest.mark.parametrize("name", ALGORITHMS)
 def test_actions_without_bounds_are_refused_where_they_are_squashed(monkeypatch, name, low):
     """Also where one side is open; the error says what takes them."""
     still(monkeypatch, action=spaces.Box(low, INF, (1,), np.float32))
@@ -198,7 +195,7 @@ def test_actions_without_bounds_are_refused_where_they_are_squashed(monkeypatch,
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize("name", CONTINUOUS)
+@pytest.mark.parametrize("name", ALGORITHMS)
 def test_actions_that_can_take_one_value_alone_are_refused_where_they_are_drawn(monkeypatch, name):
     """With which they are; a deterministic policy takes that value."""
     still(monkeypatch, action=spaces.Box(np.array([-1.0, 2.0], "f4"), np.array([1.0, 2.0], "f4")))
@@ -352,22 +349,20 @@ def test_ppo_rpe_acts_without_bounds_where_it_does_not_squash(monkeypatch):
     assert run.learner.updates > 0 and np.abs(actions(run)).max() > 1.0
 
 
-def test_discrete_actions_that_start_elsewhere_are_those_of_the_task(monkeypatch):
-    """TorchRL counts from 0."""
-    still(monkeypatch, action=spaces.Discrete(3, start=5))
-    run = experiment("dqn", task(episodes=2))
-    run.train()
-    assert set(actions(run).tolist()) == {5, 6, 7}
-
-
 @pytest.mark.parametrize(
     "action",
-    [spaces.MultiBinary(2), spaces.Box(0, 3, (2,), np.int64), MATRIX, spaces.Dict(a=ACTION)],
+    [
+        spaces.Discrete(3),
+        spaces.MultiBinary(2),
+        spaces.Box(0, 3, (2,), np.int64),
+        MATRIX,
+        spaces.Dict(a=ACTION),
+    ],
 )
 def test_actions_that_are_no_vector_are_refused(monkeypatch, action):
     """In one line that says what may be."""
     still(monkeypatch, action=action)
-    with pytest.raises(ValueError, match="must be one vector of floats or Discrete"):
+    with pytest.raises(ValueError, match="must be one vector of floats"):
         make_env(task(), 0)
 
 

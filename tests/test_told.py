@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from small import ALGORITHMS, env_id_of, replay_of
+from small import ALGORITHMS, replay_of
 from tensordict import TensorDict
 from torchrl.envs import GymEnv
 from torchrl.modules import MLP, Actor, ValueOperator
@@ -33,7 +33,7 @@ PENDULUM = TaskConfig("pendulum", "Pendulum-v1", episodes=2, max_steps=40)
 
 def make(name, folder=None, **settings):
     values = {
-        "task": replace(PENDULUM, name="task", env_id=env_id_of(name)),
+        "task": replace(PENDULUM, name="task", env_id="Pendulum-v1"),
         "algorithm": ALGORITHMS[name],
         "replay": replay_of(name),
         "optimizer": AdamConfig(),

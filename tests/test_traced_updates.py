@@ -13,7 +13,6 @@ import torch
 import torch._inductor.compile_fx
 
 from torchrl_l2c2.experiment import (
-    DQNConfig,
     Experiment,
     ExperimentConfig,
     L2C2Config,
@@ -38,7 +37,6 @@ ALGORITHMS = {
     "PPO-RPE": PPORPEConfig(updates=4, hidden=(8,)),
     "SAC": SACConfig(random_frames=60, hidden=(8,)),
     "TD3": TD3Config(random_frames=60, hidden=(8,)),
-    "DQN": DQNConfig(random_frames=20, hidden=(8,)),
     "PPO": PPO,
     "PPO, entropy that is estimated": replace(PPO, entropy_coeff=0.01),
     "PPO, entropy of a normal": replace(FIXED, entropy_coeff=0.01),
@@ -61,13 +59,12 @@ PAIRS += [
 
 
 def train(algorithm, regularizer, compile):
-    discrete, name = algorithm.name == "dqn", algorithm.name
     replays = {"ppo": RolloutReplayConfig, "ppo_rpe": PrioritizedReplayConfig}
     config = ExperimentConfig(
-        task=replace(TASK, env_id="CartPole-v1" if discrete else "Pendulum-v1"),
+        task=TASK,
         algorithm=algorithm,
         regularizer=regularizer,
-        replay=replays.get(name, UniformReplayConfig)(batch_size=20),
+        replay=replays.get(algorithm.name, UniformReplayConfig)(batch_size=20),
         compile=compile,
         late_share=0.0,
     )

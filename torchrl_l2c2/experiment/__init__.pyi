@@ -4,7 +4,7 @@ from .envs.environments import make_env
 from .run.evaluation import Evaluation, evaluate_policy
 from .run.experiment import Experiment
 from .run.policies import load_policy
-from .settings.algorithms import DQNConfig, PPOConfig, PPORPEConfig, SACConfig, TD3Config
+from .settings.algorithms import PPOConfig, PPORPEConfig, SACConfig, TD3Config
 from .settings.config import ExperimentConfig, LoggerConfig
 from .settings.optimizers import AdamConfig, AdaTermConfig
 from .settings.regularizers import (
@@ -29,7 +29,6 @@ __all__ = [
     "AdamConfig",
     "CAPSConfig",
     "CATSConfig",
-    "DQNConfig",
     "EpisodeCollector",
     "Evaluation",
     "Experiment",

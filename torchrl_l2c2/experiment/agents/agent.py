@@ -58,11 +58,6 @@ class Agent:
         self.policy_terms |= getattr(self.loss, "policy_terms", frozenset())
 
     @property
-    def exploration(self) -> nn.Module | None:
-        """Exploration module at the end of ``policy``; ``None`` if the policy samples itself."""
-        return exploration_module(self.policy)
-
-    @property
     def device(self) -> torch.device:
         """Device of the loss's parameters and batches."""
         return next(self.loss.parameters()).device
@@ -81,10 +76,8 @@ class Agent:
         return transitions if self.advantage is None else self.advantage(transitions)
 
     def load_networks(self, state: Mapping[str, Any]) -> None:
-        """Restores the networks, the exploration and the normalization from a checkpoint."""
+        """Restores the networks and the normalization from a checkpoint."""
         self.loss.load_state_dict(state["loss"])
-        if self.exploration is not None:
-            self.exploration.load_state_dict(state["exploration"])
         if self.normalization is not None:
             self.normalization.load_state_dict(state["normalization"])
 

@@ -10,13 +10,11 @@ import torch
 from torchrl.envs import EnvBase
 
 from torchrl_l2c2.experiment.agents.agent import Agent
-from torchrl_l2c2.experiment.agents.dqn import make_dqn
 from torchrl_l2c2.experiment.agents.ppo import make_ppo
 from torchrl_l2c2.experiment.agents.ppo_rpe import make_ppo_rpe
 from torchrl_l2c2.experiment.agents.sac import make_sac
 from torchrl_l2c2.experiment.agents.td3 import make_td3
 from torchrl_l2c2.experiment.settings.algorithms import (
-    DQNConfig,
     PPOConfig,
     PPORPEConfig,
     SACConfig,
@@ -84,7 +82,6 @@ make_algorithm.register(PPORPEConfig, make_ppo_rpe)
 make_algorithm.register(SACConfig, make_sac)
 make_algorithm.register(TD3Config, make_td3)
 make_algorithm.register(PPOConfig, make_ppo)
-make_algorithm.register(DQNConfig, make_dqn)
 
 
 def check_device_found(device: str) -> None:

@@ -26,31 +26,22 @@ from torchrl_l2c2.experiment.errors import UserError
 
 
 def check_actions(
-    env: EnvBase, algorithm: str, *, continuous: bool, squashed: bool = False, sampled: bool = True
+    env: EnvBase, algorithm: str, *, squashed: bool = False, sampled: bool = True
 ) -> None:
-    """Checks that an algorithm supports the environment's actions.
+    """Checks that an algorithm can squash the environment's actions into their bounds.
 
     Args:
         env (EnvBase): Environment.
         algorithm (str): Name of the algorithm, for errors.
 
     Keyword Args:
-        continuous (bool): Whether the algorithm needs continuous or discrete actions.
         squashed (bool): Whether actions are squashed into their bounds. Default ``False``.
         sampled (bool): Whether squashed actions are sampled from a distribution, which needs bounds
             that differ. Default ``True``.
 
     Raises:
-        ValueError: If the actions are not continuous or discrete as required, or squashed actions
-            have no bounds or equal bounds.
+        UserError: If squashed actions have no bounds or equal bounds.
     """
-    if env.action_spec.dtype.is_floating_point != continuous:
-        raise UserError(
-            f"algorithm={algorithm} needs {'continuous' if continuous else 'discrete'} actions, "
-            f"got {type(env.action_spec).__name__} of shape "
-            f"{tuple(env.action_spec.shape)}: use algorithm="
-            f"{'dqn' if continuous else 'ppo_rpe'}, or another algorithm."
-        )
     if squashed and not _bounded(env.action_spec):
         raise UserError(
             f"algorithm={algorithm} squashes actions into their bounds, but this task's actions "

@@ -31,7 +31,7 @@ def make_ppo(
     config: PPOConfig, env: EnvBase, regularizer: RegularizerConfig, optimizer: OptimizerConfig
 ) -> Agent:
     """Builds PPO, with the arguments of :func:`~.build.make_algorithm`."""
-    check_actions(env, config.name, continuous=True, squashed=not config.clip_actions)
+    check_actions(env, config.name, squashed=not config.clip_actions)
     activation = {"tanh": nn.Tanh, "relu": nn.ReLU}[config.activation]
     actor = normal_actor(
         env, config.hidden, activation, squash=not config.clip_actions, log_scale=config.log_scale

@@ -25,7 +25,7 @@ def make_ppo_rpe(
     config: PPORPEConfig, env: EnvBase, regularizer: RegularizerConfig, optimizer: OptimizerConfig
 ) -> Agent:
     """Builds PPO-RPE, with the arguments of :func:`~.build.make_algorithm`."""
-    check_actions(env, config.name, continuous=True, squashed=config.squash != "none")
+    check_actions(env, config.name, squashed=config.squash != "none")
     size = observation_size(env)
     actor = make_actor(
         size,

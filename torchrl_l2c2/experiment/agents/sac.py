@@ -24,7 +24,7 @@ def make_sac(
     config: SACConfig, env: EnvBase, regularizer: RegularizerConfig, optimizer: OptimizerConfig
 ) -> Agent:
     """Builds SAC, with the arguments of :func:`~.build.make_algorithm`."""
-    check_actions(env, config.name, continuous=True, squashed=True)
+    check_actions(env, config.name, squashed=True)
     actor = normal_actor(env, config.hidden, nn.ReLU, exponential=config.scale_mapping == "exp")
     loss = SACLoss(
         actor,

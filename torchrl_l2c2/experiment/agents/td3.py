@@ -30,7 +30,7 @@ def make_td3(
     config: TD3Config, env: EnvBase, regularizer: RegularizerConfig, optimizer: OptimizerConfig
 ) -> Agent:
     """Builds TD3, with the arguments of :func:`~.build.make_algorithm`."""
-    check_actions(env, config.name, continuous=True, squashed=True, sampled=False)
+    check_actions(env, config.name, squashed=True, sampled=False)
     spec = env.action_spec
     network = perceptron(env, spec.shape[-1], config.hidden, nn.ReLU)
     bounds = spec.to(torch.get_default_device())

@@ -15,22 +15,18 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.data import OneHot
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
-from torchrl_l2c2.experiment.agents._torchrl_internals import simulator_of
 from torchrl_l2c2.experiment.agents.networks import action_bounds
 from torchrl_l2c2.experiment.collect.episodes import play_episodes
 from torchrl_l2c2.experiment.envs.environments import untransformed
 from torchrl_l2c2.experiment.envs.pictures import control_rate
-from torchrl_l2c2.experiment.envs.spaces import ZeroBasedActions
 from torchrl_l2c2.experiment.errors import MissingPackageError, UserError
 from torchrl_l2c2.experiment.run.files import (
     make_folder,
@@ -51,26 +47,23 @@ TOLERANCE = 1e-4
 class MeanPolicy(nn.Module):
     """A policy's mean action as a function of tensors: ``[B, F]`` to ``[B, A]``.
 
-    It contains the layers, the squashing and the bounds. Discrete actions are the task's own
-    numbers ``[B]``.
+    It contains the layers, the squashing and the bounds.
 
     Args:
         policy (TensorDictModule): The policy, deterministic under
             ``ExplorationType.DETERMINISTIC``.
-        first (int, optional): Number of the first action, if actions are one-hot vectors.
     """
 
-    def __init__(self, policy: TensorDictModule, first: int | None = None) -> None:
+    def __init__(self, policy: TensorDictModule) -> None:
         super().__init__()
         self.policy = policy
-        self.first = first
 
     def forward(self, observation: Tensor) -> Tensor:
         """Returns the mean actions at the observations."""
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             batch = TensorDict({"observation": observation}, observation.shape[:1])
             action: Tensor = self.policy(batch)["action"]
-        return action if self.first is None else self.first + action.argmax(-1)
+        return action
 
 
 @dataclass(frozen=True)
@@ -92,11 +85,10 @@ def export_policy(
     """Writes the mean policy of a run for use without this package, and checks its actions.
 
     ``policy.onnx`` has an input ``observation`` ``[batch, F]`` and an output ``action``
-    ``[batch, A]``, float32; discrete actions are the task's own numbers ``[batch]``.
-    ``policy.pt2`` is the same policy as a ``torch.export`` program. ``contract.json`` has the order
-    of observations and actions, the bounds of the actions, the control rate, the run's test
-    results, the largest difference from PyTorch's actions on recorded observations, and the time
-    of one action.
+    ``[batch, A]``, float32. ``policy.pt2`` is the same policy as a ``torch.export`` program.
+    ``contract.json`` has the order of observations and actions, the bounds of the actions, the
+    control rate, the run's test results, the largest difference from PyTorch's actions on recorded
+    observations, and the time of one action.
 
     Args:
         run (str or Path): The run's folder.
@@ -127,7 +119,7 @@ def export_policy(
     with ProcessState(0):
         played = play_episodes(policy, env, episodes, max_steps=max_steps)
         observations = torch.cat([episode["observation"] for episode in played])
-    mean = MeanPolicy(policy, _first_action(env)).eval()
+    mean = MeanPolicy(policy).eval()
     # Two rows, even if an episode has one step: torch treats a batch of 1 as a constant.
     program, content = _translate(mean, observations[[0, -1]])
     act = _onnx_function(content)
@@ -236,16 +228,6 @@ def _describe_observation(env: EnvBase) -> dict[str, Any]:
     return {"shape": ["batch", size], "dtype": "float32", "entries": names}
 
 
-def _wrapper(env: EnvBase, kind: type) -> Any:
-    """Returns the outermost wrapper of a kind around the simulator; ``None`` without one."""
-    wrapped = simulator_of(untransformed(env))
-    while isinstance(wrapped, gymnasium.Wrapper):
-        if isinstance(wrapped, kind):
-            return wrapped
-        wrapped = wrapped.env
-    return None
-
-
 def entry_names(space: Any, size: int) -> list[str]:
     """Names the entries of an observation vector by their keys, in the order of the vector.
 
@@ -262,18 +244,8 @@ def entry_names(space: Any, size: int) -> list[str]:
     return names if len(names) == size else [f"observation[{i}]" for i in range(size)]
 
 
-def _first_action(env: EnvBase) -> int | None:
-    """Returns the task's number of its first action; ``None`` for actions that are vectors."""
-    counted = _wrapper(env, ZeroBasedActions)
-    first = 0 if counted is None else counted.first
-    return first if isinstance(env.action_spec, OneHot) else None
-
-
 def _describe_action(env: EnvBase) -> dict[str, Any]:
     spec = env.action_spec
-    if (first := _first_action(env)) is not None:
-        choices = {"choices": spec.shape[-1], "first": first}
-        return {"shape": ["batch"], "dtype": "int64", **choices}
     size = spec.shape[-1]
     described = {
         "shape": ["batch", size],

@@ -311,8 +311,6 @@ def describe_preset(config: ExperimentConfig) -> str | None:
     if regularizer.name not in BEGIN_WITH_PRESET:
         return None
     method, _ = BEGIN_WITH_PRESET[regularizer.name]
-    if algorithm not in KINDS:
-        return f"regularizer={regularizer.name}: there is no preset for {algorithm}, only defaults"
     initial = preset_settings(regularizer.name, algorithm)
     chosen = ", ".join(f"{name}={getattr(regularizer, name)}" for name in initial)
     source = preset(method, algorithm)

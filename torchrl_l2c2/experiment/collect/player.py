@@ -10,7 +10,6 @@ from typing import Any, TypeVar
 import torch
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
-from torchrl.modules import EGreedyModule
 
 from torchrl_l2c2.experiment.agents.agent import Agent
 from torchrl_l2c2.experiment.collect.episodes import EpisodeCollector
@@ -138,7 +137,7 @@ class Player:
         frame = self._simulate(self.collector.step)
         if not frame.is_finite():
             check_finite(stack_frames([frame]), self.frames)
-        self._count(1)
+        self.frames += 1
         return frame
 
     def discard_episode(self) -> None:
@@ -152,12 +151,7 @@ class Player:
 
     def _check_and_count(self, frames: TensorDictBase) -> None:
         check_finite(frames, self.frames)
-        self._count(frames.numel())
-
-    def _count(self, frames: int) -> None:
-        self.frames += frames
-        if isinstance(self._agent.exploration, EGreedyModule):
-            self._agent.exploration.step(frames)
+        self.frames += frames.numel()
 
     @torch.no_grad()
     def measure(

@@ -65,19 +65,17 @@ def with_vector_observation(env: Env, *, flatten: bool) -> Env:
 
 
 def with_vector_action(env: Env) -> Env:
-    """Wraps a task to take a float32 vector or an index from 0; returns the task if it does.
+    """Wraps a task to take a float32 vector; returns the task if it does.
 
     Raises:
-        ValueError: If the actions have another type.
+        UserError: If the actions have another type.
     """
     space: Any = env.action_space
-    if isinstance(space, spaces.Discrete):
-        return ZeroBasedActions(env) if space.start else env
     vector = isinstance(space, spaces.Box) and len(space.shape) == 1
     if not vector or not np.issubdtype(space.dtype, np.floating):
         raise UserError(
-            f"the task's actions are a {_kind(space)}; they must be one vector of floats or "
-            "Discrete: wrap the task in a gymnasium.ActionWrapper, and register the result."
+            f"the task's actions are a {_kind(space)}; they must be one vector of floats: wrap the "
+            "task in a gymnasium.ActionWrapper, and register the result."
         )
     if space.dtype == np.float32:
         return env
@@ -86,15 +84,6 @@ def with_vector_action(env: Env) -> Env:
     return TransformAction(
         env, lambda action: np.clip(action.astype(dtype), low, high), _float32(space)
     )
-
-
-class ZeroBasedActions(TransformAction[Any, Any, Any]):
-    """Wrapper with Discrete actions from 0 for a task whose actions start at ``first``."""
-
-    def __init__(self, env: Env) -> None:
-        space: Any = env.action_space
-        self.first = int(space.start)
-        super().__init__(env, lambda action: self.first + action, spaces.Discrete(int(space.n)))
 
 
 def _float32(space: Any) -> Any:

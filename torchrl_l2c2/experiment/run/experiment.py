@@ -330,7 +330,7 @@ class Experiment:
 
     def _parts(self) -> dict[str, Any]:
         """Returns the objects with a state by their names in checkpoints."""
-        named = ("loss", "optimizer", "target_updater", "exploration", "normalization")
+        named = ("loss", "optimizer", "target_updater", "normalization")
         parts = {name: getattr(self.agent, name) for name in named}
         parts |= {"best_policy": self._best_policy, "gain": self._gain, "metrics_log": self._log}
         return {name: part for name, part in parts.items() if part is not None}

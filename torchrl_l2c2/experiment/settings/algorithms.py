@@ -386,24 +386,9 @@ class PPOConfig(AlgorithmConfig):
                 )
 
 
-@settings
-class DQNConfig(PerStepConfig):
-    """Double deep Q-learning, for discrete actions."""
-
-    name: str = "dqn"
-    epsilon_end: float = Field(
-        default=0.05, ge=0, le=1, description="final probability of a random action"
-    )
-    epsilon_frames: int = Field(
-        default=10_000, ge=1, description="frames until epsilon_end is reached"
-    )
-    hidden: Layers = Field(default=(120, 84), description="neurons of the hidden layers")
-
-
 ALGORITHMS: dict[str, AlgorithmConfig] = {
     "ppo_rpe": PPORPEConfig(),
     "sac": SACConfig(),
     "td3": TD3Config(),
     "ppo": PPOConfig(),
-    "dqn": DQNConfig(),
 }
