@@ -3,8 +3,6 @@
 import csv
 import json
 import math
-import subprocess
-import sys
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -456,9 +454,7 @@ SHORTER = ("algorithm.replay_ratio=1", "test_episodes=1")
 
 def test_a_run_from_the_command_line_leaves_everything_behind(tmp_path):
     """Configuration, versions, metrics, policy, test episodes, picture; the result is printed."""
-    overrides = (*PENDULUM_OVERRIDES, f"outputs={tmp_path}", "compile=false")
-    command = [sys.executable, ROOT / "train.py", *overrides, "logger=tensorboard"]
-    finished = subprocess.run(command, capture_output=True, text=True, check=True)
+    finished = run_train(*PENDULUM_OVERRIDES, "logger=tensorboard", folder=tmp_path)
     assert finished.stdout.count("2 test episodes, seed 0") == 2  # mean and sampled actions
     (run,) = read_runs(tmp_path)
     assert "(the preset for ppo_rpe: results/paper.md" in (run.folder / "train.log").read_text()

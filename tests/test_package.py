@@ -30,7 +30,7 @@ def test_the_types_fit():
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-# What is imported, and when, in a process that has imported nothing yet: one for all tests.
+# What is imported, and when, in a process that has imported nothing yet.
 IMPORTS = """
 import json, sys, torchrl
 begun = set(sys.modules)
@@ -55,17 +55,18 @@ print(json.dumps(told))
 """
 
 
-@pytest.fixture(scope="module")
-def imported():
-    """What that process tells."""
+def test_importing_the_package_imports_only_what_is_used():
+    """No module before one of its names is used, and nothing of the experiment's packages.
+
+    Importing the configurations for TorchRL's trainers stores none of them.
+    """
     command = [sys.executable, "-c", IMPORTS]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
-    return json.loads(done.stdout.splitlines()[-1])
-
-
-def test_importing_the_components_needs_nothing_of_the_experiment(imported):
-    """No Hydra, Gymnasium, PyBullet or drawing library beyond what torchrl itself imports."""
+    imported = json.loads(done.stdout.splitlines()[-1])
+    assert imported["at first"] == [] and not imported["losses"]
+    assert imported["dir"] and imported["named"] == ["L2C2Loss", True]
     assert imported["components"] == []
+    assert imported["stored"] == [True, False] and imported["registered"]
 
 
 # As where none of them is installed.
@@ -92,12 +93,6 @@ def test_the_components_work_without_the_experiments_packages():
     assert done.stdout == "True\n", done.stderr
 
 
-def test_hydra_is_optional_and_registration_explicit(imported):
-    """Importing the package imports no Hydra; importing the configurations stores none of them."""
-    assert imported["at first"] == []
-    assert imported["stored"] == [True, False] and imported["registered"]
-
-
 def test_the_package_says_what_there_is_without_torch():
     """Commands that exist."""
     code = "import runpy, sys; runpy.run_module('torchrl_l2c2'); print('torch' in sys.modules)"
@@ -114,12 +109,6 @@ def test_the_package_says_what_there_is_without_torch():
     assert done.stdout.endswith("False\n")
     for command in re.findall(r"python -m (\S+)", done.stdout):
         assert find_spec(command), command
-
-
-def test_importing_the_package_puts_off_what_it_exports(imported):
-    """Not one of its modules is imported before a name of it is used; then it is there."""
-    assert imported["at first"] == [] and not imported["losses"]
-    assert imported["dir"] and imported["named"] == ["L2C2Loss", True]
 
 
 def test_every_public_name_is_documented_with_an_example():

@@ -1,12 +1,11 @@
 """A run has the process's generators and threads for itself, and leaves them as they were."""
 
 import random
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 import torch
+from processes import run_train
 from small import ALGORITHMS
 
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig, TaskConfig
@@ -71,7 +70,7 @@ def test_two_runs_in_turns_are_as_one_after_the_other():
     assert rows == [[row["return"] for row in alone.train()]] * 2
 
 
-def test_memory_that_was_freed_is_not_handed_out_anew():
+def test_memory_that_was_freed_is_not_handed_out_anew(tmp_path):
     """Page faults of tensors that come and go together: thousands, and in the end next to none."""
     code = """
 import random, resource, torch
@@ -86,9 +85,8 @@ def faults():
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 print([faults() for _ in range(2)][-1], keep_freed_memory(), [faults() for _ in range(5)][-1])
 """
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=300
-    )
+    (tmp_path / "script.py").write_text(code)
+    done = run_train(cwd=tmp_path, script=tmp_path / "script.py")
     before, taken, after = done.stdout.split()
     if taken == "False":
         pytest.skip("the C library is not glibc")

@@ -46,6 +46,7 @@ ALGORITHMS = {
 RIVALS = ("caps", "cats", "grad_caps", "asap", "sr2l", "lcp")
 METHODS = {
     **{name: REGULARIZERS[name] for name in ("none", "l2c2", "l2c2_mean", "l2c2_ramp", *RIVALS)},
+    "sr2l": replace(REGULARIZERS["sr2l"], steps=2),
     "half of the batch": L2C2Config(fraction=0.5),
     "the worst of four": L2C2Config(num_samples=4, over_neighbors="max"),
 }
