@@ -20,6 +20,7 @@ from torchrl_l2c2.experiment import (
 )
 from torchrl_l2c2.experiment.cli import diagnose, export, video
 from torchrl_l2c2.experiment.cli.evaluate import main
+from torchrl_l2c2.experiment.run.checkpoints import list_checkpoints, load_checkpoint
 from torchrl_l2c2.experiment.run.evaluation import Evaluation
 
 # What each command begins with.
@@ -74,15 +75,6 @@ def test_tests_during_training_are_continued_with_the_run(tmp_path):
     assert whole._best_policy.tests == parts._best_policy.tests
 
 
-def test_a_run_in_another_folder_takes_its_best_policy_along(folder, tmp_path):
-    """Even where no later one is better, or tested."""
-    config = ExperimentConfig(**FEW_UPDATES | {"task": replace(TASK, episodes=8)})
-    Experiment(config, tmp_path / "new", resume=folder).close()
-    for name in ("evaluations.json", "policy_best.pt"):
-        brought = (tmp_path / "new" / name).read_bytes()
-        assert brought == (folder / name).read_bytes()
-
-
 def test_a_run_without_tests_plays_none():
     """And a test of none is asked for in vain."""
     experiment = Experiment(ExperimentConfig(**FEW_UPDATES, test_episodes=0))
@@ -115,7 +107,8 @@ def test_evaluate_plays_as_it_is_told(folder):
 
 def test_without_a_seed_evaluate_plays_the_runs_own_test(folder):
     """Its samples, too."""
-    own = Experiment(ExperimentConfig(**FEW_UPDATES), resume=folder)
+    own = Experiment(ExperimentConfig(**FEW_UPDATES))
+    own.load_state_dict(load_checkpoint(list_checkpoints(folder)[0]))
     for arguments, sampled in (([], False), (["--sampled"], True)):
         returns = own.test(3, sampled=sampled).returns
         assert evaluated(folder, *arguments)["episodes"]["returns"] == returns

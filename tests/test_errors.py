@@ -98,7 +98,6 @@ def test_help_may_have_no_reader():
     [
         ("task.env_id=Nowhere-v0", "'Nowhere-v0' is not a task that Gymnasium can create here"),
         ("task.env_id=my_robot:Robot-v0", "No module named 'my_robot'"),
-        ("resume=nowhere", "resume='nowhere' has no checkpoint"),
     ],
 )
 def test_what_is_not_there_is_told_before_torch_is_imported(tmp_path, setting, told):

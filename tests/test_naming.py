@@ -80,7 +80,7 @@ def test_shells_hydra_and_every_file_system_take_a_name_as_it_is(beta, env_id, h
         )
     )
     assert shlex.quote(name) == name
-    (override,) = OverridesParser.create().parse_overrides([f"resume=outputs/{name}"])
+    (override,) = OverridesParser.create().parse_overrides([f"hydra.run.dir=outputs/{name}"])
     assert override.value() == f"outputs/{name}" and not override.is_sweep_override()
     for part in name.split("/"):
         assert 0 < len(part) <= MAX_PART_LENGTH and not part.endswith(".")

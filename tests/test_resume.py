@@ -32,7 +32,7 @@ from torchrl_l2c2.experiment import (
     UniformReplayConfig,
 )
 from torchrl_l2c2.experiment.analysis.reports import find_runs, finished_run, read_runs
-from torchrl_l2c2.experiment.cli.train import _log_errors, run
+from torchrl_l2c2.experiment.cli.train import _log_errors
 from torchrl_l2c2.experiment.errors import OtherRunError, warnings_as_lines
 from torchrl_l2c2.experiment.run.checkpoints import (
     CheckpointError,
@@ -170,12 +170,21 @@ def test_a_continued_run_is_the_uninterrupted_one(tmp_path, settings):
     assert second.test() == whole.test()
 
 
-def test_a_run_can_be_continued_in_another_folder(trained, tmp_path):
-    """resume= reads there and writes here."""
-    longer = Experiment(small(task=replace(SWINGUP, episodes=8)), tmp_path / "b", resume=trained)
-    longer.train()
-    assert len(lines(trained)) == 6
-    assert [row["episode"] for row in lines(tmp_path / "b")] == [str(i) for i in range(1, 9)]
+def test_a_copied_folder_continues_in_its_new_place(tmp_path):
+    """As ``cp -r`` copies it, with its lock; the old folder stays as it is."""
+    task = TaskConfig("pendulum", "Pendulum-v1", episodes=4, max_steps=30)
+    old, new = tmp_path / "old", tmp_path / "new"
+    whole = Experiment(small(task=task))
+    whole.train()
+    first = Experiment(small(task=replace(task, episodes=2)), old)  # Keeps the lock.
+    first.train()
+    before = contents(old)
+    again = Experiment(small(task=task), shutil.copytree(old, new))
+    assert len(again.metrics) == 2
+    again.train()
+    assert parameter_hash(again) == parameter_hash(whole)
+    assert [row["episode"] for row in lines(new)] == ["1", "2", "3", "4"]
+    assert contents(old) == before
 
 
 @pytest.mark.parametrize("steps", range(8))
@@ -357,25 +366,6 @@ def of_other_versions(folder, **changed):
     state = load_checkpoint(newest)
     state["versions"] = json.dumps(json.loads(state["versions"]) | changed)
     save_checkpoint(folder, int(newest.stem.split("_")[1]), state, keep=1)
-
-
-@pytest.mark.parametrize("what", ["other settings", "nothing"])
-def test_what_is_refused_from_elsewhere_leaves_no_folder(tmp_path, what):
-    """Neither that of the run, nor a lock in it."""
-    if what == "other settings":
-        Experiment(small(), tmp_path / "a").train(1)
-    with pytest.raises(OtherRunError if what == "other settings" else CheckpointError):
-        Experiment(small(seed=7), tmp_path / "b" / "c", resume=tmp_path / "a")
-    assert not (tmp_path / "b").exists()
-
-
-def test_what_is_no_run_is_refused_where_there_is_one_already(ended):
-    """One that has checkpoints, and one that the command finds finished."""
-    values = {"resume": str(ended / "nonsense"), "allow_other_versions": False}
-    for again in (partial(Experiment, small(), ended, resume=values["resume"]),
-                  partial(run, small(), ended, values)):  # fmt: skip
-        with pytest.raises(CheckpointError, match=r"nonsense' has no checkpoint_.*leave resume"):
-            again()
 
 
 def test_other_versions_are_refused_unless_they_are_allowed(trained):

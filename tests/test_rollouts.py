@@ -305,7 +305,7 @@ def test_a_signal_is_heeded_after_a_rollout_that_no_episode_ended_in(tmp_path, m
         first.train()
     assert first.player.frames == 40 and 0.0 < first._gain.gain.value < 0.3
     first.close()
-    again = Experiment(first.config, tmp_path / "again", resume=tmp_path / "first")
+    again = Experiment(first.config, tmp_path / "first")
     again.train()
     for row in (*again.metrics, *whole.metrics):
         del row["frames_per_second"]

@@ -17,7 +17,7 @@ from small import own_nodes
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig
 from torchrl_l2c2.experiment.cli.composition import (
     CONF,
-    check_folder_name,
+    check_outputs,
     composition_errors,
     register,
 )
@@ -164,17 +164,12 @@ def test_the_whole_error_is_shown_where_it_is_asked_for(settings_of, monkeypatch
         settings_of("sed=1")
 
 
-@pytest.mark.parametrize(
-    ("setting", "given"),
-    [("outputs", None), ("outputs", ""), ("resume", ""), ("resume", [1]), ("outputs", False)],
-)
-def test_what_is_no_folder_is_refused(setting, given):
-    """A number may name one, and nothing need be resumed."""
-    with pytest.raises(SettingError, match=rf"{setting} must be a folder, got "):
-        check_folder_name(setting, given)
-    assert (
-        check_folder_name("outputs", 2026) == "2026" and check_folder_name("resume", None) is None
-    )
+@pytest.mark.parametrize("given", [None, "", [1], False])
+def test_what_is_no_folder_is_refused(given):
+    """A number may name one."""
+    with pytest.raises(SettingError, match="outputs must be a folder, got "):
+        check_outputs(given)
+    assert check_outputs(2026) == "2026"
 
 
 def kinds_of_settings():

@@ -82,8 +82,7 @@ def read(values: dict[str, Any]) -> tuple[ExperimentConfig, Path]:
     """
     chosen = HydraConfig.get()
     check_preset(values, chosen.runtime.choices.get("preset"))
-    for name in ("outputs", "resume"):
-        values[name] = check_folder_name(name, values[name])
+    values["outputs"] = check_outputs(values["outputs"])
     config = ExperimentConfig.from_dict(values)
     check_budget(config, chosen.overrides.task)
     multirun = chosen.mode == RunMode.MULTIRUN
@@ -287,21 +286,18 @@ def _suggest_two_commands(group: str, having: Sequence[str]) -> str:
     )
 
 
-def check_folder_name(setting: str, given: Any) -> str | None:
-    """Returns the name of a folder as text. It may be a number, and ``resume`` may be ``None``.
+def check_outputs(given: Any) -> str:
+    """Returns the folder of ``outputs`` as text; its name may be a number.
 
     Args:
-        setting (str): Name of the setting.
         given: Value of the setting.
 
     Raises:
         SettingError: If the value is not the name of a folder.
     """
-    if setting == "resume" and given is None:
-        return None
     named = str(given) if type(given) in (int, float) else given
     if not isinstance(named, str) or not named:
-        raise SettingError(setting, f"must be a folder, got {given!r}.")
+        raise SettingError("outputs", f"must be a folder, got {given!r}.")
     return named
 
 

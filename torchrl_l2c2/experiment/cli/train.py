@@ -181,7 +181,7 @@ def _main(values: DictConfig) -> None:
         return
     try:
         show_sweep_hint()
-        run(*read(plain), plain)
+        run(*read(plain), allow_other_versions=plain["allow_other_versions"])
     except Interrupted as interruption:
         print(interruption, file=sys.stderr)
         sys.exit(128 + interruption.signal_number)
@@ -203,7 +203,13 @@ def _run_job(values: dict[str, Any], sweep: Sweep) -> None:
             patience = LOST_SECONDS if started_before else 0.0
             config, folder = read(values)
             sweep.claim(number, folder)
-            finished = run(config, folder, values, _sweep_status(sweep), patience)
+            finished = run(
+                config,
+                folder,
+                allow_other_versions=values["allow_other_versions"],
+                status=_sweep_status(sweep),
+                patience=patience,
+            )
             if finished is not None:
                 sweep.add_finished(number, finished.folder, finished.record.seconds)
     except (Interrupted, KeyboardInterrupt) as interruption:
@@ -244,7 +250,8 @@ def _print_error(error: Exception) -> str:
 def run(
     config: ExperimentConfig,
     folder: Path,
-    values: dict[str, Any],
+    *,
+    allow_other_versions: bool,
     status: str = "",
     patience: float = 0.0,
 ) -> FinishedRun | None:
@@ -253,7 +260,9 @@ def run(
     Args:
         config (ExperimentConfig): Settings of the run.
         folder (Path): Run folder.
-        values (dict): Configuration with the settings of the command.
+
+    Keyword Args:
+        allow_other_versions (bool): Setting of the command.
         status (str): Progress of the sweep, shown before the run's name. Default: none.
         patience (float): Maximum time in seconds to wait for another process that uses the folder.
             Default 0.
@@ -263,11 +272,10 @@ def run(
     """
     # Local imports: settings are checked before torch is imported.
     from torchrl_l2c2.experiment.envs.spaces import check_env_id
-    from torchrl_l2c2.experiment.run.continuation import check_resume_folder, warn_ignored_settings
+    from torchrl_l2c2.experiment.run.continuation import warn_ignored_settings
     from torchrl_l2c2.experiment.run.finished import finished_run
     from torchrl_l2c2.experiment.run.lock import wait_for_folder
 
-    check_resume_folder(values["resume"])
     if not (folder / "evaluation.json").exists():
         check_installed(config.logger.name)
         check_env_id(config.task.env_id)
@@ -285,7 +293,7 @@ def run(
     with _log_errors(folder):
         finished = finished_run(folder, config.to_dict())
         if finished is None:
-            finished = _train(config, folder, values, status)
+            finished = _train(config, folder, status, allow_other_versions=allow_other_versions)
         else:
             print(
                 "finished before: these are its results. Use another seed= or outputs= for a new "
@@ -307,7 +315,7 @@ def _silence_libraries() -> None:
 
 
 def _train(
-    config: ExperimentConfig, folder: Path, values: dict[str, Any], status: str
+    config: ExperimentConfig, folder: Path, status: str, *, allow_other_versions: bool
 ) -> FinishedRun | None:
     """Trains a policy, and tests it unless ``test_episodes`` is 0."""
     from torchrl_l2c2.experiment.run.experiment import Experiment
@@ -315,10 +323,11 @@ def _train(
     from torchrl_l2c2.experiment.run.process import keep_freed_memory
 
     keep_freed_memory()
-    options = {name: values[name] for name in ("resume", "allow_other_versions")}
     with (
         warnings_as_lines(partial(show_and_log, folder)),
-        closing(Experiment(config, folder, **options)) as experiment,
+        closing(
+            Experiment(config, folder, allow_other_versions=allow_other_versions)
+        ) as experiment,
     ):
         if (description := describe_preset(config)) is not None:
             log(folder, description)

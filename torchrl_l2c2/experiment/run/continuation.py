@@ -139,52 +139,6 @@ def find_checkpoint(
     return path, state
 
 
-def check_resume_folder(folder: str | Path | None) -> None:
-    """Checks that the folder of ``resume`` has a checkpoint.
-
-    Raises:
-        CheckpointError: If it has none.
-    """
-    if folder is not None and not list_checkpoints(folder):
-        raise CheckpointError(
-            f"resume={str(folder)!r} has no checkpoint_*.pt: choose the folder of another run, or "
-            "leave resume out. To continue a run in its own folder, no resume is necessary."
-        )
-
-
-def find_resume_checkpoint(
-    folder: str | Path | None,
-    own: Path | None,
-    config: ExperimentConfig,
-    *,
-    allow_other_versions: bool,
-) -> tuple[Path, dict[str, Any]] | None:
-    """Finds the checkpoint in the folder of ``resume``, unless the run has its own checkpoint.
-
-    The run's own checkpoint has priority, so the same command continues the run. The run's own
-    folder need not exist, and is not created.
-
-    Args:
-        folder (str or Path, optional): Folder of ``resume``.
-        own (Path, optional): The run's own folder.
-        config (ExperimentConfig): Current settings.
-
-    Keyword Args:
-        allow_other_versions (bool): Whether versions of packages may differ, with a warning.
-
-    Returns:
-        tuple: Path and state; ``None`` without ``resume`` or if the run has its own checkpoint.
-
-    Raises:
-        CheckpointError: If the folder has no checkpoint, and as :func:`find_checkpoint`.
-        OtherRunError: As :func:`check_continuable`.
-    """
-    check_resume_folder(folder)
-    if folder is None or (own is not None and list_checkpoints(own)):
-        return None
-    return find_checkpoint(folder, config, allow_other_versions=allow_other_versions)
-
-
 def check_continuable(
     state: Mapping[str, Any], config: ExperimentConfig, *, allow_other_versions: bool
 ) -> None:

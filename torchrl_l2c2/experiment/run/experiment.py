@@ -24,12 +24,11 @@ from torchrl_l2c2.experiment.run.continuation import (
     check_length,
     check_same_settings,
     find_checkpoint,
-    find_resume_checkpoint,
 )
 from torchrl_l2c2.experiment.run.evaluation import Evaluation, LateTests, evaluate_task
 from torchrl_l2c2.experiment.run.files import make_folder
 from torchrl_l2c2.experiment.run.finished import FinishedRun, write_evaluation
-from torchrl_l2c2.experiment.run.folder import copy_training_files, prepare_folder, versions
+from torchrl_l2c2.experiment.run.folder import prepare_folder, versions
 from torchrl_l2c2.experiment.run.gain_schedule import GainControl
 from torchrl_l2c2.experiment.run.lock import lock_folder
 from torchrl_l2c2.experiment.run.metrics_log import MetricsLog, check_installed
@@ -55,8 +54,6 @@ class Experiment:
             continues from it. Default: nothing is written.
 
     Keyword Args:
-        resume (str or Path, optional): Folder of another run to continue from; results are written
-            to ``folder``.
         allow_other_versions (bool): Whether to continue runs of other versions of PyTorch, TorchRL
             or a simulator, with a warning. The numbers may then differ from an uninterrupted run.
             Default ``False``.
@@ -89,7 +86,6 @@ class Experiment:
         config: ExperimentConfig | None = None,
         folder: str | Path | None = None,
         *,
-        resume: str | Path | None = None,
         allow_other_versions: bool = False,
     ) -> None:
         self.config = config = config or ExperimentConfig()
@@ -115,7 +111,8 @@ class Experiment:
         try:
             self._best_policy = BestPolicy(config, self.agent.policy, self.folder)
             self._gain = GainControl(config, self.learner)
-            self._start(resume, allow_other_versions)
+            if self.folder is not None:
+                self._start(self.folder, allow_other_versions)
         except BaseException:
             self.close()
             raise
@@ -306,27 +303,16 @@ class Experiment:
         self._log.close()
         self._unlock()
 
-    def _start(self, elsewhere: str | Path | None, allow_other_versions: bool) -> None:
-        options = {"allow_other_versions": allow_other_versions}
-        found = find_resume_checkpoint(elsewhere, self.folder, self.config, **options)
-        if self.folder is not None:
-            # After the checks: refused settings do not create a folder.
-            self._unlock = lock_folder(make_folder(self.folder), self)
-            found = find_checkpoint(self.folder, self.config, **options) or found
-        self._log = MetricsLog(self.folder, logger=self.config.logger.name)
+    def _start(self, folder: Path, allow_other_versions: bool) -> None:
+        self._unlock = lock_folder(make_folder(folder), self)
+        found = find_checkpoint(folder, self.config, allow_other_versions=allow_other_versions)
+        self._log = MetricsLog(folder, logger=self.config.logger.name)
         if found is not None:
-            self._continue_from(*found)
-        if self.folder is not None:
-            ended = self._ended(self.config.task.budget)
-            prepare_folder(
-                self.folder, self.config.to_dict(), resumed=found is not None, ended=ended
-            )
-
-    def _continue_from(self, path: Path, state: dict[str, Any]) -> None:
-        if self.folder is not None and path.parent != self.folder:
-            copy_training_files(path.parent, self.folder)
-        self.load_state_dict(state)
-        show_and_log(self.folder, f"continuing after episode {len(self.metrics)} from {path}")
+            path, state = found
+            self.load_state_dict(state)
+            show_and_log(folder, f"continuing after episode {len(self.metrics)} from {path}")
+        ended = self._ended(self.config.task.budget)
+        prepare_folder(folder, self.config.to_dict(), resumed=found is not None, ended=ended)
 
     def _parts(self) -> dict[str, Any]:
         """Returns the objects with a state by their names in checkpoints."""

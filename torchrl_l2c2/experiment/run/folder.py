@@ -23,7 +23,7 @@ config.json           all settings
 versions.json         versions of the packages that affect the numbers
 metrics.csv           one line per training episode
 train.log             messages of the run
-checkpoint_*.pt       to continue, run the same command again, or use resume=FOLDER
+checkpoint_*.pt       to continue, run the same command again
 policy.pt             state_dict of the acting policy after training
 policy_best.pt        best policy of evaluations.json (evaluate_every)
 evaluations.json      tests during training (evaluate_every)
@@ -76,12 +76,6 @@ def prepare_folder(folder: Path, settings: dict[str, Any], *, resumed: bool, end
     write_json(folder / "config.json", settings)
     write_json(folder / "versions.json", {**versions(), "commit": code_commit()})
     write_atomically(folder / "README.txt", README.encode())
-
-
-def copy_training_files(old: Path, new: Path) -> None:
-    """Copies the files that a resumed run continues to write in its new folder."""
-    for path in filter(Path.exists, (old / name for name in TRAINING_FILES)):
-        write_atomically(new / path.name, path.read_bytes())
 
 
 def versions() -> dict[str, str]:

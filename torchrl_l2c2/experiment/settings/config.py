@@ -59,10 +59,6 @@ COMMAND_SETTINGS = {
     "outputs": ("outputs", "parent folder of all run folders"),
     "preset": ("null", "settings of a task and an algorithm: baselines, rl_zoo, field"),
     "experiment": ("null", "a whole comparison from conf/experiment/, with -m"),
-    "resume": (
-        "null",
-        "folder of another run to continue from; null: the run's own folder",
-    ),
     "allow_other_versions": (
         "false",
         "continue a checkpoint made with other versions of torch, TorchRL or a simulator",
@@ -179,8 +175,7 @@ class ExperimentConfig:
         Args:
             values (Mapping): Settings by group and name. Missing settings have the defaults of the
                 group's ``name``; for ``l2c2``, the paper's settings. Settings of the command
-                (``outputs``, ``preset``, ``resume``, ``experiment``, ``allow_other_versions``) are
-                ignored.
+                (``outputs``, ``preset``, ``experiment``, ``allow_other_versions``) are ignored.
 
         Raises:
             SettingError: If a key or name is unknown, or a value is outside its range.
