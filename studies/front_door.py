@@ -176,8 +176,8 @@ def table(path: Path, algorithms: Iterable[str] = ALGORITHMS) -> str:
     """Means with 95% intervals over the seeds that both methods have, and probabilities."""
     with path.open(newline="") as file:
         found = {(r["algorithm"], r["method"], r["seed"]): r for r in csv.DictReader(file)}
-    columns = ["algorithm (seeds)", "action variation: baseline", "with `smooth`", "P(smoother)"]
-    columns += ["return: baseline", "with `smooth`", "P(returns more)"]
+    columns = ["trained (seeds)", "action variation: baseline", "with L2C2", "P(smoother)"]
+    columns += ["return: baseline", "with L2C2", "P(returns more)"]
     rows = [columns, ["---"] * len(columns)]
     for algorithm in algorithms:
         both = [

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from studies import field, front_door, paper
+from studies import field, front_door, paper, rsl_rl
 from studies.cells import digest, number_range, regrouped
 from studies.field import BETTER, TEST, field_groups, field_table
 from studies.methods import against_table, choice_table, pairwise_tables
@@ -132,6 +132,9 @@ def pages() -> dict[str, Page]:
         "results/parts.md": Page({"parts": parts()}),
         "results/front_door.md": Page(
             {"results": front_door.table(ROOT / "results" / "front_door.csv")}
+        ),
+        "results/rsl_rl.md": Page(
+            {"results": front_door.table(ROOT / "results" / "rsl_rl.csv", [rsl_rl.TASK])}
         ),
         "results/td3.md": Page({"test": td3_test(), "choice": td3_choice()}),
         "results/field_gains.md": Page(dict(zip(("rivals", "one", "caps"), chosen, strict=True))),
