@@ -9,7 +9,7 @@ import pytest
 from studies.filters import COLUMNS, CONDITIONS, main, play
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig, PPORPEConfig, TaskConfig
 from torchrl_l2c2.experiment.analysis.reports import FinishedRun
-from torchrl_l2c2.experiment.envs.environments import make_env
+from torchrl_l2c2.experiment.envs.environments import ActionRatePenalty
 from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.settings.regularizers import REGULARIZERS
 
@@ -95,5 +95,7 @@ def test_only_training_has_the_action_rate_penalty(runs):
     first, other = (FinishedRun.read(runs / name) for name in ("none_0", "none_5"))
     assert first.evaluation["episodes"] == other.evaluation["episodes"]
     assert first.column("return")[0] > other.column("return")[0] + 0.01
+    free = gymnasium.make("Pendulum-v1")
+    free.action_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,), np.float32)
     with pytest.raises(UserError, match=r"Expected bounded actions with task\.action_rate=1"):
-        make_env(TaskConfig("cartpole", "CartPole-v1", action_rate=1.0), 0)
+        ActionRatePenalty(free, 1.0)
