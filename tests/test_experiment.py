@@ -335,24 +335,6 @@ def test_a_broken_simulator_stops_the_run_and_leaves_a_checkpoint(
     assert len(again.metrics) == 1 and len(again.train()) == 2
 
 
-@pytest.mark.parametrize("entry", [("next", "reward"), "observation"])
-def test_a_batch_that_is_not_finite_can_be_skipped(entry):
-    """Nothing changes but the count; a finite batch then learns as ever."""
-    experiment = Experiment(small(on_nonfinite="skip"))
-    experiment.train()
-    loss = experiment.agent.loss
-    before = [p.clone() for p in (*loss.parameters(), *loss.buffers())]
-    rows = experiment.learner.replay.storage._storage[entry]
-    finite = rows.clone()
-    rows.fill_(float("nan"))
-    assert experiment.learner.update(True) is None
-    after = (*loss.parameters(), *loss.buffers())
-    assert all(torch.equal(a, b) for a, b in zip(before, after, strict=True))
-    rows.copy_(finite)
-    assert experiment.learner.update(True)[0].isfinite().all()
-    assert experiment.metrics[-1]["skipped_updates"] == 0
-
-
 def test_a_loss_that_is_not_finite_stops_the_run_with_its_name(monkeypatch):
     """The term, the update and the frame."""
     experiment = Experiment(small())

@@ -3,10 +3,8 @@
 import math
 from dataclasses import replace
 
-import gymnasium
 import pytest
 import torch
-from gymnasium.envs.classic_control.pendulum import PendulumEnv
 from tensordict import TensorDict
 from torchrl.envs import ExplorationType, set_exploration_type
 
@@ -16,7 +14,6 @@ from torchrl_l2c2.experiment import (
     EpisodeCollector,
     Experiment,
     ExperimentConfig,
-    NoRegularizerConfig,
     PPOConfig,
     PPORPEConfig,
     RolloutReplayConfig,
@@ -28,7 +25,6 @@ from torchrl_l2c2.experiment import (
 from torchrl_l2c2.experiment.agents.normalization import Normalization
 from torchrl_l2c2.experiment.agents.optimizers import anneal, make_optimizer
 from torchrl_l2c2.experiment.envs.environments import NOISE_SEED
-from torchrl_l2c2.experiment.learn.learner import MAX_SKIPPED
 from torchrl_l2c2.experiment.run.checkpoints import list_checkpoints
 from torchrl_l2c2.experiment.run.evaluation import LateTests
 from torchrl_l2c2.experiment.settings.tasks import Budget
@@ -107,87 +103,6 @@ def test_a_frames_reward_is_scaled_as_an_episodes():
     run.learner.remember_frame(frame)
     stored = run.learner.replay[:]["next", "reward"].item()
     assert stored == pytest.approx(0.5 * frame.reward)
-
-
-def test_a_gradient_that_is_not_finite_is_skipped_and_counted():
-    """Also where the loss itself is finite."""
-    run = Experiment(small(on_nonfinite="skip"))
-    run.train()
-    loss, updates = run.agent.loss, run.learner.updates
-    loss.delta.fill_(0.5)  # PPO-RPE's threshold, which every update lets decay
-    kept = [*loss.parameters(), *loss.buffers()]
-    before = [tensor.clone() for tensor in kept]
-    trained = next(parameter for parameter in loss.parameters() if parameter.requires_grad)
-    hook = trained.register_hook(lambda gradient: gradient * math.nan)
-    run.learner.learn(3)
-    hook.remove()
-    assert all(map(torch.equal, before, kept))
-    assert (run.learner.updates, run.learner.skipped_updates) == (updates, 3)
-
-
-class Spike(PendulumEnv):
-    """Pendulum with one reward whose square is more than a float holds."""
-
-    steps = 0
-
-    def step(self, action):
-        observation, reward, *ended = super().step(action)
-        self.steps += 1
-        return observation, 1e30 if self.steps == 30 else reward, *ended
-
-
-gymnasium.register("Spike-v0", entry_point=Spike)
-
-
-@pytest.mark.parametrize("compile", [False, True])
-def test_a_transition_that_spoils_batches_is_drawn_once(compile):
-    """Its priority was the largest, and stayed so: three of four updates were skipped."""
-    task = TaskConfig("spike", "Spike-v0", episodes=3, max_steps=50)
-    few = PPORPEConfig(replay_ratio=8.0, hidden=(8,))
-    run = Experiment(small(task=task, algorithm=few, on_nonfinite="skip", compile=compile))
-    rows = run.train()
-    assert run.learner.skipped_updates == rows[0]["skipped_updates"] == 1
-    assert run.learner.updates > 20
-    factor = run.config.algorithm.reward_factor
-    assert run.learner.update.bad_row == (29, pytest.approx(1e30 * factor, rel=1e-3))
-
-
-def test_a_run_that_skips_every_update_stops_and_names_the_reward():
-    """After a hundred in a row; one update that is made begins the count anew."""
-    run = Experiment(small(task=replace(PENDULUM, max_steps=150), on_nonfinite="skip"))
-    run.train()
-    updates = run.learner.updates
-    trained = next(p for p in run.agent.loss.parameters() if p.requires_grad)
-    for skipped in (MAX_SKIPPED - 1, MAX_SKIPPED):
-        hook = trained.register_hook(lambda gradient: gradient * math.nan)
-        run.learner.learn(skipped)
-        hook.remove()
-        if skipped < MAX_SKIPPED:
-            run.learner.report(80)
-            run.learner.learn(1)
-    row, reward = run.learner.update.bad_row
-    reward /= run.config.algorithm.reward_factor
-    told = rf"^100 updates .* after update {updates + 1} \(frame 80\), .* Row {row} .*{reward:g}:"
-    with pytest.raises(FloatingPointError, match=told):
-        run.learner.report(80)
-
-
-def test_one_rollout_that_cannot_be_learned_from_stops_no_run():
-    """It is forgotten; two are too many."""
-    run = Experiment(
-        small(
-            algorithm=PPOConfig(hidden=(8,), frames=40, epochs=60),
-            replay=RolloutReplayConfig(batch_size=20),
-            regularizer=NoRegularizerConfig(),
-            optimizer=AdamConfig(),
-            on_nonfinite="skip",
-        )
-    )
-    trained = next(p for p in run.agent.loss.parameters() if p.requires_grad)
-    trained.register_hook(lambda gradient: gradient * math.nan)
-    assert run.train(1)[-1]["skipped_updates"] == 120
-    with pytest.raises(FloatingPointError, match=r"updates in a row were skipped .* Row \d+ of"):
-        run.train(2)
 
 
 def test_parameters_that_are_not_finite_are_not_saved(tmp_path):

@@ -32,8 +32,8 @@ SWINGUP = GROUPS["task"]["swingup"]
         # The algorithm, the replay buffer and the optimizer have a beta of their own.
         ({"algorithm": PPORPEConfig(beta=0.2)}, "swingup/ppo_rpe/l2c2/algorithm.beta-0.2/seed_0"),
         (
-            {"compile": False, "on_nonfinite": "skip"},
-            "swingup/ppo_rpe/l2c2/compile-false_on_nonfinite-skip",
+            {"compile": False, "test_episodes": 5},
+            "swingup/ppo_rpe/l2c2/compile-false",
         ),
         (
             {"algorithm": TD3Config(hidden=(8, 9)), "regularizer": NoRegularizerConfig()},

@@ -353,6 +353,13 @@ class TestSettings:
         expected = found.stdout.strip() if (ROOT / ".git").exists() else ""
         assert code_commit().removesuffix("-dirty") == expected
 
+    def test_the_fingerprint_of_the_papers_baseline_is_that_of_its_records(self):
+        """Also after a setting was removed."""
+        recorded = pd.read_csv(ROOT / "results" / "runs.csv").iloc[0]
+        baseline = {"regularizer": {"name": "none"}}
+        assert (recorded["task"], recorded["method"]) == ("swingup", "none")
+        assert fingerprint(baseline) == recorded["settings"]
+
     def test_what_changes_no_number_leaves_the_fingerprint(self):
         """Nor do the seed and the length; every other setting changes it."""
         plain = fingerprint(make_config().to_dict())

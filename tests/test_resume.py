@@ -459,8 +459,8 @@ def test_what_changes_no_number_may_change(trained):
 def test_a_setting_that_a_checkpoint_does_not_know_is_named(tmp_path):
     """One of an earlier release, before there was such a setting."""
     saved = small().to_dict()
-    del saved["on_nonfinite"]
-    with pytest.raises(OtherRunError, match=r"made with on_nonfinite=none .*, not stop:"):
+    del saved["algorithm"]["kappa"]
+    with pytest.raises(OtherRunError, match=r"made with algorithm.kappa=none .*, not 0.5:"):
         check_same_settings(saved, small().to_dict())
 
 

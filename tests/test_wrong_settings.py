@@ -59,7 +59,6 @@ def settings_of():
         ),
         ("threads=0", "threads must be greater than or equal to 1, got 0."),
         ("compile=maybe", "compile must be a valid boolean, got 'maybe'."),
-        ("on_nonfinite=continue", "on_nonfinite must be 'stop' or 'skip', got 'continue'."),
         ("test_episodes=-1", "test_episodes must be greater than or equal to 0, got -1."),
         ("evaluate_every=-5", "evaluate_every must be greater than or equal to 0, got -5."),
         ("late_share=1.1", "late_share must be less than or equal to 1, got 1.1."),

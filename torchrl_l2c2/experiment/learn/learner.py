@@ -23,8 +23,6 @@ from torchrl_l2c2.gains import gradient_shares, is_loss
 # such as PPO's with orthogonal weights, the share grows during training.
 MEASURE_AFTER = 100
 WARN_BELOW = 1e-4
-# Maximum number of skipped updates in a row; the run then stops.
-MAX_SKIPPED = 100
 
 
 def untrained_reason(frames: int, updates: int, random_frames: int) -> str | None:
@@ -56,13 +54,10 @@ class Learner:
     Keyword Args:
         reward_factor (float): Factor on the stored rewards.
         compile (bool): Whether to compile the update, as for :func:`~.update.make_update`.
-        skip_nonfinite (bool): Whether to skip batches with a NaN or infinite loss or gradient, as
-            for :func:`~.update.make_update`.
 
     Attributes:
         compiles: Whether the update is compiled.
         updates: Number of gradient steps so far.
-        skipped_updates: Number of skipped batches.
         unreported: Values of the loss's entries in each update since the last report.
         first_update_seconds: Duration of the first update, including compilation; ``None`` before
             it.
@@ -77,19 +72,15 @@ class Learner:
         *,
         reward_factor: float,
         compile: bool,
-        skip_nonfinite: bool,
     ) -> None:
         self.agent = agent
         self.replay = replay
         self.updates = 0
-        self.skipped_updates = 0
-        self._skipped_in_a_row = 0
         self.first_update_seconds: float | None = None
         self.warns_weak_regularizer = True
         self.at_full_gain: Callable[[], AbstractContextManager[None]] = nullcontext
         self._reward_factor = reward_factor
         self.compiles = compile
-        self._skip_nonfinite = skip_nonfinite
         self.unreported: list[torch.Tensor] = []
         self._learned_from: TensorDictBase | None = None
         self._rows = RowWriter(replay)
@@ -103,9 +94,7 @@ class Learner:
     def rebuild_update(self) -> None:
         """Rebuilds the update, which is necessary after tensors or settings were replaced."""
         self.agent.refresh_policy()
-        self.update = ReplayUpdate(
-            self.agent, self.replay, compile=self.compiles, skip_nonfinite=self._skip_nonfinite
-        )
+        self.update = ReplayUpdate(self.agent, self.replay, compile=self.compiles)
 
     @torch.no_grad()
     def remember(self, transitions: TensorDictBase) -> None:
@@ -138,13 +127,10 @@ class Learner:
         Args:
             epochs (int): Number of passes over the rollout.
         """
-        skipped = self._skipped_in_a_row
         for _ in range(epochs):
             self.replay.sampler.ran_out = False
             while not self.replay.sampler.ran_out:
                 self._update()
-        if skipped < MAX_SKIPPED // 2:  # One bad rollout must not stop the run: it is not reused.
-            self._skipped_in_a_row = min(self._skipped_in_a_row, MAX_SKIPPED // 2)
         self._learned_from = self.update.example()
         self.replay.empty()
         self.agent.refresh_policy()
@@ -156,16 +142,11 @@ class Learner:
     def _update(self) -> None:
         with_policy = (self.updates + 1) % self.agent.policy_delay == 0
         started = time.monotonic()
-        result = self.update(with_policy)
+        values, _ = self.update(with_policy)
         if self.first_update_seconds is None:
             self.first_update_seconds = time.monotonic() - started
-        if result is None:
-            self.skipped_updates += 1
-            self._skipped_in_a_row += 1
-            return
-        self._skipped_in_a_row = 0
         self.updates += 1
-        self.unreported.append(result[0])
+        self.unreported.append(values)
         if self.updates == MEASURE_AFTER and self.warns_weak_regularizer:
             self._warn_weak_regularizer()
 
@@ -203,10 +184,8 @@ class Learner:
             last_frame (int): Number of frames of the run, for errors.
 
         Raises:
-            FloatingPointError: If an entry or a parameter is NaN or infinite, or too many updates
-                in a row were skipped.
+            FloatingPointError: If an entry or a parameter is NaN or infinite.
         """
-        self._check_skipped(last_frame)
         keys, terms = self.agent.loss.out_keys, self.unreported
         self.unreported = []
         if terms:
@@ -223,17 +202,6 @@ class Learner:
             k.replace("loss", "share"): v / total if total else 0.0 for k, v in losses.items()
         }
         return {**means, **shares}
-
-    def _check_skipped(self, last_frame: int) -> None:
-        if self._skipped_in_a_row < MAX_SKIPPED:
-            return
-        row, reward = self.update.bad_row
-        raise FloatingPointError(
-            f"{self._skipped_in_a_row} updates in a row were skipped after update {self.updates} "
-            f"(frame {last_frame}), because a loss or gradient was not finite. Row {row} of the "
-            f"replay buffer has the reward {reward / self._reward_factor:g}: use smaller rewards, "
-            "or lower algorithm.reward_scale."
-        )
 
     def check_parameters(self) -> None:
         """Checks that all parameters are finite.

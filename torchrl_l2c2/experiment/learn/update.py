@@ -25,15 +25,14 @@ from torchrl_l2c2.experiment.learn.tracing import traceable_step, traceable_targ
 from torchrl_l2c2.gains import is_loss
 from torchrl_l2c2.transforms import NeighborTransform
 
-Step = Callable[..., tuple[Tensor | None, Tensor | None]]
-"""Gradient step that returns the means of the loss's entries (``None``: skipped) and priorities."""
+Step = Callable[..., tuple[Tensor, Tensor | None]]
+"""Gradient step that returns the means of the loss's entries, and priorities."""
 
 
 def make_update(
     agent: Agent,
     *,
     compile: bool,
-    skip_nonfinite: bool = False,
     read: Callable[..., TensorDictBase] | None = None,
 ) -> Step:
     """Returns one gradient step as a function: loss, gradients, optimizer and target networks.
@@ -47,16 +46,13 @@ def make_update(
         compile (bool): Whether to compile the step. If the steps of the optimizer and the target
             networks compile (:mod:`~.tracing`), the whole step is one graph, otherwise only loss
             and gradients.
-        skip_nonfinite (bool): Whether to skip batches with a NaN or infinite loss or gradient. The
-            step is then two graphs. Default ``False``.
         read (Callable, optional): Function that creates the batch, compiled with the step. Default:
             the step's argument is the batch.
 
     Returns:
         Callable: Function of a bool, whether to also update the policy and the target networks, and
         the batch or the arguments of ``read``. It returns the means of ``agent.loss.out_keys`` as
-        one tensor, ``None`` if the batch is skipped, and the batch's new priorities, or ``None``.
-        It clears the parameters' ``grad``.
+        one tensor, and the batch's new priorities, or ``None``. It clears the parameters' ``grad``.
     """
     parameters = [p for group in agent.optimizer.param_groups for p in group["params"]]
     keys = agent.loss.out_keys
@@ -101,29 +97,11 @@ def make_update(
         apply(with_policy, gradients)
         return values, priority
 
-    if compile and whole and not skip_nonfinite:
+    if compile and whole:
         return compiled(update)
     if compile:
         differentiate = compiled(differentiate)
-        apply = compiled(apply) if whole else apply
-    if not skip_nonfinite:
-        return update
-
-    # State of the loss that depends on batches, such as PPO-RPE's threshold.
-    buffers = list(agent.loss.buffers())
-
-    def checked_update(with_policy: bool, *drawn: Any) -> tuple[Tensor | None, Tensor | None]:
-        before = [buffer.clone() for buffer in buffers]
-        values, priority, gradients = differentiate(with_policy, *drawn)
-        tensors = (values, *(g for g in gradients if g is not None))
-        if not all(bool(tensor.isfinite().all()) for tensor in tensors):
-            for buffer, old in zip(buffers, before, strict=True):
-                buffer.copy_(old)
-            return None, priority
-        apply(with_policy, gradients)
-        return values, priority
-
-    return checked_update
+    return update
 
 
 class Draw(NamedTuple):
@@ -156,23 +134,9 @@ class ReplayUpdate:
 
     Keyword Args:
         compile (bool): Whether to compile the update, as for :func:`make_update`.
-        skip_nonfinite (bool): Whether to skip batches with a NaN or infinite loss or gradient, as
-            for :func:`make_update`. Default ``False``.
-
-    Attributes:
-        bad_row: Row that probably caused the last skipped batch, and its stored reward.
     """
 
-    bad_row: tuple[int, float]
-
-    def __init__(
-        self,
-        agent: Agent,
-        replay: TensorDictReplayBuffer,
-        *,
-        compile: bool,
-        skip_nonfinite: bool = False,
-    ) -> None:
+    def __init__(self, agent: Agent, replay: TensorDictReplayBuffer, *, compile: bool) -> None:
         # The buffer's properties are slow.
         self._storage, self._sampler = replay.storage, replay.sampler
         self._batch_size = replay.batch_size
@@ -183,29 +147,24 @@ class ReplayUpdate:
         self._source: TensorDictBase | None = None
         self._names: tuple[NestedKey, ...] = ()
         self._stored: tuple[Tensor, ...] = ()
-        make = partial(make_update, agent, skip_nonfinite=skip_nonfinite, read=self.read)
+        make = partial(make_update, agent, read=self.read)
         self.update = make(compile=compile)
         # The last batch of a rollout may have any size: compiling it does not pay off.
         self._smaller_update = make(compile=False)
 
-    def __call__(self, with_policy: bool) -> tuple[Tensor, Tensor | None] | None:
+    def __call__(self, with_policy: bool) -> tuple[Tensor, Tensor | None]:
         """Makes one update and sets the batch's priorities.
-
-        If the batch is skipped, the row that probably caused it is replaced in the buffer.
 
         Args:
             with_policy (bool): Whether to also update the policy and the target networks.
 
         Returns:
-            tuple: Means and priorities as from :func:`make_update`; ``None`` if skipped.
+            tuple: Means and priorities as from :func:`make_update`.
         """
         draw = self.draw()
         smaller = len(draw.rows) < self._batch_size
         update = self._smaller_update if smaller else self.update
         values, priority = update(with_policy, *draw)
-        if values is None:
-            self._replace_bad_rows(draw.rows, priority)
-            return None
         self.prioritize(draw.rows, priority)
         return values, priority
 
@@ -248,28 +207,6 @@ class ReplayUpdate:
         """Sets the priorities of rows, if the buffer is prioritized."""
         if self._prioritized and priority is not None:
             self._sampler.update_priority(index, priority)
-
-    def _replace_bad_rows(self, rows: Tensor, priority: Tensor | None) -> None:
-        """Finds the rows that caused a skipped batch, and overwrites them with another row.
-
-        Otherwise they would keep their priority and be sampled again and again.
-        """
-        assert self._source is not None
-        rewards = self._source.get(("next", "reward"))[rows].flatten()
-        sizes = (rewards.abs() if priority is None else priority.flatten()).nan_to_num(torch.inf)
-        largest = sizes.argmax()
-        self.bad_row = int(rows[largest]), float(rewards[largest])
-        if not self._prioritized or priority is None:
-            return
-        bad = sizes.isinf()
-        if not bad.any() or bad.all():  # If all are infinite, probably one row is the cause.
-            bad = torch.arange(len(rows), device=rows.device) == largest
-        bad_rows, good_rows = rows[bad].cpu(), rows[~bad].cpu()
-        if len(good_rows):
-            copies = good_rows[torch.zeros_like(bad_rows)]
-            self._storage.set(bad_rows, self._storage.get(copies))
-            median = sizes[~bad].nan_to_num(posinf=0.0).median()
-            self._sampler.update_priority(bad_rows, median.expand(len(bad_rows)).cpu())
 
     def read(
         self,

@@ -102,7 +102,6 @@ class Experiment:
                 make_replay(config),
                 reward_factor=config.algorithm.reward_factor,
                 compile=self._compile,
-                skip_nonfinite=config.on_nonfinite == "skip",
             )
             collector = make_collector(config, env, self.agent, compile=self._compile)
             self.player = Player(collector, self.agent, config.task.env_id)
@@ -220,7 +219,7 @@ class Experiment:
             "replay": replay_state(self.learner.replay),
             "collector": self.player.collector.generator_state(),
             "global_rng": self._process.state_dict(),
-            "counters": [self.player.frames, self.learner.updates, self.learner.skipped_updates],
+            "counters": [self.player.frames, self.learner.updates],
             "unreported": self.learner.unreported,
             "metrics": json.dumps(self.metrics),
         }
@@ -237,7 +236,7 @@ class Experiment:
             part.load_state_dict(state[name])
         load_replay_state(learner.replay, state["replay"])
         self.player.collector.set_generator_state(state["collector"])
-        self.player.frames, learner.updates, learner.skipped_updates = state["counters"]
+        self.player.frames, learner.updates = state["counters"]
         learner.unreported = list(state["unreported"])
         self.metrics = json.loads(state["metrics"])
         # Loading replaced some tensors of the compiled update.
@@ -342,7 +341,6 @@ class Experiment:
             "episode": number,
             "frames": episode.last_frame,
             "updates": self.learner.updates,
-            "skipped_updates": self.learner.skipped_updates,
             **episode.measures,
             **(self._late_tests.play(number) if late else self._late_tests.none()),
             **report,

@@ -115,11 +115,6 @@ class ExperimentConfig:
         description="compilation of updates and policies if a C++ compiler is found; false: eager "
         "mode",
     )
-    on_nonfinite: Literal["stop", "skip"] = Field(
-        default="stop",
-        description="reaction to a batch with a NaN or infinite loss or gradient: stop the run, or "
-        "skip and count the batch",
-    )
     test_episodes: int = Field(
         default=100,
         ge=0,

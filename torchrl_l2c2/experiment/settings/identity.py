@@ -18,6 +18,8 @@ from torchrl_l2c2.experiment.settings.config import GROUPS, ExperimentConfig
 from torchrl_l2c2.experiment.settings.tasks import TASKS
 
 NEWER_SETTING = "none (a newer setting)"
+# Removed settings with the value that all recorded runs have: a part of their hashes.
+REMOVED = {"on_nonfinite": "stop"}
 # Length of training: runs of different lengths are of the same kind.
 BUDGETS = ("task.episodes", "task.frames")
 
@@ -130,6 +132,7 @@ def fingerprint(config: Mapping[str, Any]) -> str:
         for name, value in own.items()
         if _counts(name) and name != "task.name" and not is_neutral(name, value)
     }
+    compared |= REMOVED
     return hashlib.sha256(json.dumps(compared, sort_keys=True).encode()).hexdigest()[:10]
 
 
