@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from studies.field import TEST
-from studies.pages import ROOT, SUMMARIZED, fill, headline_groups
+from studies.pages import ROOT, fill, summarized
 from torchrl_l2c2.experiment.analysis.reports.figures import save, subplots
 from torchrl_l2c2.experiment.analysis.reports.groups import Group
 from torchrl_l2c2.experiment.analysis.reports.table import Estimate, improvement
@@ -52,9 +52,9 @@ def rows(pairs: dict[str, tuple[Group, Group]]) -> list[Row]:
 def published() -> list[Row]:
     """The rows of the README's table."""
     pairs = {}
-    for label in SUMMARIZED:
-        algorithm, task = label.split(", ")[:2]
-        pairs[f"{task}, {algorithm}"] = headline_groups(label)
+    for label, pair in summarized().items():
+        algorithm, task = label.split(", ")
+        pairs[f"{task}, {algorithm}"] = pair
     return rows(pairs)
 
 

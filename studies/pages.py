@@ -47,6 +47,7 @@ from torchrl_l2c2.experiment.run.files import write_atomically
 
 ROOT = Path(__file__).parents[1]
 FRONT_DOOR = ROOT / "results" / "front_door.csv"
+RSL_RL = ROOT / "results" / "rsl_rl.csv"
 FIELD_PAGES = ("field", "hopper", "sac_lunarlander", "sac_pendulum", "walker2d")
 # PPO's one setting of L2C2, and the methods that one page compares it with.
 OURS = "L2C2, mse 1, ramp"
@@ -133,9 +134,7 @@ def pages() -> dict[str, Page]:
         "results/front_door.md": Page(
             {"results": front_door.table(ROOT / "results" / "front_door.csv")}
         ),
-        "results/rsl_rl.md": Page(
-            {"results": front_door.table(ROOT / "results" / "rsl_rl.csv", [rsl_rl.TASK])}
-        ),
+        "results/rsl_rl.md": Page({"results": front_door.table(RSL_RL, [rsl_rl.TASK])}),
         "results/td3.md": Page({"test": td3_test(), "choice": td3_choice()}),
         "results/field_gains.md": Page(dict(zip(("rivals", "one", "caps"), chosen, strict=True))),
         "results/targets.md": Page(dict(zip(("all", "swingup", "hopper"), targets, strict=True))),
@@ -178,12 +177,17 @@ def headline_groups(label: str) -> tuple[Group, Group]:
     return ours, baseline
 
 
+def summarized() -> dict[str, tuple[Group, Group]]:
+    """L2C2 and the baseline for each row of the README's table, by algorithm and task."""
+    found = {", ".join(label.split(", ")[:2]): headline_groups(label) for label in SUMMARIZED}
+    return {**found, "PPO of rsl_rl, HalfCheetah": rsl_rl.recorded(RSL_RL)}
+
+
 def summary() -> str:
     """The README's table: means of the baseline and of L2C2, the roughest baseline first."""
     rows = {}
-    for label in SUMMARIZED:
-        ours, baseline = headline_groups(label)
-        algorithm, task = label.split(", ")[:2]
+    for label, (ours, baseline) in summarized().items():
+        algorithm, task = label.split(", ")
         (before, after), (lost, kept) = (
             [side.scores(TEST, quantity).mean() for side in (baseline, ours)]
             for quantity in ("action_variation", "return")

@@ -13,12 +13,24 @@ from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 
+import pandas as pd
+
+from studies.field import TEST
 from studies.front_door import METHODS, add_runs
+from torchrl_l2c2.experiment.analysis.reports.groups import Group
 
 TASK = "HalfCheetah-v5"
 SEEDS = range(5)
 ITERATIONS = 489  # 1,001,472 frames
 CLASSES = dict(zip(METHODS, ("PPO", "torchrl_l2c2.rsl_rl:L2C2PPO"), strict=True))
+
+
+def recorded(path: Path) -> tuple[Group, Group]:
+    """The runs with L2C2 and of the baseline, as groups for tables and pictures."""
+    measures = ("return", "action_variation")
+    runs = pd.read_csv(path).rename(columns={name: f"{TEST}_{name}" for name in measures})
+    baseline, smooth = (Group(runs[runs["method"] == method], method) for method in METHODS)
+    return smooth, baseline
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
