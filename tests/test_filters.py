@@ -6,6 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 
+from studies import deployments
 from studies.filters import COLUMNS, CONDITIONS, main, play
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig, PPORPEConfig, TaskConfig
 from torchrl_l2c2.experiment.analysis.reports import FinishedRun
@@ -99,3 +100,76 @@ def test_only_training_has_the_action_rate_penalty(runs):
     free.action_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,), np.float32)
     with pytest.raises(UserError, match=r"Expected bounded actions with task\.action_rate=1"):
         ActionRatePenalty(free, 1.0)
+
+
+@pytest.fixture
+def recorded(tmp_path):
+    """Two seeds of the baseline, of it with a filter, and of L2C2, in every condition."""
+    lines = [",".join(COLUMNS)]
+    for condition in CONDITIONS:
+        for seed in (0, 1):
+            for name, total in (("none,0,{},", -100), ("none,0,{},0.1", -300), ("l2c2,0,{},", -90)):
+                values = f"{total - 10 * seed},{0.04 + 0.02 * seed},0.01,abc"
+                lines.append(f"pendulum,{name.format(seed)},{condition},{values}")
+    path = tmp_path / "filters.csv"
+    path.write_text("\n".join(lines))
+    return deployments.read(path)
+
+
+def test_the_table_compares_each_deployment_with_the_baseline(recorded):
+    """Means by hand; L2C2's returns -90 and -100 win 3.5 of 4 pairs."""
+    shown = recorded[recorded["condition"] == "noise"]
+    rows = [
+        [cell.strip() for cell in line.split("|")[1:-1]]
+        for line in deployments.table(shown).splitlines()[2:]
+    ]
+    assert [row[:2] for row in rows] == [
+        ["baseline", "0, 1"],
+        ["baseline, filter 0.1", "0, 1"],
+        ["L2C2", "0, 1"],
+    ]
+    assert [row[2].split()[0] for row in rows] == ["-105.0", "-305.0", "-95.0"]
+    assert [row[3].split(" ")[0] for row in rows] == ["", "0.00", "0.88"]
+    assert [row[5].split(" ")[0] for row in rows] == ["", "0.50", "0.50"]
+    assert deployments.tables(recorded).count("### pendulum, ") == len(CONDITIONS)
+
+
+def test_a_line_of_another_comparison_is_refused(recorded, tmp_path):
+    """One that no row of the table would show."""
+    recorded.assign(method="caps")[COLUMNS].to_csv(tmp_path / "other.csv")
+    with pytest.raises(KeyError, match="caps"):
+        deployments.read(tmp_path / "other.csv")
+
+
+def test_the_picture_has_a_panel_for_each_condition(recorded, tmp_path):
+    """And the same bytes every time."""
+    for name in ("a.svg", "b.svg"):
+        deployments.draw(recorded, tmp_path / name)
+    text = (tmp_path / "a.svg").read_text()
+    assert text == (tmp_path / "b.svg").read_text()
+    assert text.count('id="axes_') == len(CONDITIONS)
+
+
+def test_page_and_picture_are_of_the_records():
+    """The tables, the picture, and the numbers of the first sentences."""
+    found = deployments.read(deployments.PAGE.with_suffix(".csv"))
+    page = deployments.PAGE.read_text()
+    assert deployments.tables(found) in page
+    means = found.groupby(["task", "condition", "deployment"])[
+        ["return", "action_variation"]
+    ].mean()
+    (plain, late, filtered, noisy, rewarded, ours) = (
+        means.loc["pendulum", condition, name]
+        for condition, name in (
+            ("noise", "baseline"),
+            ("delay", "baseline"),
+            ("delay", "baseline, filter 0.1"),
+            ("noise", "baseline, filter 0.1"),
+            ("noise", "action-rate reward 0.1"),
+            ("noise", "L2C2"),
+        )
+    )
+    assert f"from {late['return']:.0f} to {filtered['return']:.0f}" in page
+    assert f"lowers the return by {rewarded['return'] / plain['return'] - 1:.0%}" in page
+    assert f"{noisy['return'] / plain['return'] - 1:.0%} below the baseline's" in page
+    assert ours["action_variation"] < 0.5 * plain["action_variation"]
