@@ -145,7 +145,6 @@ def main() -> None:
     found = read(PAGE.with_suffix(".csv"))
     write_atomically(PAGE, fill(PAGE.read_text(), "tables", tables(found)).encode())
     draw(found, PAGE.with_suffix(".svg"))
-    print(tables(found))
 
 
 if __name__ == "__main__":

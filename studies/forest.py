@@ -84,7 +84,6 @@ def main() -> None:
     shown = published()
     write_atomically(PAGE, fill(PAGE.read_text(), "forest", table(shown)).encode())
     draw(shown, PICTURE)
-    print(table(shown))
 
 
 def _better(pairs: Sequence[tuple[Group, Group]]) -> tuple[Estimate, ...]:

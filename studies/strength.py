@@ -117,7 +117,6 @@ def main() -> None:
     found = curves(shown())
     write_atomically(PAGE, fill(PAGE.read_text(), "strength", table(found)).encode())
     draw(found, PICTURE)
-    print(table(found))
 
 
 if __name__ == "__main__":

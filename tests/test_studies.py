@@ -6,6 +6,8 @@ import json
 import math
 import re
 import statistics
+import subprocess
+import sys
 from collections import Counter
 from dataclasses import replace
 
@@ -493,6 +495,16 @@ def by_methods(table):
 
 def records(name):
     return read_records(ROOT / "results" / f"{name}.csv")
+
+
+@pytest.mark.slow
+def test_one_command_writes_every_generated_part():
+    """And changes nothing where all is as the records have it."""
+    results = [path for path in (ROOT / "results").iterdir() if path.suffix in (".md", ".svg")]
+    pages = [*results, ROOT / "README.md", ROOT / "docs" / "results.md"]
+    before = [path.read_bytes() for path in pages]
+    subprocess.run([sys.executable, "-m", "studies"], cwd=ROOT, check=True)
+    assert [path.read_bytes() for path in pages] == before
 
 
 class TestPages:
