@@ -105,7 +105,7 @@ def tables(found: pd.DataFrame) -> str:
     for task in found["task"].unique():
         for condition in CONDITIONS:
             rows = found[(found["task"] == task) & (found["condition"] == condition)]
-            parts.append(f"### {task}, {CONDITION_NAMES[condition]}\n\n{table(rows)}")
+            parts.append(f"## {task}, {CONDITION_NAMES[condition]}\n\n{table(rows)}")
     return "\n\n".join(parts)
 
 

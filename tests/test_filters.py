@@ -131,7 +131,7 @@ def test_the_table_compares_each_deployment_with_the_baseline(recorded):
     assert [row[2].split()[0] for row in rows] == ["-105.0", "-305.0", "-95.0"]
     assert [row[3].split(" ")[0] for row in rows] == ["", "0.00", "0.88"]
     assert [row[5].split(" ")[0] for row in rows] == ["", "0.50", "0.50"]
-    assert deployments.tables(recorded).count("### pendulum, ") == len(CONDITIONS)
+    assert deployments.tables(recorded).count("## pendulum, ") == len(CONDITIONS)
 
 
 def test_a_line_of_another_comparison_is_refused(recorded, tmp_path):
@@ -173,3 +173,8 @@ def test_page_and_picture_are_of_the_records():
     assert f"lowers the return by {rewarded['return'] / plain['return'] - 1:.0%}" in page
     assert f"{noisy['return'] / plain['return'] - 1:.0%} below the baseline's" in page
     assert ours["action_variation"] < 0.5 * plain["action_variation"]
+    lander = means.loc["lunarlander", "as trained"]
+    filtered, baseline = lander.loc["baseline, filter 0.1"], lander.loc["baseline"]
+    assert 0.6 < filtered["action_variation"] / baseline["action_variation"] < 0.7
+    assert filtered["return"] > baseline["return"]
+    assert lander.loc["L2C2", "action_variation"] > baseline["action_variation"]
