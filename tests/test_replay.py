@@ -183,17 +183,17 @@ def test_compiled_it_learns_the_same_and_follows_what_may_change(name):
         # With a learning rate that is a number, as it was in earlier checkpoints.
         state["config"] = json.dumps(experiment.config.to_dict())
         begin(experiment, state)
-        values.append(experiment.learner.update(True)[0])
+        values.append(experiment.learner.update(True))
         experiment.agent.loss.l2c2_coeff = 100.0
-        values.append(experiment.learner.update(True)[0])
+        values.append(experiment.learner.update(True))
         scale_rates(experiment.agent.optimizer, 10.0)
         # Without the policy it is another graph, which takes its time.
         turns = (False, True) if name == "sac" else (True,)
-        values += [experiment.learner.update(with_policy)[0] for with_policy in turns]
+        values += [experiment.learner.update(with_policy) for with_policy in turns]
         # Loading replaces the optimizer's tensors: a step that kept the old ones would go wrong.
         begin(experiment, state)
         experiment.agent.loss.l2c2_coeff = 1.0
-        values += [experiment.learner.update(True)[0] for _ in range(3)]
+        values += [experiment.learner.update(True) for _ in range(3)]
         seen.append((torch.stack(values), learned(experiment)))
     (compiled, ours), (eager, plain) = seen
     torch.testing.assert_close(compiled, eager, rtol=1e-3, atol=1e-4)

@@ -25,9 +25,7 @@ from torchrl.modules import (
 from torchrl_l2c2.experiment.errors import UserError
 
 
-def check_actions(
-    env: EnvBase, algorithm: str, *, squashed: bool = False, sampled: bool = True
-) -> None:
+def check_bounds(env: EnvBase, algorithm: str, *, sampled: bool = True) -> None:
     """Checks that an algorithm can squash the environment's actions into their bounds.
 
     Args:
@@ -35,20 +33,19 @@ def check_actions(
         algorithm (str): Name of the algorithm, for errors.
 
     Keyword Args:
-        squashed (bool): Whether actions are squashed into their bounds. Default ``False``.
-        sampled (bool): Whether squashed actions are sampled from a distribution, which needs bounds
-            that differ. Default ``True``.
+        sampled (bool): Whether actions are sampled from a distribution, which needs bounds that
+            differ. Default ``True``.
 
     Raises:
-        UserError: If squashed actions have no bounds or equal bounds.
+        UserError: If the actions have no bounds or equal bounds.
     """
-    if squashed and not _bounded(env.action_spec):
+    if not _bounded(env.action_spec):
         raise UserError(
             f"algorithm={algorithm} squashes actions into their bounds, but this task's actions "
             "have none: use algorithm=ppo_rpe with algorithm.squash=none, or register the task "
             "with a gymnasium.ActionWrapper that has bounds."
         )
-    bounds = action_bounds(env) if squashed and sampled else ()
+    bounds = action_bounds(env) if sampled else ()
     if bounds and (fixed := (bounds[0] >= bounds[1]).nonzero().flatten().tolist()):
         raise UserError(
             f"algorithm={algorithm} squashes actions into their bounds, but entries {fixed} of "

@@ -11,7 +11,7 @@ from torchrl.objectives.value import GAE
 from torchrl_l2c2.experiment.agents._torchrl_internals import TraceableClipPPOLoss
 from torchrl_l2c2.experiment.agents.agent import Agent
 from torchrl_l2c2.experiment.agents.networks import (
-    check_actions,
+    check_bounds,
     clip_bounds,
     normal_actor,
     observation_size,
@@ -31,7 +31,8 @@ def make_ppo(
     config: PPOConfig, env: EnvBase, regularizer: RegularizerConfig, optimizer: OptimizerConfig
 ) -> Agent:
     """Builds PPO, with the arguments of :func:`~.build.make_algorithm`."""
-    check_actions(env, config.name, squashed=not config.clip_actions)
+    if not config.clip_actions:
+        check_bounds(env, config.name)
     activation = {"tanh": nn.Tanh, "relu": nn.ReLU}[config.activation]
     actor = normal_actor(
         env, config.hidden, activation, squash=not config.clip_actions, log_scale=config.log_scale

@@ -7,7 +7,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_l2c2.experiment.agents.agent import Agent
 from torchrl_l2c2.experiment.agents.networks import (
-    check_actions,
+    check_bounds,
     observation_size,
     shared_copy,
 )
@@ -25,7 +25,8 @@ def make_ppo_rpe(
     config: PPORPEConfig, env: EnvBase, regularizer: RegularizerConfig, optimizer: OptimizerConfig
 ) -> Agent:
     """Builds PPO-RPE, with the arguments of :func:`~.build.make_algorithm`."""
-    check_actions(env, config.name, squashed=config.squash != "none")
+    if config.squash != "none":
+        check_bounds(env, config.name)
     size = observation_size(env)
     actor = make_actor(
         size,

@@ -9,7 +9,7 @@ from torchrl.objectives import SACLoss, SoftUpdate
 from torchrl_l2c2.experiment.agents.agent import Agent
 from torchrl_l2c2.experiment.agents.networks import (
     action_value,
-    check_actions,
+    check_bounds,
     normal_actor,
     shared_copy,
 )
@@ -24,7 +24,7 @@ def make_sac(
     config: SACConfig, env: EnvBase, regularizer: RegularizerConfig, optimizer: OptimizerConfig
 ) -> Agent:
     """Builds SAC, with the arguments of :func:`~.build.make_algorithm`."""
-    check_actions(env, config.name, squashed=True)
+    check_bounds(env, config.name)
     actor = normal_actor(env, config.hidden, nn.ReLU, exponential=config.scale_mapping == "exp")
     loss = SACLoss(
         actor,

@@ -15,7 +15,7 @@ from torchrl.objectives import SoftUpdate, TD3Loss
 from torchrl_l2c2.experiment.agents.agent import Agent
 from torchrl_l2c2.experiment.agents.networks import (
     action_value,
-    check_actions,
+    check_bounds,
     perceptron,
     shared_copy,
 )
@@ -30,7 +30,7 @@ def make_td3(
     config: TD3Config, env: EnvBase, regularizer: RegularizerConfig, optimizer: OptimizerConfig
 ) -> Agent:
     """Builds TD3, with the arguments of :func:`~.build.make_algorithm`."""
-    check_actions(env, config.name, squashed=True, sampled=False)
+    check_bounds(env, config.name, sampled=False)
     spec = env.action_spec
     network = perceptron(env, spec.shape[-1], config.hidden, nn.ReLU)
     bounds = spec.to(torch.get_default_device())

@@ -266,7 +266,7 @@ def unknown_setting(name: str) -> str:
     known = {*COMMAND_SETTINGS, *(field.name for field in dataclasses.fields(ExperimentConfig))}
     known |= {f"{of[0]}.{each}" for of, names in settings.items() for each in names}
     near = sorted(each for each in known if each.endswith(f".{name}"))
-    near = near or ALIASES.get(name) or get_close_matches(name, sorted(known), 1)
+    near = near or ALIASES.get(name) or get_close_matches(name, sorted(known), 1, cutoff=0.7)
     suggestion = f"; did you mean {near[0]}?" if near else "."
     return f"{name} is not a setting{suggestion} --help lists every setting."
 

@@ -73,9 +73,15 @@ def with_vector_action(env: Env) -> Env:
     space: Any = env.action_space
     vector = isinstance(space, spaces.Box) and len(space.shape) == 1
     if not vector or not np.issubdtype(space.dtype, np.floating):
+        discrete = isinstance(space, spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary)
         raise UserError(
-            f"the task's actions are a {_kind(space)}; they must be one vector of floats: wrap the "
-            "task in a gymnasium.ActionWrapper, and register the result."
+            f"the task's actions are a {_kind(space)}; they must be one vector of floats: "
+            + (
+                "train a policy with discrete actions in a TorchRL loop of your own, and wrap its "
+                "loss with torchrl_l2c2.smooth."
+                if discrete
+                else "register the task with a gymnasium.ActionWrapper that takes such a vector."
+            )
         )
     if space.dtype == np.float32:
         return env

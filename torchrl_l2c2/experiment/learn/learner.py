@@ -142,7 +142,7 @@ class Learner:
     def _update(self) -> None:
         with_policy = (self.updates + 1) % self.agent.policy_delay == 0
         started = time.monotonic()
-        values, _ = self.update(with_policy)
+        values = self.update(with_policy)
         if self.first_update_seconds is None:
             self.first_update_seconds = time.monotonic() - started
         self.updates += 1

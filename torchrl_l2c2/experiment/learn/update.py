@@ -152,21 +152,21 @@ class ReplayUpdate:
         # The last batch of a rollout may have any size: compiling it does not pay off.
         self._smaller_update = make(compile=False)
 
-    def __call__(self, with_policy: bool) -> tuple[Tensor, Tensor | None]:
+    def __call__(self, with_policy: bool) -> Tensor:
         """Makes one update and sets the batch's priorities.
 
         Args:
             with_policy (bool): Whether to also update the policy and the target networks.
 
         Returns:
-            tuple: Means and priorities as from :func:`make_update`.
+            Tensor: Means of the loss's terms, as from :func:`make_update`.
         """
         draw = self.draw()
         smaller = len(draw.rows) < self._batch_size
         update = self._smaller_update if smaller else self.update
         values, priority = update(with_policy, *draw)
         self.prioritize(draw.rows, priority)
-        return values, priority
+        return values
 
     def draw(self) -> Draw:
         """Samples the rows of a batch and the random numbers of their neighbors."""
