@@ -1,5 +1,6 @@
-"""Gymnasium's vector environments for rsl_rl, and PPO with L2C2 on one (needs the extra rsl-rl).
+"""Gymnasium's vector environments for rsl_rl, and PPO with L2C2 on one of them.
 
+It needs the extra rsl-rl and ``pip install "gymnasium[mujoco]"``.
 ``python examples/rsl_rl_gymnasium.py HalfCheetah-v5 500`` trains for 500 iterations, and prints the
 return and the action variation of the mean actions.
 """
@@ -70,6 +71,6 @@ def train(class_name: str, env_id: str, seed: int, iterations: int) -> tuple[flo
 
 if __name__ == "__main__":
     task = sys.argv[1] if len(sys.argv) > 1 else "HalfCheetah-v5"
-    steps = int(sys.argv[2]) if len(sys.argv) > 2 else 1
+    steps = int(sys.argv[2]) if len(sys.argv) > 2 else 3
     total, variation = train("torchrl_l2c2.rsl_rl:L2C2PPO", task, 0, steps)
     print(f"{task} with L2C2: return {total:.1f}, action variation {variation:.3f}")

@@ -1,6 +1,6 @@
 """rsl_rl's PPO with and without L2C2, on points seen through noise (needs the extra rsl-rl).
 
-``python examples/rsl_rl_l2c2.py`` shows in seconds that it runs;
+``python examples/rsl_rl_l2c2.py`` shows in seconds that it runs, with three iterations;
 ``python examples/rsl_rl_l2c2.py 40`` trains for some minutes.
 """
 
@@ -70,4 +70,4 @@ def main(iterations: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 1)
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 3)

@@ -157,7 +157,7 @@ class TestWhatIsAdded:
         successor = batch[unravel_key(("next", case.observation))]
         successor[0], successor[1] = torch.nan, torch.inf
         loss = regularized(case)
-        with pytest.warns(UserWarning, match=r"33\.33% of the next observations"):
+        with pytest.warns(UserWarning, match=r"33\.33% of the transitions in the batch"):
             terms = loss.value_regularizer(batch).update(loss.policy_regularizer(batch))
         assert terms["l2c2_counted"].item() == pytest.approx(4 / 6)
         assert all(value.isfinite().all() for value in terms.values())

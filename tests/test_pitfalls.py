@@ -119,7 +119,7 @@ class TestUnknownNextObservations:
         batch["next", "observation"][~self.KNOWN] = math.nan
         return batch
 
-    @pytest.mark.filterwarnings("ignore:.*of the next observations")
+    @pytest.mark.filterwarnings("ignore:.*of the transitions in the batch")
     def test_the_term_is_the_mean_of_the_others(self, kind):
         make, term, counted = TEMPORAL[kind]
         batch = batch_of(8)
@@ -128,7 +128,7 @@ class TestUnknownNextObservations:
         torch.testing.assert_close(found[term], values[self.KNOWN].mean())
         assert found[counted].item() == 0.75
 
-    @pytest.mark.filterwarnings("ignore:.*of the next observations")
+    @pytest.mark.filterwarnings("ignore:.*of the transitions in the batch")
     def test_with_priority_weights(self, kind):
         make, term, counted = TEMPORAL[kind]
         batch = batch_of(8)
@@ -139,7 +139,7 @@ class TestUnknownNextObservations:
         torch.testing.assert_close(found[term], expected)
         assert found[counted].item() == 0.75  # Not weighted.
 
-    @pytest.mark.filterwarnings("ignore:.*of the next observations")
+    @pytest.mark.filterwarnings("ignore:.*of the transitions in the batch")
     def test_with_masks(self, kind):
         make, term, counted = TEMPORAL[kind]
         batch = batch_of(8)
@@ -150,7 +150,7 @@ class TestUnknownNextObservations:
         torch.testing.assert_close(found[term], values[self.KNOWN & mask].mean())
         assert found[counted].item() == pytest.approx(4 / 5)
 
-    @pytest.mark.filterwarnings("ignore:.*of the next observations")
+    @pytest.mark.filterwarnings("ignore:.*of the transitions in the batch")
     def test_with_a_fraction(self, kind, monkeypatch):
         """Of every choice of rows the mean over those that count; on average it is the whole's."""
         make, term, _ = TEMPORAL[kind]
@@ -172,7 +172,9 @@ class TestUnknownNextObservations:
         found = []
         messages = told_by(lambda: found.extend(loss.policy_regularizer(batch) for _ in range(3)))
         (message,) = [each for each in messages if "next observations" in each]
-        assert message.startswith("100.00% of the next observations in the batch are not finite")
+        assert message.startswith(
+            "100.00% of the transitions in the batch have an observation or a next"
+        )
         assert "keep the true next observations" in message
         for terms in found:
             assert terms[term] == 0 and terms[counted] == 0
@@ -219,7 +221,7 @@ class TestUnknownNextObservations:
         assert "skip_ends=True" in repr(loss).split("actor_network_params")[0]
 
 
-@pytest.mark.filterwarnings("ignore:.*of the next observations")
+@pytest.mark.filterwarnings("ignore:.*of the transitions in the batch")
 def test_value_terms_leave_the_same_rows_out():
     batch = batch_of(8)
     values = L2C2Loss(base_loss(reduction="none"), NEAR).value_regularizer
@@ -604,6 +606,41 @@ def test_a_typo_in_a_gains_name_is_told(name, gain):
         loss.note, loss.delay_actor, loss.gamma = "", True, 0.9
 
     assert not told_by(others)
+
+
+@pytest.mark.parametrize("name", ["sigma", "lambda_min", "method", "fraction", "neighbors"])
+def test_a_setting_that_is_assigned_too_late_is_told(name):
+    loss = L2C2Loss(base_loss(), NEAR)
+    with pytest.warns(UserWarning, match=f"assigning to it has no effect.* with {name}=0.5"):
+        setattr(loss, name, 0.5)
+
+
+def test_a_method_is_not_replaced_by_a_value():
+    loss = L2C2Loss(base_loss(), NEAR)
+    with pytest.raises(TypeError, match=r"ramp is a method: call loss\.ramp\("):
+        loss.ramp = 0.5
+    assert loss.ramp(0.5) is loss
+
+
+def test_returns_of_several_steps_are_told_once():
+    """The neighborhoods are then larger; with one step nothing is told."""
+    for steps, count in ((3, 1), (1, 0)):
+        loss, batch = smooth(base_loss()), batch_of(8)
+        batch["steps_to_next_obs"] = torch.full((8,), steps)
+        messages = told_by(lambda loss=loss, batch=batch: [loss(batch) for _ in range(3)])
+        found = [each for each in messages if "n-step returns" in each]
+        assert len(found) == count
+        assert all(
+            each.startswith("the next observations") and "up to 3 steps" in each for each in found
+        )
+
+
+def test_a_limit_that_leaves_out_everything_is_told_once():
+    """Such as one in other units than the observations."""
+    for limit, count in ((1e-9, 1), (0.5, 0)):
+        loss = L2C2Loss(base_loss(), Neighborhood(max_step=limit))
+        messages = told_by(lambda loss=loss: [loss(batch_of(64)) for _ in range(3)])
+        assert sum("longer than max_step=1e-09" in each for each in messages) == count
 
 
 class Curved(nn.Module):

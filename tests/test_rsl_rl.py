@@ -310,7 +310,7 @@ def test_other_methods_train(method: str) -> None:
         (
             rsl.RegularizedPPO,
             "l2c3",
-            r"one of \['l2c2', 'caps', 'cats', 'lcp', 'sr2l'\], got 'l2c3'",
+            "method must be 'l2c2' or 'caps' or 'cats' or 'lcp' or 'sr2l', got 'l2c3'",
         ),
         (rsl.L2C2PPO, "cats", "method 'l2c2' of L2C2PPO, got 'cats'. Use .*:RegularizedPPO"),
     ],
@@ -420,8 +420,41 @@ def test_the_environments_final_observations_are_used() -> None:
 
 def test_final_observations_that_lack_a_group_are_refused() -> None:
     """In the step that has them, with what is missing; not later in the update."""
+    with pytest.raises(KeyError, match=r"'final_obs'.* got none of \['policy'\]"):
+        collected(make(rsl.CATSPPO), final_obs=observations(77).select("privileged"))
+    both = {"regularizer_cfg": {"beta": 1.0}}
     with pytest.raises(KeyError, match=r"'final_obs'.* got none of \['privileged'\]"):
-        collected(make(rsl.CATSPPO), final_obs=observations(77).select("policy"))
+        collected(make(rsl.L2C2PPO, **both), final_obs=observations(77).select("policy"))
+
+
+def test_only_what_the_regularizer_reads_is_looked_up() -> None:
+    """The critic's own group is not, if the critic has no term, also not among the last ones."""
+    ends = {"dones": {2: [1]}}
+    whole, part = (
+        update(collected(make(rsl.CATSPPO), **ends, final_obs=observations(77).select(*groups)))
+        for groups in (("policy", "privileged"), ("policy",))
+    )
+    assert whole == part
+    ppo = collected(make(rsl.CATSPPO))
+    (batch,) = ppo.storage.mini_batch_generator(1, 1)
+    assert list(batch.next_observations.keys()) == ["policy"]
+    assert {*batch.observations.keys()} == {"policy", "privileged"}
+
+
+@pytest.mark.parametrize("final", [torch.zeros(ENVS, 3), np.array([None] * ENVS)])
+def test_final_observations_of_another_kind_are_refused(final: Any) -> None:
+    """As Gymnasium's arrays of objects, which rsl_rl's PPO ignores."""
+    with pytest.raises(TypeError, match=r"'final_obs'.* to be a TensorDict .* got a (Tens|ndarr)"):
+        collected(make(rsl.CATSPPO), final_obs=final)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "name"), [(rsl.L2C2PPO, "l2c2_counted"), (rsl.CATSPPO, "cats_counted")]
+)
+def test_the_share_that_counts_is_less_by_the_resets(algorithm: type[PPO], name: str) -> None:
+    """Three of thirty transitions end an episode."""
+    ppo = collected(make(algorithm), dones={STEPS - 1: [0, 2], 1: [4]})
+    assert update(ppo)[name] == pytest.approx(1 - 3 / (ENVS * STEPS))
 
 
 def test_final_observations_of_another_shape_are_refused() -> None:
@@ -515,6 +548,17 @@ def test_the_gain_rises_with_the_updates_and_is_resumed() -> None:
     assert update(collected(resumed)) == losses
 
 
+def test_a_ramp_of_another_length_is_told_when_it_is_resumed() -> None:
+    """The gain would jump: from a half to the whole."""
+    ppo = make(rsl.L2C2PPO, max_iterations=4)
+    for _ in range(2):
+        update(collected(ppo))
+    resumed = make(rsl.L2C2PPO, max_iterations=2)
+    said = r"with ramp_updates=4, and this run has ramp_updates=2: the gain continues at 1"
+    with pytest.warns(UserWarning, match=said):
+        resumed.load(ppo.save(), None, strict=True)
+
+
 def test_draws_of_another_kind_of_device_begin_anew() -> None:
     """A policy trained on a GPU is played, exported and trained on elsewhere."""
     ppo = make(rsl.L2C2PPO, regularizer_cfg={"ramp_updates": 4})
@@ -559,6 +603,9 @@ def test_a_checkpoint_of_another_ppo_is_a_beginning(before: type[PPO]) -> None:
         ({"normal": {"class_name": "BetaDistribution"}}, "normal .* got a BetaDistribution"),
         ({"normal": None}, "normal .* got a NoneType"),
         ({"regularizer_cfg": {"sigmaa": 1.0}}, "sigmaa"),
+        ({"regularizer_cfg": "strength=2"}, "regularizer_cfg to be a dict .* got 'strength=2'"),
+        ({"regularizer_cfg": {"method": ["l2c2"]}}, r"method must be 'l2c2' or .* got \['l2c2'\]"),
+        ({"max_iterations": 1500.0}, "max_iterations must be an integer, got 1500.0"),
     ],
 )
 def test_what_cannot_be_regularized_is_refused(settings: dict[str, Any], said: str) -> None:

@@ -674,6 +674,19 @@ class TestPresets:
         for name, value in PRESETS[method]["sac"].settings.items():
             assert f"{name}={value!r}" in message
 
+    def test_without_a_preset_single_settings_replace_those_of_the_nearest(self):
+        """As they replace a preset's; the others are told."""
+        (case,) = (case for case in CASES if case.name == "IQL")
+        with pytest.warns(UserWarning, match=r"of SACLoss, the nearest: policy_dist.*beta=0\.0\.$"):
+            loss = smooth(case.make(), lambda_min=20.0)
+        near = loss.l2c2_neighborhood
+        assert (near.lambda_min, near.lambda_max, near.neighbors) == (20.0, 1000.0, "line")
+        assert loss.l2c2_policy_distance == "mean" and loss._ramp is None
+        with pytest.warns(UserWarning, match="has no preset") as told:
+            loss = smooth(case.make(), neighborhood=Neighborhood(0.3, 2.0, 5.0))
+        assert "lambda_max" not in str(told[0].message)
+        assert loss.l2c2_neighborhood.lambda_max == 5.0
+
     def test_overrides_replace_single_settings(self):
         loss = smooth(sac(), lambda_min=3.0, sigma=0.5, fraction=0.5, beta=0.2)
         near = loss.l2c2_neighborhood
@@ -690,8 +703,10 @@ class TestPresets:
             (
                 {"lamda_min": 1.0},
                 TypeError,
-                r"settings of l2c2, .*'lambda_min'.*got \['lamda_min'\]",
+                r"settings of l2c2, .*'lambda_min'.*got \['lamda_min'\]\. .* mean 'lambda_min'",
             ),
+            ({"strenght": 1.0}, TypeError, "Did you mean 'strength'"),
+            ({"method": 2.0}, ValueError, "got 2.0. For a strength: strength=2.0"),
             ({"method": "caps", "beta": 0.1}, TypeError, r"settings of caps, .*got \['beta'\]"),
             (
                 {"method": "caps", "neighbors": "line"},
@@ -706,7 +721,7 @@ class TestPresets:
             ),
             ({"strength": -1.0}, ValueError, "strength must be .*at least 0"),
             ({"strength": "2"}, TypeError, "strength must be a real number"),
-            ({"ramp": 2.0}, ValueError, "ramp|length"),
+            ({"ramp": 2.0}, ValueError, r"ramp must be in \(0, 1\], got 2.0"),
         ],
     )
     def test_wrong_settings_are_refused(self, arguments, error, message):
@@ -719,6 +734,12 @@ class TestPresets:
             smooth(smooth(sac()), "cats")
         with pytest.raises(TypeError, match="Call smooth before the loss is compiled"):
             smooth(torch.compile(sac(), backend="eager"))
+        with pytest.raises(
+            TypeError, match=r"the class SACLoss: make the loss first, SACLoss\(\.\."
+        ):
+            smooth(SACLoss)
+        with pytest.raises(TypeError, match=r"LossModule, got a int\.$"):
+            smooth(3)
         with pytest.raises(TypeError, match="got a Linear"):
             smooth(nn.Linear(1, 1))
         with pytest.raises(TypeError, match="sequences"):
@@ -806,6 +827,35 @@ class TestProgress:
             assert loss.regularizer_gain.item() == progress
         assert len(graphs) == 1
 
+    def test_the_strength_can_be_changed_later(self):
+        """Of a ramp it is the final gain, and the progress stays."""
+        loss = smooth(sac(), strength=3.0)
+        loss.strength = 1.5
+        assert loss.regularizer_gain.item() == 1.5 == loss.strength
+        loss = smooth(ppo(), strength=2.0)
+        loss.set_progress(0.25)
+        loss.strength *= 0.5
+        assert loss.regularizer_gain.item() == 0.25
+        loss.set_progress(0.5)
+        assert loss.regularizer_gain.item() == 0.5
+        assert loss.strength == 1.0
+        for wrong in (-1.0, math.nan, "2"):
+            with pytest.raises((ValueError, TypeError), match="strength must be"):
+                loss.strength = wrong
+        assert loss.regularizer_gain.item() == 0.5
+
+    def test_progress_that_stays_at_zero_is_told_once(self):
+        """As from frames // total_frames."""
+        loss, batch = smooth(cloning(), **GIVEN, ramp=1.0, beta=0.0), seeded(transitions, 4)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            for _ in range(1010):
+                loss.set_progress(0)
+                loss(batch)
+        (message,) = (str(each.message) for each in told if "progress" in str(each.message))
+        assert "still 0 after 1000 updates" in message
+        assert "loss.set_progress(frames / total_frames)" in message
+
     def test_presets_with_a_constant_gain_ignore_it(self):
         loss = smooth(sac())
         loss.set_progress(0.1)
@@ -841,5 +891,5 @@ class TestProgress:
         loss = smooth(cloning(), **GIVEN, ramp=1.0)
         loss.set_progress(0.0)
         assert not self.train(loss)
-        assert not self.train(smooth(cloning(), **GIVEN))
+        assert not self.train(smooth(cloning(), **GIVEN, ramp=None))
         assert not self.train(smooth(cloning(), **GIVEN, ramp=1.0), updates=40)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import inspect
 import warnings
 from collections.abc import Mapping
+from difflib import get_close_matches
 from typing import Any
 
+from torch import nn
 from torchrl.objectives import LossModule
 
 from torchrl_l2c2 import objectives
-from torchrl_l2c2._checks import check_real
+from torchrl_l2c2._checks import as_number, check_real
 from torchrl_l2c2.neighborhood import Neighborhood
 from torchrl_l2c2.objectives import RegularizedLoss
 from torchrl_l2c2.objectives._batch import check_evaluates_states
@@ -84,18 +86,19 @@ def smooth(
         ['loss_actor', 'loss_qvalue', 'penalty_l2c2_actor']
     """
     if not isinstance(loss, LossModule):
-        raise TypeError(
-            f"Expected a torchrl.objectives.LossModule, got a {type(loss).__name__}. Call smooth "
-            "before the loss is compiled."
-        )
+        raise TypeError(f"Expected a torchrl.objectives.LossModule, got {_what(loss)}.")
     if isinstance(loss, RegularizedLoss):
         raise TypeError(
             f"Expected a loss without a regularizer, got a {type(loss).__name__}. Call smooth once "
             "with overrides, or combine the classes: CATSLoss(L2C2Loss(loss, ...), ...)."
         )
     if method not in METHODS:
-        raise ValueError(f"Expected method to be one of {list(METHODS)}, got {method!r}.")
+        hint = f" For a strength: strength={method!r}." if isinstance(method, int | float) else ""
+        raise ValueError(f"Expected method to be one of {list(METHODS)}, got {method!r}.{hint}")
+    strength = as_number("strength", strength)
     check_real("strength", strength, at_least=0)
+    if overrides.get("ramp") is not None:
+        check_real("ramp", overrides["ramp"], above=0, at_most=1, hint="None: no ramp.")
     check_evaluates_states(loss)
     chosen = _chosen(loss, method, overrides)
     make = getattr(objectives, METHODS[method])
@@ -111,9 +114,7 @@ def _chosen(loss: LossModule, method: str, overrides: Mapping[str, Any]) -> Pres
     name = type(loss).__name__
     kind, exact = kind_of(type(loss))
     if kind is None:
-        if GAIN_SETTING[method] in overrides:
-            return Preset().overridden(overrides)
-        raise TypeError(_no_preset(loss, method))
+        return _of_nearest(loss, method, overrides)
     chosen = preset(method, kind)
     found_with = KINDS[kind][0][0]
     if chosen.evidence is None and GAIN_SETTING[method] not in overrides:
@@ -131,22 +132,52 @@ def _chosen(loss: LossModule, method: str, overrides: Mapping[str, Any]) -> Pres
     return chosen.overridden(overrides)
 
 
-def _no_preset(loss: LossModule, method: str) -> str:
+def _of_nearest(loss: LossModule, method: str, overrides: Mapping[str, Any]) -> Preset:
+    """The settings of a loss without a preset: the gain is given, others are the nearest preset's.
+
+    Raises:
+        TypeError: no gain is given, or the loss has nothing that the method can smooth.
+    """
     name = type(loss).__name__
-    if getattr(loss, POLICY_NETWORK, None) is None:
-        if method != "l2c2":
-            return f"{method} needs a policy: {name} has none. 'l2c2' smooths value functions, too."
-        kind = "ppo_rpe"  # The only preset that smooths values.
-    else:
-        names = [part.__name__ for part in type(loss).__mro__]
-        others = "sac" if getattr(loss, "qvalue_network", None) is not None else "ppo"
-        kind = next((NEAREST[each] for each in names if each in NEAREST), others)
+    without = "" if getattr(loss, POLICY_NETWORK, None) is not None else f" and no {POLICY_NETWORK}"
+    if without and method != "l2c2":
+        raise TypeError(
+            f"{method} needs a policy: {name} has none. 'l2c2' smooths value functions, too."
+        )
+    kind = _nearest_kind(loss)
     nearest = preset(method, kind)
     settings = dict(nearest.settings) | ({} if nearest.ramp is None else {"ramp": nearest.ramp})
-    return (
-        f"{name} has no preset. The nearest is the preset of {KINDS[kind][0][0]}; to use it, pass "
-        f"its settings: smooth(loss, {method!r}, {_shown(settings)})."
-    )
+    found_with = KINDS[kind][0][0]
+    if GAIN_SETTING[method] not in overrides and "neighborhood" not in overrides:
+        raise TypeError(
+            f"{name} has no preset{without}. The nearest is the preset of {found_with}; to use it, "
+            f"pass its settings: smooth(loss, {method!r}, {_shown(settings)})."
+        )
+    chosen = nearest.overridden(overrides)
+    kept = chosen.settings.keys() | {"ramp"}
+    if taken := {k: v for k, v in settings.items() if k in kept and k not in overrides}:
+        warnings.warn(
+            f"{name} has no preset: settings that are not given come from the preset of "
+            f"{found_with}, the nearest: {_shown(taken)}.",
+            stacklevel=4,
+        )
+    return chosen
+
+
+def _nearest_kind(loss: LossModule) -> str:
+    if getattr(loss, POLICY_NETWORK, None) is None:
+        return "ppo_rpe"  # The only preset that smooths values.
+    names = [part.__name__ for part in type(loss).__mro__]
+    others = "sac" if getattr(loss, "qvalue_network", None) is not None else "ppo"
+    return next((NEAREST[each] for each in names if each in NEAREST), others)
+
+
+def _what(loss: object) -> str:
+    """Describes an argument that is no loss, and the remedy."""
+    if isinstance(loss, type):
+        return f"the class {loss.__name__}: make the loss first, {loss.__name__}(...)"
+    hint = ". Call smooth before the loss is compiled" if isinstance(loss, nn.Module) else ""
+    return f"a {type(loss).__name__}{hint}"
 
 
 def _shown(settings: Mapping[str, Any]) -> str:
@@ -158,13 +189,16 @@ def _arguments(method: str, make: type, settings: Mapping[str, Any]) -> dict[str
     arguments = dict(settings)
     known = list(inspect.signature(make).parameters)
     known.remove("base_loss")
-    near = {}
+    fields = {}
     if "neighborhood" in known:
-        near = {name: arguments.pop(name) for name in NEIGHBORHOOD_FIELDS & arguments.keys()}
+        fields = {name: arguments.pop(name) for name in NEIGHBORHOOD_FIELDS & arguments.keys()}
         known += sorted(NEIGHBORHOOD_FIELDS)
     unknown = sorted(arguments.keys() - set(known))
     if unknown:
-        raise TypeError(f"Expected settings of {method}, {[*known, 'ramp']}, got {unknown}.")
-    if "neighborhood" not in arguments and near:
-        arguments["neighborhood"] = Neighborhood(**near)
+        known += ["ramp", "method", "strength", "fold"]
+        near = get_close_matches(unknown[0], known, 1)
+        hint = f" Did you mean {near[0]!r}?" if near else ""
+        raise TypeError(f"Expected settings of {method}, {known}, got {unknown}.{hint}")
+    if "neighborhood" not in arguments and fields:
+        arguments["neighborhood"] = Neighborhood(**fields)
     return arguments

@@ -118,7 +118,7 @@ def find_transitions(
         if not present:
             raise KeyError(
                 f"{network} needs the next observation to be regularized, and the batch has no "
-                f"{list(map(next_key, floating))}: keep what the collector wrote there."
+                f"{list(map(next_key, floating))}: keep it (collectors with compact_obs=False do)."
             )
         pairs.update(present)
         for key in read if labels else ():

@@ -43,6 +43,9 @@ PARTS: dict[str, tuple[str, tuple[str, ...]]] = {
 PATIENCE = 50
 """Calls of a loss before it warns of mistakes in the training loop."""
 
+STANDSTILL = 1000
+"""Calls of a loss at progress 0 before it warns; a first rollout has fewer."""
+
 
 def fold_targets(term: str, trains_policy: bool, own: Iterable[str]) -> list[str]:
     """Finds the loss's own terms to which a penalty is added.
@@ -156,9 +159,11 @@ class TermWatch:
         self._counted = 0
         self._warned: set[str] = set()
 
-    def see_forward(self, loss: Any, terms: TensorDictBase) -> None:
+    def see_forward(self, loss: Any, batch: TensorDictBase, terms: TensorDictBase) -> None:
         """Counts a call of a loss in training, and follows the gradients of its added terms."""
         self._forwards += 1
+        if self._forwards == 1 and loss._followed:
+            _warn_of_several_steps(batch)
         if self._forwards == PATIENCE and loss._ramp is not None and not self.progress_set:
             warnings.warn(
                 f"the gain of {type(loss).__name__} follows the progress of training, and "
@@ -166,6 +171,14 @@ class TermWatch:
                 f"{loss.regularizer_gain.item():g}. Call "
                 "loss.set_progress(frames / total_frames) after every rollout, or "
                 "choose ramp=None.",
+                stacklevel=4,
+            )
+        stands = self._forwards == STANDSTILL and self.progress_set and loss.strength > 0
+        if stands and not loss.regularizer_gain:
+            warnings.warn(
+                f"the penalty of {type(loss).__name__} was 0 until now, because the progress of "
+                f"training is still 0 after {STANDSTILL} updates. Call "
+                "loss.set_progress(frames / total_frames) after every rollout, with / and not //.",
                 stacklevel=4,
             )
         if loss.folded:
@@ -210,20 +223,43 @@ class TermWatch:
                 stacklevel=4,
             )
 
-    def see_counts(self, name: str, counts: Tensor) -> None:
-        """Warns of next observations that are not finite."""
+    def see_counts(self, name: str, counts: Tensor, max_step: float | None) -> None:
+        """Warns of observations that are not finite, or of a ``max_step`` that is too small."""
         self._counted += 1
         if "counts" in self._warned or (counts.is_cuda and self._counted % 100 != 1):
             return
-        if not bool(counts.all()):
+        if max_step is not None:
+            if not bool(counts.any()):
+                self._warned.add("counts")
+                warnings.warn(
+                    f"all transitions of the batch are longer than max_step={max_step:g}, so the "
+                    f"penalty of {name} is 0: raise max_step, or choose max_step=None.",
+                    stacklevel=5,
+                )
+        elif not bool(counts.all()):
             self._warned.add("counts")
             share = 1.0 - counts.float().mean().item()
             warnings.warn(
-                f"{share:.2%} of the next observations in the batch are not finite, as some "
-                f"environments give at resets: {name} leaves these transitions out. If all are not "
-                "finite, the regularizer has no effect: keep the true next observations.",
+                f"{share:.2%} of the transitions in the batch have an observation or a next "
+                "observation that is not finite, as some environments give at resets: "
+                f"{name} leaves these transitions out. If all are left out, the regularizer has no "
+                "effect: keep the true next observations.",
                 stacklevel=5,
             )
+
+
+def _warn_of_several_steps(batch: TensorDictBase) -> None:
+    """Warns if next observations are several steps ahead, as after ``MultiStepTransform``."""
+    steps = batch.get("steps_to_next_obs", None)
+    most = 1 if steps is None or not steps.numel() else int(steps.max())
+    if most > 1:
+        warnings.warn(
+            f"the next observations of the batch are up to {most} steps ahead of their states "
+            "(n-step returns): the neighborhoods are larger than with single transitions, and so is "
+            "the penalty. The presets were found with single transitions: choose a smaller "
+            "strength.",
+            stacklevel=5,
+        )
 
 
 def _forget(pending: set[str], key: str, gradient: Tensor) -> None:

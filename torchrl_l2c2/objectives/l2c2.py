@@ -383,8 +383,7 @@ class L2C2Loss(RegularizedLoss):
             neighbor = at_rows(neighbor, rows)
         states, distance = _read_neighbors(neighbor, self.l2c2_neighbor_key)
         counts = distance[0].isfinite()
-        if self.l2c2_neighborhood.max_step is None:
-            self.warn_uncounted(counts)
+        self.warn_uncounted(counts, self.l2c2_neighborhood.max_step)
         if (ends := self._ends(tensordict)) is not None:
             counts = counts & ~(ends if rows is None else ends.flatten()[rows])
         return Neighbors(states, distance, counts, rows)

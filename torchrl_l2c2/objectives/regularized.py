@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from difflib import get_close_matches
+from inspect import signature
 from textwrap import indent
 from types import MappingProxyType
 from typing import Any, ClassVar, TypeVar
@@ -46,11 +47,15 @@ from torchrl_l2c2.objectives._networks import (
     is_ensemble,
 )
 from torchrl_l2c2.objectives._specialize import SpecializedLoss
+from torchrl_l2c2.presets import NEIGHBORHOOD_FIELDS
 
 Made = TypeVar("Made")
 
 GAIN = "regularizer_gain"
 """Name of the coefficient that multiplies all added terms of a regularized loss."""
+
+METHODS = ("fold", "ramp", "set_progress", "unfold")
+"""Methods that could be taken for attributes."""
 
 PROGRESS = "regularizer_progress"
 """Name of the buffer with the completed share of training, for a ramp."""
@@ -87,9 +92,11 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         base_loss (LossModule): the loss.
 
     Attributes:
-        regularizer_gain (Tensor): factor of all added terms, at least 0; initially 1. Larger values
-            regularize more; 0 leaves the base loss's values and gradients unchanged. Assign to it
-            at any time, also between calls of a compiled loss.
+        strength (float): factor of all added terms, at least 0; of a ramp, its final value. Larger
+            values regularize more; 0 leaves the base loss's values and gradients unchanged. Assign
+            to it at any time, also between calls of a compiled loss.
+        regularizer_gain (Tensor): the factor at present, at least 0; initially 1. A ramp sets it at
+            every :meth:`set_progress`. Without a ramp it is the strength.
         policy_terms (frozenset of str): the added ``loss_*`` keys that train the policy.
         auxiliary_terms (frozenset of str): the added ``loss_*`` keys that train networks of a
             regularizer, such as a predictor.
@@ -99,9 +106,10 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         TypeError: the loss cannot be regularized, or has this regularizer already.
 
     Warns:
-        UserWarning: in use, once each: an added term is never differentiated; next observations are
-            not finite; :meth:`set_progress` is never called for a ramp; or keys or the value
-            estimator of the base loss change after the wrapping.
+        UserWarning: in eager use, once each: an added term is never differentiated; observations
+            are not finite, or several steps ahead; the progress of a ramp is never set, or stays 0;
+            keys or the value estimator of the base loss change after the wrapping; or a setting is
+            assigned that is only read when the loss is made.
 
     Examples:
         >>> import torch
@@ -207,7 +215,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         else:
             terms.update(added)
         if not is_compiling() and self.training and torch.is_grad_enabled():
-            self._watch.see_forward(self, terms)
+            self._watch.see_forward(self, tensordict, terms)
             self._warn_of_changed_base()
         networks = (f"{name}_params" for name in self._evaluation.specs)
         self._clear_weakrefs(tensordict, terms, *networks)
@@ -311,6 +319,21 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         self.regularizer_gain = end
         return self
 
+    @property
+    def strength(self) -> float:
+        """Factor of all added terms; of a ramp, its final value."""
+        return self._buffers[GAIN].item() if self._ramp is None else self._ramp[0]
+
+    @strength.setter
+    def strength(self, strength: float) -> None:
+        strength = as_number("strength", strength)
+        check_real("strength", strength, at_least=0)
+        if self._ramp is None:
+            self.regularizer_gain = strength
+        else:
+            self._ramp = float(strength), self._ramp[1]
+            self._follow_progress()
+
     def set_progress(self, progress: float) -> None:
         """Sets the progress of training, which sets the gain of a :meth:`ramp`.
 
@@ -387,7 +410,9 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name not in self._coefficients:
-            self._warn_of_typo(name)
+            if name in METHODS and not callable(value):
+                raise TypeError(f"{name} is a method: call loss.{name}(...) instead.")
+            self._warn_of_typo(name, value)
             super().__setattr__(name, value)
             return
         try:
@@ -405,8 +430,8 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         self._buffers[name].fill_(number)
         self._coefficients[name].fill_(number)
 
-    def _warn_of_typo(self, name: str) -> None:
-        """Warns of a new attribute whose name is nearly the name of a gain."""
+    def _warn_of_typo(self, name: str, value: Any) -> None:
+        """Warns of a new attribute with the name of a setting, or nearly the name of a gain."""
         if name.startswith("_") or hasattr(self, name):
             return
         gains = [gain for gain in self._coefficients if gain.endswith(f"_{name}")]
@@ -416,6 +441,18 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
                 f"{name!r} scales nothing in a {type(self).__name__}: the gain is {gains[0]!r}.",
                 stacklevel=3,
             )
+        elif name in self._made_with():
+            warnings.warn(
+                f"{name!r} is read when a {type(self).__name__} is made: assigning to it has no "
+                f"effect. Make the loss with {name}={value!r}.",
+                stacklevel=3,
+            )
+
+    def _made_with(self) -> set[str]:
+        """Names of the settings with which this package's regularizers are made."""
+        own = (part for part in self._parts if part.__module__.startswith(__package__))
+        names = {name for part in own for name in signature(part).parameters}
+        return (names | NEIGHBORHOOD_FIELDS | {"method"}) - {"base_loss"}
 
     def __repr__(self) -> str:
         # TensorDict's modules leave extra_repr out.
@@ -752,13 +789,13 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             raise KeyError(f"skip_ends=True needs {key!r}, and the batch has none: keep it.")
         return done.reshape(*tensordict.batch_size, -1).any(-1)
 
-    def warn_uncounted(self, counts: Tensor) -> None:
-        """Warns once if next observations of the batch are not finite; eager only.
+    def warn_uncounted(self, counts: Tensor, max_step: float | None = None) -> None:
+        """Warns once if transitions do not count, with ``max_step`` only if none does; eager only.
 
         On a GPU only some batches are checked, because the check synchronizes.
         """
         if not is_compiling():
-            self._watch.see_counts(type(self).__name__, counts)
+            self._watch.see_counts(type(self).__name__, counts, max_step)
 
     def reduce_term(
         self,

@@ -11,10 +11,11 @@ from rsl_rl.algorithms import PPO
 from rsl_rl.env import VecEnv
 from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
-from tensordict import NestedKey, TensorDict
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_l2c2 import objectives
+from torchrl_l2c2._checks import check_choice, check_positive_int
 from torchrl_l2c2.objectives import L2C2Loss, RegularizedLoss
 from torchrl_l2c2.presets import METHODS, NEIGHBORHOOD_FIELDS, preset
 from torchrl_l2c2.rsl_rl.networks import ENTRIES, ActorCriticLoss
@@ -79,6 +80,13 @@ class RegularizedPPO(PPO):
         networks = ActorCriticLoss(actor, critic)
         _check_groups(storage.observations.keys(), (*ENTRIES, ROW, "next"))
         super().__init__(actor, critic, SuccessorStorage(storage), *args, **kwargs)
+        if not isinstance(regularizer_cfg, Mapping | None):
+            raise TypeError(
+                "Expected regularizer_cfg to be a dict of settings, such as {'strength': 2.0}, got "
+                f"{regularizer_cfg!r}."
+            )
+        if max_iterations is not None:
+            check_positive_int("max_iterations", max_iterations)
         overrides = dict(regularizer_cfg or {})
         method = overrides.pop("method", self.method or "l2c2")
         _check_method(method, type(self))
@@ -87,14 +95,15 @@ class RegularizedPPO(PPO):
         chosen = preset(method, "ppo").overridden(
             {name: value for name, value in overrides.items() if name != "ramp_updates"}
         )
+        hint = chosen.ramp is not None and "ramp_updates" not in overrides
         ramp_updates = overrides.pop("ramp_updates", chosen.ramp and max_iterations)
         loss = smooth(networks, method, strength, fold=False, **overrides, ramp=None)
+        self.storage.groups = list(_groups(loss))
         self.symmetry = self.regularization = Regularization(
             loss.to(self.device), self._neighbors(loss), method, ramp_updates, self.symmetry
         )
         if not self.gpu_global_rank:
             settings = {"method": method, **chosen.settings, "strength": strength}
-            hint = ramp_updates is None and chosen.ramp is not None
             name, given = type(self).__name__, bool(regularizer_cfg)
             print(_settings_line(name, settings, ramp_updates, hint, given))
 
@@ -118,8 +127,7 @@ class RegularizedPPO(PPO):
             return None
         stored = self.storage.observations
         _check_groups(stored.keys(), [loss.l2c2_neighbor_key])
-        read = dict.fromkeys(group for spec in loss.networks.values() for group in spec.states)
-        groups = [group for group in read if stored[group].is_floating_point()]
+        groups = [group for group in _groups(loss) if stored[group].is_floating_point()]
         generator = torch.Generator(self.device).manual_seed(torch.initial_seed())
         return loss.neighbor_transform(generator, loss.l2c2_moved_keys or groups)
 
@@ -128,10 +136,11 @@ class RegularizedPPO(PPO):
     ) -> None:
         final = extras.get(FINAL)
         if final is not None:
-            _check_final(final, obs)
+            _check_final(final, obs, self.storage.groups)
         super().process_env_step(obs, rewards, dones, extras)
         if final is not None:
-            final = TensorDict({**final}, [self.storage.num_envs], device=self.device)
+            final = {group: final[group] for group in self.storage.groups}
+            final = TensorDict(final, [self.storage.num_envs], device=self.device)
             self.storage.add_final(final, dones)
 
     def compute_returns(self, obs: TensorDict) -> None:
@@ -172,11 +181,21 @@ def _check_groups(names: Iterable[str], taken: Iterable[NestedKey]) -> None:
         )
 
 
-def _check_final(final: Any, obs: TensorDict) -> None:
-    groups = list(obs.keys())
+def _groups(loss: RegularizedLoss) -> dict[str, None]:
+    """The observation groups that the regularized networks read."""
+    return dict.fromkeys(group for spec in loss.networks.values() for group in spec.states)
+
+
+def _check_final(final: Any, obs: TensorDict, groups: Iterable[str]) -> None:
+    if not isinstance(final, Mapping | TensorDictBase):
+        raise TypeError(
+            f"Expected extras[{FINAL!r}] to be a TensorDict of observation groups, [num_envs], got "
+            f"a {type(final).__name__}. Convert it in the environment, or leave {FINAL!r} out."
+        )
+    groups = list(groups)
     if missing := [group for group in groups if group not in final.keys()]:
         raise KeyError(
-            f"Expected all observation groups in extras[{FINAL!r}], {groups}, got none of "
+            f"Expected the observation groups {groups} in extras[{FINAL!r}], got none of "
             f"{missing}. Add these groups in the environment, or leave {FINAL!r} out."
         )
     for group in groups:
@@ -208,7 +227,7 @@ class L2C2PPO(RegularizedPPO):
 
     When an episode ends, rsl_rl stores the observation after the reset, so these transitions are
     left out of the mean. They count if the environment writes the last observations of ended
-    episodes to ``extras["final_obs"]``, a TensorDict of all groups, ``[num_envs]``.
+    episodes to ``extras["final_obs"]``, a TensorDict of these groups, ``[num_envs]``.
 
     Neighbors have their own generator, seeded with :func:`torch.initial_seed`: at a gain of 0 a
     training run has the same random numbers as with rsl_rl's PPO. A symmetry extension works as
@@ -266,13 +285,12 @@ class CATSPPO(RegularizedPPO):
 
 def _check_method(method: str, algorithm: type[RegularizedPPO]) -> None:
     possible = [name for name in METHODS if name not in PREVIOUS]
-    if method in PREVIOUS:
+    if isinstance(method, str) and method in PREVIOUS:
         raise ValueError(
             f"Expected method to be one of {possible}, got {method!r}, which needs the observation "
             "before each state. Rollouts of rsl_rl lack it."
         )
-    if method not in METHODS:
-        raise ValueError(f"Expected method to be one of {possible}, got {method!r}.")
+    check_choice("method", method, possible)
     if algorithm.method not in (None, method):
         raise ValueError(
             f"Expected the method {algorithm.method!r} of {algorithm.__name__}, got {method!r}. "

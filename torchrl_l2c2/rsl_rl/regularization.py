@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import torch
@@ -75,6 +76,9 @@ class Regularization:
         """
         batch_of_loss = self._transitions(actor, batch, original_batch_size)
         terms = dict(self.loss(batch_of_loss).items())
+        # Means over the valid rows: these diagnostics are shares of all rows.
+        valid = batch.has_next.float().mean()
+        terms.update({name: terms[name] * valid for name in terms if name.endswith("_counted")})
         total = sum(term for name, term in terms.items() if is_loss(name))
         if self.symmetry is not None:
             mirror = self.symmetry.compute_loss(actor, batch, original_batch_size)
@@ -97,17 +101,31 @@ class Regularization:
         self._set_progress()
 
     def state_dict(self) -> dict[str, Any]:
-        """The method, the number of updates and the state of the generator."""
+        """The method, the number of updates, the ramp and the state of the generator."""
         generator = None if self.neighbors is None else self.neighbors.generator
         drawn = {} if generator is None else {"generator": generator.get_state()}
-        return {"method": self.method, "updates": self.updates, **drawn}
+        ramp = {"updates": self.updates, "ramp_updates": self.ramp_updates}
+        return {"method": self.method, **ramp, **drawn}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores the result of :meth:`state_dict`; ignores the state of another method."""
+        """Restores the result of :meth:`state_dict`; ignores the state of another method.
+
+        Warns:
+            UserWarning: the ramp has another length than in the run that was saved.
+        """
         if state["method"] != self.method:
             return
         self.updates = state["updates"]
         self._set_progress()
+        length = state.get("ramp_updates", self.ramp_updates)
+        if length != self.ramp_updates:
+            warnings.warn(
+                f"the checkpoint was trained with ramp_updates={length}, and this run has "
+                f"ramp_updates={self.ramp_updates}: the gain continues at "
+                f"{float(self.loss.regularizer_gain):g}. To continue as before, set ramp_updates "
+                f"to {length} in regularizer_cfg.",
+                stacklevel=2,
+            )
         generator = None if self.neighbors is None else self.neighbors.generator
         # A generator of another kind of device has another state: do not restore it.
         if generator is not None and "generator" in state:

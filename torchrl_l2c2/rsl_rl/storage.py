@@ -21,8 +21,12 @@ class SuccessorStorage(RolloutStorage):
     episode ended, the next step belongs to another episode, and the next observation is unknown
     unless it was passed to :meth:`add_final`.
 
-    Batches have two more attributes: ``next_observations``, a TensorDict like ``observations``, and
+    Batches have two more attributes: ``next_observations``, a TensorDict of the ``groups``, and
     ``has_next``, boolean, ``[B]``, false in rows whose next observation is unknown.
+
+    Attributes:
+        groups (list of str): observation groups whose next observations batches have; initially
+            all.
 
     Args:
         storage (RolloutStorage): the storage, for reinforcement learning. Do not use it afterwards.
@@ -40,6 +44,7 @@ class SuccessorStorage(RolloutStorage):
     def __init__(self, storage: RolloutStorage) -> None:
         self.__dict__.update(vars(storage))
         stored = storage.observations
+        self.groups = list(stored.keys())
         observations: TensorDict = torch.cat((stored, stored[:1]))
         rows = torch.arange(observations.numel(), device=self.device)
         self._observations = observations.set(ROW, rows.reshape(observations.shape))
@@ -89,7 +94,7 @@ class SuccessorStorage(RolloutStorage):
     def _successors(
         self, rows: Tensor, finals: tuple[Tensor, TensorDictBase] | None
     ) -> tuple[TensorDict, Tensor]:
-        after = self._observations.exclude(ROW).flatten(0, 1)[rows + self.num_envs]
+        after = self._observations.select(*self.groups).flatten(0, 1)[rows + self.num_envs]
         known = ~self.dones.flatten()[rows].bool()
         if finals is not None:
             place = finals[0][rows]
