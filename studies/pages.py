@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +17,7 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 from studies import field, front_door, paper, rsl_rl
-from studies.cells import digest, number_range, regrouped
+from studies.cells import digest, improvements_over_tasks, number_range, regrouped
 from studies.field import BETTER, TEST, field_groups, field_table
 from studies.methods import against_table, choice_table, pairwise_tables
 from studies.paper import (
@@ -128,6 +129,7 @@ def pages() -> dict[str, Page]:
         **{f"results/{name}.md": _field_page(name, records(name)) for name in FIELD_PAGES},
         "results/one_setting.md": _field_page("one_setting", one_setting()),
         "results/other_methods.md": _other_methods_page(),
+        "results/new_tasks.md": _new_tasks_page(),
         "results/batch_mean.md": Page({"results": paper_table(averaged).markdown()}),
         "results/reacher_3000.md": Page({"results": paper_table(short).markdown()}),
         "results/parts.md": Page({"parts": parts()}),
@@ -317,6 +319,19 @@ def _other_methods_page() -> Page:
     table = comparison_table(TEST, groups).markdown()
     draw = partial(draw_plane, groups, TEST, measure="sm_asap", description=description(groups))
     return Page({"results": f"{picture}\n\n{table}"}, groups, draw)
+
+
+def _new_tasks_page() -> Page:
+    groups = group_records(records("new_tasks"))
+    table, across = comparison_table(TEST, groups), []
+    for algorithm, name, ours, better in improvements_over_tasks(groups, TEST, COMPARED):
+        runs = str(sum(len(group.runs) for group in ours))
+        cells = [cell for each in better for cell in ("", each)]
+        across.append([f"{len(ours)} tasks", algorithm, name, runs, *cells])
+    table = replace(table, rows=[*table.rows, *across])
+    picture = "![Return against action variation on each task](new_tasks.svg)"
+    draw = partial(draw_plane, groups, TEST, description=description(groups))
+    return Page({"results": f"{picture}\n\n{table.markdown()}"}, groups, draw)
 
 
 def _field_page(name: str, shown: pd.DataFrame) -> Page:
