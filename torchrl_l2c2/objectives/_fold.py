@@ -255,8 +255,8 @@ def _warn_of_several_steps(batch: TensorDictBase) -> None:
     if most > 1:
         warnings.warn(
             f"the next observations of the batch are up to {most} steps ahead of their states "
-            "(n-step returns): the neighborhoods are larger than with single transitions, and so is "
-            "the penalty. The presets were found with single transitions: choose a smaller "
+            "(n-step returns): the neighborhoods are larger than with single transitions, and so "
+            "is the penalty. The presets were found with single transitions: choose a smaller "
             "strength.",
             stacklevel=5,
         )
