@@ -26,11 +26,11 @@ SPACE: dict[str, BaseDistribution] = {
 }
 
 
-def open_study() -> optuna.Study:
+def open_study(episodes: int) -> optuna.Study:
     """The study in the folder's journal, lines of JSON that Optuna's own tools read, too."""
     FOLDER.mkdir(parents=True, exist_ok=True)
     study = optuna.create_study(
-        study_name="search",
+        study_name=f"{episodes} episodes",  # Trials of other lengths are not comparable.
         storage=optuna.storages.JournalStorage(JournalFileBackend(str(FOLDER / "journal.log"))),
         directions=["maximize", "minimize"],
         load_if_exists=True,
@@ -52,7 +52,8 @@ def measure(number: int, gains: dict[str, Any], episodes: int) -> list[float]:
             compile=episodes > 10,  # It takes longer than a few episodes.
         )
         # A run that was interrupted continues from its checkpoint.
-        experiment = Experiment(config, FOLDER / f"trial_{number:04d}" / f"seed_{seed}")
+        folder = FOLDER / f"{episodes}_episodes" / f"trial_{number:04d}" / f"seed_{seed}"
+        experiment = Experiment(config, folder)
         experiment.train()
         found.append(experiment.test(episodes=min(10, episodes)).summary())
         experiment.close()
@@ -61,7 +62,7 @@ def measure(number: int, gains: dict[str, Any], episodes: int) -> list[float]:
 
 
 def main(trials: int, episodes: int) -> None:
-    study = open_study()
+    study = open_study(episodes)
     for lost in study.get_trials(states=(TrialState.RUNNING,)):
         study.tell(lost.number, measure(lost.number, lost.params, episodes))
     while len(study.trials) < trials:

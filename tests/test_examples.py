@@ -65,12 +65,13 @@ def test_a_search_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     search = runpy.run_path(str(ROOT / "examples" / "search.py"))
     search["main"].__globals__["measure"] = lambda number, *_: [float(number), 0.1]
     search["main"](1, 1)
-    lost = search["open_study"]().ask(search["SPACE"])
+    lost = search["open_study"](1).ask(search["SPACE"])
     search["main"](3, 1)
-    trials = search["open_study"]().trials
+    trials = search["open_study"](1).trials
     assert [trial.state.name for trial in trials] == ["COMPLETE"] * 3
     assert trials[1].params == lost.params and trials[1].values == [1.0, 0.1]
     assert len({tuple(trial.params.values()) for trial in trials}) == 3
+    assert not search["open_study"](2).trials  # Longer trials would not be comparable.
 
 
 def test_it_is_short(example: Path) -> None:

@@ -129,12 +129,15 @@ def check_preset(values: dict[str, Any], name: str | None) -> None:
     folder, prefix = CONF / "preset", f"{name}_"
     general = (path.stem.removeprefix(prefix) for path in folder.glob(f"general/{prefix}*.yaml"))
     known = [f"any task with algorithm={each}" for each in sorted(general)]
-    known += sorted(path.stem for path in (folder / str(name)).glob("*.yaml"))
+    stems = [path.stem.rpartition("_") for path in (folder / str(name)).glob("*.yaml")]
+    for each in sorted({stem[-1] for stem in stems}):
+        tasks = sorted(task for task, _, algorithm in stems if algorithm == each)
+        known.append(f"task={', '.join(tasks)} with algorithm={each}")
     task, algorithm = values["task"]["name"], values["algorithm"]["name"]
     raise SettingError(
         "preset",
         f"must have settings of task={task} with algorithm={algorithm}; {name} has settings of "
-        f"{', '.join(known)}: choose one of these, or preset=none.",
+        f"{'; '.join(known)}. Choose one of these, or preset=none.",
     )
 
 
@@ -249,6 +252,8 @@ def unknown_setting(name: str) -> str:
         'task.epsodes is not a setting; did you mean task.episodes? --help lists every setting.'
         >>> unknown_setting("algorithm.num_envs")
         'algorithm.num_envs is a setting of algorithm=ppo only.'
+        >>> unknown_setting("algorithm.lr")
+        'algorithm.lr is not a setting; did you mean optimizer.lr? --help lists every setting.'
         >>> unknown_setting("sigma")
         'sigma is not a setting; did you mean regularizer.sigma? --help lists every setting.'
         >>> unknown_setting("methods")
@@ -265,7 +270,7 @@ def unknown_setting(name: str) -> str:
         return f"{name} is a setting of {chosen} only.{_suggest_two_commands(group, having)}"
     known = {*COMMAND_SETTINGS, *(field.name for field in dataclasses.fields(ExperimentConfig))}
     known |= {f"{of[0]}.{each}" for of, names in settings.items() for each in names}
-    near = sorted(each for each in known if each.endswith(f".{name}"))
+    near = sorted(each for each in known if each.endswith(f".{setting or name}"))
     near = near or ALIASES.get(name) or get_close_matches(name, sorted(known), 1, cutoff=0.7)
     suggestion = f"; did you mean {near[0]}?" if near else "."
     return f"{name} is not a setting{suggestion} --help lists every setting."

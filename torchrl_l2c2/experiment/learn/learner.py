@@ -36,6 +36,11 @@ def untrained_reason(frames: int, updates: int, random_frames: int) -> str | Non
     if updates and frames > random_frames:
         return None
     what = "no update was made" if not updates else "the policy never acted"
+    if not random_frames:
+        return (
+            f"{what} in {frames} frames: the policy is untrained. Train longer, or reduce "
+            "replay.batch_size or algorithm.frames."
+        )
     return (
         f"{what} in {frames} frames, of which the first {random_frames} were random "
         "(algorithm.random_frames): the policy is practically untrained. Train longer, or reduce "

@@ -225,8 +225,8 @@ def _movement(diagnosis: Diagnosis) -> Finding:
     """Finding about a policy whose actions have no fault."""
     change = _change(diagnosis.relative)
     numbers = (
-        f"the action changes by {change:.1%} of its range per step, and its gain on the previous "
-        f"action is {diagnosis.measures['previous_action_gain']:.2f}"
+        f"in the first episode the action changes by {change:.1%} of its range per step, and its "
+        f"gain on the previous action is {diagnosis.measures['previous_action_gain']:.2f}"
     )
     if change <= threshold("SMOOTH"):
         return Finding("smooth", f"It is smooth: {numbers}.", fault=False)

@@ -53,8 +53,9 @@ def find_runs(folders: Iterable[str | Path], *, required: bool = False) -> Found
     """
     searched = [Path(folder) for folder in folders]
     if absent := [str(folder) for folder in searched if not folder.is_dir()]:
+        found = "is a file" if Path(absent[0]).exists() else "does not exist"
         raise FileNotFoundError(
-            f"Expected a folder of runs, got {absent[0]!r}, which does not exist. Check the path."
+            f"Expected a folder of runs, got {absent[0]!r}, which {found}. Check the path."
         )
     below = {path.parent for folder in searched for path in folder.rglob("config.json")}
     unfinished, unreadable, repeated = [], [], []
