@@ -56,4 +56,6 @@ def play(folder: Path, episodes: int) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) < 2 or not Path(sys.argv[1], "contract.json").exists():
+        sys.exit("Usage: python examples/onnx_policy.py RUN/export [EPISODES]")
     play(Path(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 1)

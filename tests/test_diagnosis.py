@@ -602,11 +602,11 @@ class TestCommand:
             assert message in capsys.readouterr().err
         with pytest.raises(SystemExit, match=r"^error: '.*' is not a run folder"):
             main([str(tmp_path)])
-        for name in ("a", "b/seed_1", "b/seed_0"):
+        for name in ("a", "none/seed_1", "none/seed_0"):
             (tmp_path / "above" / name).mkdir(parents=True)
             (tmp_path / "above" / name / "config.json").touch()
         assert run_folders([str(tmp_path / "above"), str(run)]) == [
-            *(str(tmp_path / "above" / name) for name in ("a", "b/seed_0", "b/seed_1")),
+            *(str(tmp_path / "above" / name) for name in ("none/seed_0", "none/seed_1", "a")),
             str(run),
         ]
         with pytest.raises(SystemExit):

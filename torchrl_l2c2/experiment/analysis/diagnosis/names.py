@@ -14,8 +14,15 @@ from torchrl_l2c2.experiment.settings.identity import differences
 
 
 def run_folders(folders: Iterable[str]) -> list[str]:
-    """Finds the runs at or below folders; a folder without any stays."""
-    below = [sorted(Path(folder).rglob("config.json")) or [Path(folder, "_")] for folder in folders]
+    """Finds the runs at or below folders, baselines first; a folder without any stays.
+
+    The first run is the one that others are compared with.
+    """
+    below = [
+        sorted(Path(folder).rglob("config.json"), key=lambda path: ("none" not in path.parts, path))
+        or [Path(folder, "_")]
+        for folder in folders
+    ]
     return [str(path.parent) for paths in below for path in paths]
 
 
