@@ -210,12 +210,6 @@ class ExperimentConfig:
                 f"{self.replay.name!r} does not work with algorithm {self.algorithm.name!r}: ppo "
                 "needs rollout, the others prioritized or uniform.",
             )
-        if on_policy and self.replay.batch_size > self.algorithm.frames:
-            raise SettingError(
-                "replay.batch_size",
-                f"must be at most the frames of a rollout (algorithm.frames={self.algorithm.frames}"
-                f"), got {self.replay.batch_size}.",
-            )
 
 
 def _read_group(group: str, values: Mapping[str, Any]) -> Any:
