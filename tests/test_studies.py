@@ -655,6 +655,23 @@ class TestProse:
         for group in group_records(merge(shown, records("sac_pendulum"))):
             assert cell(*group.runs.iloc[:4].itertuples()) in page, group.name
 
+    def test_the_first_sentences_on_new_tasks(self):
+        """The shares of the baseline's action variation, and the changes of the return."""
+        page = " ".join((ROOT / "results" / "new_tasks.md").read_text().split())
+        means = records("new_tasks").groupby(["task", "method"]).mean(numeric_only=True)
+        ours, baseline = (means.xs(name, level="method") for name in ("l2c2", "none"))
+        shares = (ours / baseline)["last_mean_action_variation"]
+        smoother = shares[shares.index != "Reacher-v5"]
+        assert f"{100 * smoother.min():.0f} to {smoother.max():.0%} of the baseline's" in page
+        assert 1 < shares["Reacher-v5"] < 1.1
+        returns = {name: side["last_mean_return"] for name, side in (("l", ours), ("b", baseline))}
+        gained = (returns["l"] - returns["b"]) / returns["b"].abs()
+        assert set(gained[gained < 0].index) == {"HalfCheetah-v5", "Reacher-v5"}
+        assert f"on HalfCheetah ({gained['HalfCheetah-v5']:.0%})" in page
+        assert f"Reacher ({gained['Reacher-v5']:.0%})" in page
+        ant = [returns[side]["Ant-v5"] for side in "bl"]
+        assert f"returns {ant[0]:.0f}, and with L2C2 {ant[1]:.0f}" in page
+
     def test_walkings_gains(self):
         """Every run of the seeds that its gains are chosen on is a cell."""
         page = (ROOT / "results" / "field_gains.md").read_text()

@@ -54,8 +54,8 @@ Made = TypeVar("Made")
 GAIN = "regularizer_gain"
 """Name of the coefficient that multiplies all added terms of a regularized loss."""
 
-METHODS = ("fold", "ramp", "set_progress", "unfold")
-"""Methods that could be taken for attributes."""
+NOT_SETTINGS = ("fold", "ramp", "set_progress", "unfold")
+"""Methods that could be taken for settings."""
 
 PROGRESS = "regularizer_progress"
 """Name of the buffer with the completed share of training, for a ramp."""
@@ -410,7 +410,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name not in self._coefficients:
-            if name in METHODS and not callable(value):
+            if name in NOT_SETTINGS and not callable(value):
                 raise TypeError(f"{name} is a method: call loss.{name}(...) instead.")
             self._warn_of_typo(name, value)
             super().__setattr__(name, value)

@@ -16,7 +16,7 @@ from torchrl_l2c2.experiment.settings.identity import differences
 def run_folders(folders: Iterable[str]) -> list[str]:
     """Finds the runs at or below folders, baselines first; a folder without any stays.
 
-    The first run is the one that others are compared with.
+    A diagnosis compares the other runs with the first.
     """
     below = [
         sorted(Path(folder).rglob("config.json"), key=lambda path: ("none" not in path.parts, path))
