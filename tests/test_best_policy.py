@@ -18,16 +18,19 @@ from torchrl_l2c2.experiment import (
     evaluate_policy,
     load_policy,
 )
-from torchrl_l2c2.experiment.cli import diagnose, export, video
+from torchrl_l2c2.experiment.analysis import diagnosis
+from torchrl_l2c2.experiment.analysis import video as films
+from torchrl_l2c2.experiment.cli import diagnose, evaluate, export, video
 from torchrl_l2c2.experiment.cli.evaluate import main
+from torchrl_l2c2.experiment.run import policies
 from torchrl_l2c2.experiment.run.checkpoints import list_checkpoints, load_checkpoint
 from torchrl_l2c2.experiment.run.evaluation import Evaluation
 
-# What each command begins with.
+# What each command begins with. The modules are imported before a test replaces a function.
 LOADS = (
-    "run.policies.load_policy",
-    "analysis.diagnosis.diagnose_run",
-    "analysis.video.play_pictures",
+    (policies, "load_policy"),
+    (diagnosis, "diagnose_run"),
+    (films, "play_pictures"),
 )
 
 TASK = TaskConfig("pendulum", "Pendulum-v1", episodes=6, max_steps=40)
@@ -127,8 +130,8 @@ def test_what_could_not_be_written_is_refused_before_it_is_played(
     """By all commands that write what they played."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
-    for name in LOADS:
-        monkeypatch.setattr(f"torchrl_l2c2.experiment.{name}", None)
+    for module, name in LOADS:
+        monkeypatch.setattr(module, name, None)
     with pytest.raises(SystemExit, match=f"error: .*{told}"):
         main([str(folder), option])
     with pytest.raises(SystemExit, match=f"error: .*{told}"):
@@ -149,8 +152,8 @@ def test_a_video_that_could_not_be_written_is_refused_before_it_is_played(
     pytest.importorskip("imageio_ffmpeg")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
-    for loads in LOADS:
-        monkeypatch.setattr(f"torchrl_l2c2.experiment.{loads}", None)
+    for module, loads in LOADS:
+        monkeypatch.setattr(module, loads, None)
     with pytest.raises(SystemExit, match=f"error: .*{told}"):
         video.main([str(folder), f"--output={name}"])
 
@@ -164,6 +167,22 @@ def test_the_summary_is_json_and_is_told_before_anything_is_written(folder, caps
         main([str(folder), "--episodes", "1", "--output", str(folder / "result.json")])
     told = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
     assert told == {"return_mean": 1.0, "roughness_mean": None}
+
+
+def test_a_closed_output_does_not_prevent_the_file(folder, monkeypatch):
+    """As in ``evaluate FOLDER --output result.json | head -0``: the episodes took minutes."""
+
+    def closed(*_, **__):
+        raise BrokenPipeError
+
+    (folder / "result.json").unlink(missing_ok=True)
+    monkeypatch.setattr(evaluate, "print", closed, raising=False)
+    monkeypatch.setattr("os.dup2", lambda *_: None)  # pytest's own output stays open.
+    with pytest.raises(SystemExit) as ended:
+        main([str(folder), "--episodes", "2", "--output", str(folder / "result.json")])
+    assert ended.value.code == 1
+    written = json.loads((folder / "result.json").read_text())
+    assert len(written["episodes"]["returns"]) == 2 and written["arguments"]["seed"] >= 10**6
 
 
 def broken(path, value):
@@ -185,8 +204,8 @@ def test_numbers_that_are_not_finite_end_every_command_in_one_line(folder, monke
     def diverged(*_, **__):
         raise FloatingPointError("reward is not finite at frame 5")
 
-    for command, name in zip((main, diagnose.main, video.main), LOADS, strict=True):
-        monkeypatch.setattr(f"torchrl_l2c2.experiment.{name}", diverged)
+    for command, (module, name) in zip((main, diagnose.main, video.main), LOADS, strict=True):
+        monkeypatch.setattr(module, name, diverged)
         with pytest.raises(SystemExit, match="error: reward is not finite at frame 5"):
             command([str(folder)])
 

@@ -316,9 +316,9 @@ def broken_after(experiment, frames, outcome):
         (
             RuntimeError("physics gone"),
             SimulatorError,
-            "failed after frame 40: .* physics gone",
+            "failed in the episode after frame 40: .* physics gone",
         ),
-        (SystemExit(4), SimulatorError, r"failed after frame 40: SystemExit: 4\."),
+        (SystemExit(4), SimulatorError, r"failed in the episode after frame 40: SystemExit: 4\."),
     ],
 )
 def test_a_broken_simulator_stops_the_run_and_leaves_a_checkpoint(
@@ -513,7 +513,7 @@ def test_an_error_of_the_users_own_task_is_shown_with_its_lines(tmp_path, monkey
     assert 'broken_task.py", line 9, in step' in done.stderr and "lower_the_boom" in done.stderr
     assert "KeyError: 'boom'" in done.stderr
     told = done.stderr.splitlines()[-1]
-    assert told.startswith("error: broken_task:Broken-v0 failed after") and "'boom'" in told
+    assert told.startswith("error: broken_task:Broken-v0 failed in the ") and "'boom'" in told
 
 
 def test_a_sweep_gives_one_table(tmp_path):
@@ -538,21 +538,27 @@ def test_a_sweep_gives_one_table(tmp_path):
 
 def test_in_a_sweep_a_failed_job_is_told_and_the_others_go_on(tmp_path):
     """And the same command again does not repeat what is finished."""
-    overrides = ("-m", *PENDULUM_OVERRIDES, *SHORTER, "regularizer.sigma=-1,1")
-    overrides += ("hydra/launcher=basic",)
+    overrides = ("-m", *PENDULUM_OVERRIDES, *SHORTER, "hydra/launcher=basic")
+    # Each value is right, and so the sweep begins; the last pair of them is wrong.
+    overrides += ("replay.capacity=300,100", "replay.batch_size=8,200")
     failed = run_train(*overrides, folder=tmp_path, check=False)
     assert failed.returncode == 1
-    assert "sigma must be greater than 0, got -1" in failed.stderr
-    (run,) = read_runs(tmp_path)
-    written = (run.folder / "evaluation.json").stat().st_mtime_ns
+    assert "replay.capacity must be at least the batch_size (200), got 100" in failed.stderr
+    written = {run.folder: written_at(run.folder) for run in read_runs(tmp_path)}
+    assert len(written) == 3
     again = run_train(*overrides, folder=tmp_path, check=False)
-    assert "sigma must be greater than 0, got -1" in again.stderr  # What failed is tried again.
-    assert (run.folder / "evaluation.json").stat().st_mtime_ns == written
+    # The failed job is tried again.
+    assert "replay.capacity must be at least the batch_size (200), got 100" in again.stderr
+    assert {folder: written_at(folder) for folder in written} == written
+
+
+def written_at(folder):
+    return (folder / "evaluation.json").stat().st_mtime_ns
 
 
 def test_a_wrong_setting_ends_with_one_clear_line(tmp_path):
     """No traceback: what was given and what is allowed; and nothing is written half."""
-    wrong = ("task=gymnasium", "task.env_id=Nowhere-v0")  # in a sweep, above, sigma=-1
+    wrong = ("task=gymnasium", "task.env_id=Nowhere-v0")  # of a sweep: test_sweep
     failed = run_train(*wrong, folder=tmp_path, check=False)
     assert failed.returncode == 1
     assert "Traceback" not in failed.stderr

@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from processes import start_train
 
 from torchrl_l2c2.experiment.cli.sweep import ShareSweep, Sweep, begin_sweep
-from torchrl_l2c2.experiment.cli.train import check_launcher, check_sweep
+from torchrl_l2c2.experiment.cli.train import check_launcher, check_one_value, check_sweep
 from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.run.checkpoints import list_checkpoints, load_checkpoint
 from torchrl_l2c2.experiment.settings.fields import SettingError
@@ -138,13 +138,25 @@ def test_ctrl_c_while_compiling_saves(tmp_path):
 @pytest.mark.slow  # with the other launcher it is test_experiment's
 def test_the_failed_jobs_of_a_sweep_are_named_at_its_end(tmp_path):
     """Each in a line with its reason, after everything else; the others are finished."""
-    wrong = "regularizer.sigma=-1,1"
-    process = start(tmp_path, "-m", "task.episodes=2", wrong, *LAUNCHERS["joblib"], "compile=false")
+    sweep = "replay.capacity=300,100", "replay.batch_size=8,200", "task.episodes=2"
+    process = start(tmp_path, "-m", *sweep, *LAUNCHERS["joblib"], "compile=false")
     assert process.wait(120) == 1, said(tmp_path)
     last = said(tmp_path).splitlines()[-1]
-    assert last.startswith("failed: ") and "regularizer.sigma=-1" in last
-    assert "sigma must be greater than 0, got -1" in last and "Traceback" not in said(tmp_path)
-    assert len(list((tmp_path / "o").rglob("evaluation.json"))) == 1
+    assert last.startswith("failed: replay.capacity=100 replay.batch_size=200")
+    assert "replay.capacity must" in last and "Traceback" not in said(tmp_path)
+    assert len(list((tmp_path / "o").rglob("evaluation.json"))) == 3
+
+
+def test_the_values_of_a_sweep_are_checked_before_its_first_run(tmp_path):
+    """Not hours later, when their turn comes: one line for each, and no folder."""
+    sweep = "seed=0,1,-1", "regularizer=l2c2,l2c3", "algorithm.gamma=0.9,1.9"
+    process = start(tmp_path, "-m", *sweep, "logger=csv")
+    assert process.wait(60) == 1
+    first, second, third = said(tmp_path).splitlines()
+    assert first.startswith("error: seed must be greater than or equal to 0, got -1")
+    assert second.startswith("error: Expected regularizer to be one of ")
+    assert third.startswith("error: algorithm.gamma must be less than 1, got 1.9")
+    assert not (tmp_path / "o").exists()
 
 
 def test_a_process_that_waits_for_a_job_ends_with_its_sweep(tmp_path):
@@ -208,6 +220,13 @@ def test_a_sweep_of_nothing_says_so(sweep, told):
     check_sweep(["-m", "regularizer=glob(l2c2*)", "seed=0,1", "experiment=filters"])
     with begin_sweep(["-m", "regularizer=glob(l2c2*)"]) as begun:
         assert begun.status(2, {}) == "run 2"
+
+
+def test_several_values_need_the_option_for_a_sweep():
+    """A list within brackets is one value; what cannot be parsed, Hydra reports."""
+    with pytest.raises(SystemExit, match=r"^error: seed=0,1: .* Add -m to train one run for each"):
+        check_one_value(["seed=0,1", "algorithm.hidden=[3,4]", "--cfg=job"])
+    check_one_value(["seed=0", "algorithm.hidden=[3,4]", "--config-dir", "folder"])
 
 
 def test_a_sweep_that_is_refused_ends_and_leaves_nothing(tmp_path):

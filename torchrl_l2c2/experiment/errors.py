@@ -5,6 +5,7 @@ Every other error is a bug in this package or in a user's own code, and is shown
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import traceback
@@ -86,6 +87,18 @@ def warnings_as_lines(log: Callable[[str], Any]) -> Iterator[None]:
 
 
 @contextmanager
+def allow_closed_output() -> Iterator[None]:
+    """Exits without a traceback if the output is closed, as in ``--help | head``."""
+    try:
+        yield
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # Python flushes the output again at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+
+
+@contextmanager
 def one_line_errors() -> Iterator[None]:
     """Ends a command with one line after a user's mistake, an outside failure or Ctrl-C.
 
@@ -95,7 +108,7 @@ def one_line_errors() -> Iterator[None]:
         SystemExit: With the error's line, or with status 130 after Ctrl-C.
     """
     try:
-        with warnings_as_lines(partial(print, file=sys.stderr)):
+        with allow_closed_output(), warnings_as_lines(partial(print, file=sys.stderr)):
             yield
     except Exception as error:
         if not is_one_line_error(error):

@@ -7,7 +7,9 @@ import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from copy import deepcopy
 from difflib import get_close_matches
+from functools import cache
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -22,7 +24,7 @@ from hydra.errors import (
     OverrideParseException,
 )
 from hydra.types import RunMode
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_l2c2.experiment.settings.config import COMMAND_SETTINGS, GROUPS, ExperimentConfig
@@ -71,16 +73,16 @@ def _node(chosen: Any) -> dict[str, Any]:
     return {"defaults": [*defaults, "_self_"], **values}
 
 
-def read(values: dict[str, Any]) -> tuple[ExperimentConfig, Path]:
+def read(values: dict[str, Any], chosen: Any) -> tuple[ExperimentConfig, Path]:
     """Returns a run's settings and its folder: below ``outputs``, or Hydra's if set.
 
     Args:
         values (dict): Configuration composed by Hydra.
+        chosen (HydraConf): Hydra's own configuration.
 
     Raises:
         SettingError: If a setting is unknown or outside its range.
     """
-    chosen = HydraConfig.get()
     check_preset(values, chosen.runtime.choices.get("preset"))
     values["outputs"] = check_outputs(values["outputs"])
     config = ExperimentConfig.from_dict(values)
@@ -107,11 +109,16 @@ def preset_defaults(
     if values["preset"] is None:
         return None
     names = ("task", "algorithm", "regularizer", "preset")
-    composed = compose("config", [f"{name}={choices[name]}" for name in names])
+    composed = deepcopy(_compose(*(f"{name}={choices[name]}" for name in names)))
     if choices["task"] == "gymnasium":
         composed.task.env_id = values["task"]["env_id"]
     plain: Any = OmegaConf.to_container(composed, resolve=True)
     return ExperimentConfig.from_dict(plain)
+
+
+@cache
+def _compose(*overrides: str) -> DictConfig:
+    return compose("config", [*overrides])
 
 
 def check_preset(values: dict[str, Any], name: str | None) -> None:

@@ -22,19 +22,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     levels = chosen.noise or [None]
     with one_line_errors():
         from torchrl_l2c2.experiment.run.files import make_parent_folder, to_json, write_json
+        from torchrl_l2c2.experiment.run.policies import seed_of_test
 
         # Before the episodes, whose results could otherwise be lost.
         if chosen.output:
             make_parent_folder(chosen.output)
         played = {level: _play(chosen, level) for level in levels}
-        if len(played) == 1:
-            print(to_json(played[levels[0]].summary()), flush=True)
-        else:
-            print(_table(played), flush=True)
-        if chosen.output:
-            tests = [{"noise": level, **test.to_dict()} for level, test in played.items()]
-            written = tests[0] if len(tests) == 1 else {"tests": tests}
-            write_json(Path(chosen.output), {"arguments": vars(chosen), **written})
+        one = len(played) == 1
+        try:
+            print(to_json(played[levels[0]].summary()) if one else _table(played), flush=True)
+        finally:  # Also if the output is closed, as with head.
+            if chosen.output:
+                tests = [{"noise": level, **test.to_dict()} for level, test in played.items()]
+                written = tests[0] if one else {"tests": tests}
+                settings = {**vars(chosen), "seed": seed_of_test(chosen.folder, chosen.seed)}
+                write_json(Path(chosen.output), {"arguments": settings, **written})
 
 
 def _parser() -> argparse.ArgumentParser:

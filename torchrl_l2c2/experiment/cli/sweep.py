@@ -29,6 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
@@ -314,6 +315,40 @@ def list_jobs(overrides: Sequence[str], params: Mapping[str, str]) -> list[dict[
         >>> [" ".join(f"{name}={value}" for name, value in job.items()) for job in jobs]
         ['seed=0 beta=1', 'seed=0 beta=2', 'seed=1 beta=1', 'seed=1 beta=2']
     """
+    sweeps = _parse_sweeps(overrides, params)
+    choices = itertools.product(*(each.sweep_string_iterator() for each in sweeps.values()))
+    return [dict(zip(sweeps, chosen, strict=True)) for chosen in choices]
+
+
+def list_jobs_to_check(overrides: Sequence[str], params: Mapping[str, str]) -> list[dict[str, str]]:
+    """Returns the first job of a sweep, and one further job for each further value of a setting.
+
+    A range counts with its first and its last value.
+
+    Args:
+        overrides (sequence of str): Overrides of the command, which replace ``params``.
+        params (Mapping): Sweeps in the configuration, by setting.
+
+    Raises:
+        HydraException: If a sweep has no list of values, as a glob or an interval.
+
+    Examples:
+        >>> jobs = list_jobs_to_check(["seed=range(0,18)", "beta=1,2,-3"], {})
+        >>> [" ".join(f"{name}={value}" for name, value in job.items()) for job in jobs]
+        ['seed=0 beta=1', 'seed=17 beta=1', 'seed=0 beta=2', 'seed=0 beta=-3']
+    """
+    sweeps = _parse_sweeps(overrides, params)
+    values = {name: list(each.sweep_string_iterator()) for name, each in sweeps.items()}
+    first = {name: each[0] for name, each in values.items()}
+    jobs = [first]
+    for name, (_, *further) in values.items():
+        checked = further[-1:] if sweeps[name].is_range_sweep() else further
+        jobs += [{**first, name: value} for value in checked]
+    return jobs
+
+
+def _parse_sweeps(overrides: Sequence[str], params: Mapping[str, str]) -> dict[str, Override]:
+    """Returns the overrides that have several values, by setting."""
     given = {**params}
     for override in overrides:
         name, _, value = override.partition("=")
@@ -321,10 +356,7 @@ def list_jobs(overrides: Sequence[str], params: Mapping[str, str]) -> list[dict[
             given[name] = value
     parser = OverridesParser.create()
     parsed = parser.parse_overrides([f"{name}={value}" for name, value in given.items()])
-    sweeps = [each for each in parsed if each.is_sweep_override()]
-    names = [each.get_key_element() for each in sweeps]
-    choices = itertools.product(*(each.sweep_string_iterator() for each in sweeps))
-    return [dict(zip(names, chosen, strict=True)) for chosen in choices]
+    return {each.get_key_element(): each for each in parsed if each.is_sweep_override()}
 
 
 def _about(seconds: float) -> str:

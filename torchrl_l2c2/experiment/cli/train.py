@@ -11,7 +11,7 @@ import signal
 import sys
 import traceback
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from functools import partial
 from importlib.util import find_spec
@@ -19,24 +19,29 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import hydra
+from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
+from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_l2c2.experiment.cli.composition import (
     CONF,
     composition_errors,
     describe_preset,
+    one_line_message,
     read,
     register,
     show_sweep_hint,
 )
 from torchrl_l2c2.experiment.cli.manual import manual
-from torchrl_l2c2.experiment.cli.sweep import Sweep, begin_sweep, list_jobs
+from torchrl_l2c2.experiment.cli.sweep import Sweep, begin_sweep, list_jobs, list_jobs_to_check
 from torchrl_l2c2.experiment.errors import (
     UserError,
+    allow_closed_output,
     is_lack_of_memory,
     is_one_line_error,
     show_cause,
@@ -105,6 +110,25 @@ def check_sweep(arguments: Sequence[str]) -> None:
         sys.exit(f"error: the sweep has no jobs: one of {' '.join(arguments)} has no value.")
 
 
+def check_one_value(arguments: Sequence[str]) -> None:
+    """Checks that no setting of a single run has several values.
+
+    Raises:
+        SystemExit: If one has, with the option that runs all of them.
+    """
+    try:
+        parsed = OverridesParser.create().parse_overrides(
+            [each for each in arguments if not each.startswith("-")]
+        )
+    except HydraException:  # Hydra reports it.
+        return
+    if several := [str(each.input_line) for each in parsed if each.is_sweep_override()]:
+        sys.exit(
+            f"error: {' '.join(several)}: one run has one value of each setting. Add -m to train "
+            "one run for each value."
+        )
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Trains a run or a sweep.
 
@@ -115,8 +139,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if arguments is not None:
         sys.argv[1:] = arguments  # Hydra reads sys.argv.
     if {"-h", "--help"} & set(sys.argv[1:]):  # Hydra's own help takes seconds.
-        with _allow_closed_output():
-            print(manual(), end="", flush=True)
+        with allow_closed_output():
+            print(manual(), end="")
         return
     check_launcher(sys.argv)
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # No telemetry by default.
@@ -126,9 +150,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.path.append(os.getcwd())
     register()
     if not any(map(_is_multirun, sys.argv[1:])):
-        with composition_errors(), _allow_closed_output():
-            _main()
-            sys.stdout.flush()
+        check_one_value(sys.argv[1:])
+        try:
+            with composition_errors(), allow_closed_output():
+                _main()
+        except KeyboardInterrupt as interruption:  # Outside of training, or a second signal.
+            print("interrupted; the same command continues.", file=sys.stderr)
+            terminated = isinstance(interruption, Terminated)
+            sys.exit(128 + (signal.SIGTERM if terminated else signal.SIGINT))
         return
     check_sweep(sys.argv[1:])
     with begin_sweep(sys.argv[1:]) as sweep:
@@ -140,18 +169,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         finally:
             show_sweep_end(sweep)
         stopped_by, failures = sweep.stopped_by, sweep.failures
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # Nothing is left to save.
     sys.exit(bool(failures) if stopped_by is None else 128 + stopped_by)
-
-
-@contextmanager
-def _allow_closed_output() -> Iterator[None]:
-    """Exits without a traceback if the output is closed, as in ``--help | head``."""
-    try:
-        yield
-    except BrokenPipeError:
-        # Python flushes the output again at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(1)
 
 
 def _is_multirun(argument: str) -> bool:
@@ -181,16 +200,51 @@ def _main(values: DictConfig) -> None:
         return
     try:
         show_sweep_hint()
-        run(*read(plain), allow_other_versions=plain["allow_other_versions"])
+        run(*read(plain, HydraConfig.get()), allow_other_versions=plain["allow_other_versions"])
     except Interrupted as interruption:
         print(interruption, file=sys.stderr)
         sys.exit(128 + interruption.signal_number)
-    except KeyboardInterrupt as interruption:  # Outside of training, or a second signal.
-        print("interrupted; the same command continues.", file=sys.stderr)
-        sys.exit(128 + (signal.SIGTERM if isinstance(interruption, Terminated) else signal.SIGINT))
     except Exception as error:
         _print_error(error)
         sys.exit(1)
+
+
+class CheckSweep(Callback):
+    """Hydra callback that checks a sweep's values before its first run, one job for each value."""
+
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        """Composes and checks the jobs.
+
+        Raises:
+            SystemExit: If a value is wrong, after a line for each. Hydra would swallow other
+                errors.
+        """
+        overrides = [*config.hydra.overrides.hydra, *config.hydra.overrides.task]
+        try:
+            jobs = list_jobs_to_check(overrides, config.hydra.sweeper.params or {})
+        except HydraException:  # A glob: only Hydra knows its values.
+            return
+        wrong = [message for job in jobs if (message := _check_job(overrides, job))]
+        for message in dict.fromkeys(wrong):
+            print(f"error: {message}", file=sys.stderr)
+        if wrong:
+            sys.exit(1)
+
+
+def _check_job(overrides: Sequence[str], job: Mapping[str, str]) -> str | None:
+    """Returns what is wrong with the settings of a sweep's job, or ``None``."""
+    common = [each for each in overrides if each.partition("=")[0] not in job]
+    swept = [f"{name}={value}" for name, value in job.items()]
+    try:
+        composed = compose("config", [*common, *swept], return_hydra_config=True)
+        own = OmegaConf.masked_copy(composed, [str(name) for name in composed if name != "hydra"])
+        values: Any = OmegaConf.to_container(own, resolve=True)
+        check_task_and_logger(*read(values, composed.hydra))
+    except UserError as error:
+        return _error_line(error)
+    except (HydraException, OmegaConfBaseException) as error:
+        return one_line_message(error)
+    return None
 
 
 def _run_job(values: dict[str, Any], sweep: Sweep) -> None:
@@ -201,7 +255,7 @@ def _run_job(values: dict[str, Any], sweep: Sweep) -> None:
     try:
         with sweep.job(number, job) as started_before:
             patience = LOST_SECONDS if started_before else 0.0
-            config, folder = read(values)
+            config, folder = read(values, HydraConfig.get())
             sweep.claim(number, folder)
             finished = run(
                 config,
@@ -238,13 +292,35 @@ def _print_error(error: Exception) -> str:
         traceback.print_exception(error)
         return "".join(traceback.format_exception_only(error)).strip()
     show_cause(error)
-    message = str(error) or type(error).__name__
-    if isinstance(error, SettingError):
-        message += " --help lists every setting."
-    elif is_lack_of_memory(error):
-        message = f"{message.rstrip('.')}. Not enough memory: decrease {MEMORY_SETTINGS}."
+    message = _error_line(error)
     print(f"error: {message}", file=sys.stderr)
     return message
+
+
+def _error_line(error: Exception) -> str:
+    message = str(error) or type(error).__name__
+    if isinstance(error, SettingError):
+        return f"{message} --help lists every setting."
+    if is_lack_of_memory(error):
+        return f"{message.rstrip('.')}. Not enough memory: decrease {MEMORY_SETTINGS}."
+    return message
+
+
+def check_task_and_logger(config: ExperimentConfig, folder: Path) -> None:
+    """Checks that the task and the logger of an unfinished run are installed.
+
+    Args:
+        config (ExperimentConfig): Settings of the run.
+        folder (Path): Run folder.
+
+    Raises:
+        UserError: If Gymnasium does not know the task, or the logger's package is missing.
+    """
+    from torchrl_l2c2.experiment.envs.spaces import check_env_id  # Takes a second to import.
+
+    if not (folder / "evaluation.json").exists():
+        check_installed(config.logger.name)
+        check_env_id(config.task.env_id)
 
 
 def run(
@@ -271,14 +347,11 @@ def run(
         FinishedRun: The finished run; ``None`` without test episodes.
     """
     # Local imports: settings are checked before torch is imported.
-    from torchrl_l2c2.experiment.envs.spaces import check_env_id
     from torchrl_l2c2.experiment.run.continuation import warn_ignored_settings
     from torchrl_l2c2.experiment.run.finished import finished_run
     from torchrl_l2c2.experiment.run.lock import wait_for_folder
 
-    if not (folder / "evaluation.json").exists():
-        check_installed(config.logger.name)
-        check_env_id(config.task.env_id)
+    check_task_and_logger(config, folder)
     chosen = (config.task, config.algorithm, config.regularizer)
     name = f"{', '.join(group.name for group in chosen)}, seed {config.seed}: {folder}"
     print(f"{status}: {name}" if status else name, flush=True)

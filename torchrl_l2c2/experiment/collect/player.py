@@ -104,7 +104,7 @@ class Player:
             SimulatorError: If the environment fails.
         """
         assert isinstance(self.collector, EpisodeCollector)  # Ensured by make_collector.
-        transitions = self._simulate(self.collector.rollout)
+        transitions = self._simulate(self.collector.rollout, "in the episode ")
         self._check_and_count(transitions)
         return self.measure(transitions, self.frames)
 
@@ -116,7 +116,8 @@ class Player:
             SimulatorError: As :meth:`play`.
         """
         assert isinstance(self.collector, RolloutCollector)
-        first_frame, rollout = self.frames, self._simulate(self.collector.rollout)
+        first_frame = self.frames
+        rollout = self._simulate(self.collector.rollout, "in the rollout ")
         for frames in rollout:
             self._check_and_count(frames)
         finished = self.collector.finished_episodes
@@ -145,8 +146,8 @@ class Player:
         assert isinstance(self.collector, EpisodeCollector)
         self.collector.reset()
 
-    def _simulate(self, play: Callable[[], Played]) -> Played:
-        with simulator_errors(f"{self._env_id} failed after frame {self.frames}"):
+    def _simulate(self, play: Callable[[], Played], during: str = "") -> Played:
+        with simulator_errors(f"{self._env_id} failed {during}after frame {self.frames}"):
             return play()
 
     def _check_and_count(self, frames: TensorDictBase) -> None:

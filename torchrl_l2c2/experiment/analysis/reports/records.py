@@ -75,7 +75,9 @@ def find_runs(folders: Iterable[str | Path], *, required: bool = False) -> Found
         newest[identity] = run
     runs = sorted(newest.values(), key=lambda run: _place(run.record))
     named = {
-        "unfinished (running, interrupted or failed)": sorted(unfinished),
+        "without test results (running, interrupted, failed, or with test_episodes=0)": sorted(
+            unfinished
+        ),
         "unreadable": sorted(unreadable),
         "the same settings and seed as a newer one, left out": repeated,
         "untrained (without an update, or with random actions only)": [
