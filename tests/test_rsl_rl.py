@@ -731,6 +731,7 @@ def test_the_example_trains_and_compares(
 
 def test_gymnasium_for_rsl_rl_is_what_gymnasium_plays(monkeypatch: pytest.MonkeyPatch) -> None:
     """Clipped actions, the first observation after an end, and ends by the time limit apart."""
+    pytest.importorskip("mujoco")
     monkeypatch.syspath_prepend(EXAMPLE.parent)
     from rsl_rl_gymnasium import GymnasiumEnv
 
