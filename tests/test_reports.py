@@ -252,7 +252,7 @@ class TestGroups:
         groups = group_records(records_of(read_runs(tmp_path)))
         assert [group.name for group in groups] == ["baseline", "L2C2"]
         notes = settings_notes(groups)
-        assert [note.removeprefix("swingup, ppo_rpe, ") for note in notes] == [
+        assert [note.removeprefix("swingup, ppo_rpe: ") for note in notes] == [
             "other than the defaults in every row: `algorithm.replay_ratio=5`, `task.episodes=20`.",
             "L2C2, other than the defaults: `regularizer.gain=ramp`.",
         ]
@@ -276,7 +276,7 @@ class TestGroups:
         found = find_runs([tmp_path])
         assert [run.folder.name for run in found.runs] == ["good"]
         for start, name in (
-            ("1 unfinished", "going"),
+            ("1 without test results", "going"),
             ("1 unreadable", "cut"),
         ):
             assert sum(n.startswith(start) and str(tmp_path / name) in n for n in found.notes) == 1

@@ -105,7 +105,7 @@ class TestTables:
         chosen = of(field, "pendulum", "none")
         chosen[0] = replace(chosen[0], last_mean_return=math.nan)
         (row,) = comparison_table("last_mean", group_records(table_of(chosen))).rows
-        assert row[3:5] == ["1", "121.0"] and row[6].startswith("0.505 [")
+        assert row[3:5] == ["1", "121.0"] and row[8].startswith("0.505 [")
 
     def test_beside_two_baselines_nothing_is_compared(self, field):
         """Their defaults differ, and nothing says which one is the baseline."""

@@ -261,14 +261,14 @@ class TestField:
         assert cells(table, "hopper_v5", "ppo", "CAPS") == [
             "0, 1",
             "120.0 [120.0, 120.0]",
-            "0.500 [0.400, 0.600]",
             "0.120 [0.120, 0.120]",
+            "0.500 [0.400, 0.600]",
             "0.50",  # The baseline has a single run, which says nothing of how runs vary.
             "0.25",
             "2440",
             "0.471",
         ]
-        alone = ["0", "120.0", "0.400", "0.120", "0.50", "0.50", "", ""]
+        alone = ["0", "120.0", "0.120", "0.400", "0.50", "0.50", "", ""]
         assert cells(table, "hopper_v5", "ppo", "L2C2, means, ramp") == alone
         assert cells(table, "hopper_v5", "ppo", "LipsNet++") == [*[""] * 6, "1878", "0.543"]
         assert len(table.rows) == 8  # CAPS and vanilla once, as they were run
@@ -348,10 +348,10 @@ class TestField:
         ]
         baseline, cats = ([cell.split()[0] for cell in row[4:]] for row in table.rows)
         assert baseline == [
-            *("20.00", "15.00", "0.75", "0.200", "0.250", "0.50", "0.150", "0.150", "0.50")
+            *("20.00", "15.00", "0.75", "0.150", "0.150", "0.50", "0.200", "0.250", "0.50")
         ]
         assert cats == [
-            *("20.00", "25.00", "0.25", "0.200", "0.300", "1.00", "0.150", "0.300", "1.00")
+            *("20.00", "25.00", "0.25", "0.150", "0.300", "1.00", "0.200", "0.300", "1.00")
         ]
 
     def test_seeds_without_a_measure_are_told(self, pendulum):
@@ -362,7 +362,7 @@ class TestField:
             if "gamma" not in r.differences
         ]
         row = against_table(table_of(lacking), "L2C2").rows[0]
-        assert row[4] == "20.00" and row[7].endswith(", of 1 runs")
+        assert row[4] == "20.00" and row[10].endswith(", of 1 runs")
         notes = [table.notes for table in pairwise_tables(table_of(lacking))]
         assert [len(each) for each in notes] == [1, 2]
         assert notes[1][1] == "Not all runs have it: pendulum, L2C2, of 1 runs."

@@ -106,7 +106,7 @@ def baseline_of(group: Group, groups: Iterable[Group]) -> Group | None:
 
 def settings_notes(groups: Sequence[Group]) -> list[str]:
     """Notes on settings that no name in the table contains, and on pooled versions."""
-    notes = []
+    notes: dict[str, list[str]] = defaultdict(list)
     for together in by_task(groups):
         where = f"{together[0].first.task}, {together[0].first.algorithm}"
         shared = _common(together)
@@ -118,8 +118,10 @@ def settings_notes(groups: Sequence[Group]) -> list[str]:
         for which, settings in rows:
             if settings:
                 listed = ", ".join(f"`{name}={value}`" for name, value in settings.items())
-                notes.append(f"{where}, {which}: {listed}.")
-    return [*notes, *_pooled_versions(groups)]
+                notes[f"{which}: {listed}."].append(where)
+    # One note for all tasks with the same settings.
+    common = [f"{'; '.join(tasks)}: {note}" for note, tasks in notes.items()]
+    return [*common, *_pooled_versions(groups)]
 
 
 def _pooled_versions(groups: Sequence[Group]) -> list[str]:

@@ -23,8 +23,8 @@ from torchrl_l2c2.experiment.run.finished import TESTS
 # The compared quantities, their names in tables, and the names of their probabilities.
 COMPARED = {
     "return": ("return", "P(returns more)"),
-    "sm_asap": ("Sm", "P(smaller Sm)"),
     "action_variation": ("action variation", "P(smoother)"),
+    "sm_asap": ("Sm", "P(smaller Sm)"),
 }
 INTERVAL_NOTE = (
     "An interval that contains 0.5: the same within seed noise. An interval without a width: all "
