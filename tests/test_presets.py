@@ -1,5 +1,6 @@
 """What is learned with the RL Zoo's settings: the equations of Stable-Baselines3, by hand."""
 
+import math
 import re
 import shlex
 from pathlib import Path
@@ -103,6 +104,16 @@ def test_sacs_temperature_keeps_the_entropy_of_scaled_actions():
     assert terms["loss_alpha"].item() == 0.0  # of a temperature of 1, whose logarithm is 0
     (gradient,) = torch.autograd.grad(terms["loss_alpha"], agent.loss.log_alpha)
     assert gradient.item() == pytest.approx(terms["entropy"].item() - target, rel=1e-4)
+
+
+def test_the_general_presets_target_entropy_is_of_scaled_actions():
+    """Whatever the range of a task's actions; tasks of their own preset keep their settings."""
+    general = ("task.env_id=Pendulum-v1", "algorithm.hidden=[8]")
+    config, agent = agent_of("gymnasium", "sac", *general)
+    assert config.algorithm.target_entropy == "scaled"
+    assert agent.loss.target_entropy.item() == pytest.approx(-1.0 + math.log(2.0))
+    config, _ = agent_of("lunarlander", "sac", "algorithm.hidden=[8]")
+    assert config.algorithm.target_entropy is None
 
 
 def _critic_draw(loss, batch):

@@ -20,6 +20,16 @@ from torchrl_l2c2.experiment.settings.optimizers import OptimizerConfig
 from torchrl_l2c2.experiment.settings.regularizers import RegularizerConfig
 
 
+def _target_entropy(config: SACConfig, env: EnvBase) -> float | str:
+    if config.target_entropy is None:
+        return "auto"
+    if config.target_entropy != "scaled":
+        return config.target_entropy
+    space = env.action_spec.space
+    half_range = (space.high - space.low) / 2
+    return float(half_range.log().sum()) - half_range.numel()
+
+
 def make_sac(
     config: SACConfig, env: EnvBase, regularizer: RegularizerConfig, optimizer: OptimizerConfig
 ) -> Agent:
@@ -33,7 +43,7 @@ def make_sac(
         loss_function="l2",
         alpha_init=config.alpha_init,
         action_spec=env.action_spec,
-        target_entropy="auto" if config.target_entropy is None else config.target_entropy,
+        target_entropy=_target_entropy(config, env),
     )
     loss.make_value_estimator(gamma=config.gamma)
     # The first read creates this buffer; inside a compiled function it would be lost.

@@ -242,10 +242,11 @@ class SACConfig(PerStepConfig):
     alpha_init: float = Field(
         default=1.0, gt=0, description="initial value of the learned temperature"
     )
-    target_entropy: float | None = Field(
+    target_entropy: float | Literal["scaled"] | None = Field(
         default=None,
         description="target of the policy's entropy, for actions in the task's units: a range "
-        "twice as wide adds log 2 per dimension; null: minus the number of action dimensions",
+        "twice as wide adds log 2 per dimension; null: minus the number of action dimensions; "
+        "scaled: the same for actions scaled to [-1, 1]",
     )
     hidden: Layers = Field(
         default=(256, 256), description="neurons of the hidden layers of all networks"

@@ -134,11 +134,15 @@ _LIMITS = {
 def _allowed(annotation: Any, declared: Any) -> str:
     schema = TypeAdapter(Annotated[annotation, declared]).json_schema()
     kinds = schema.get("anyOf", [schema])
-    choices = [str(choice) for kind in kinds for choice in kind.get("enum", ())]
+    choices = [str(choice) for kind in kinds for choice in kind.get("enum", _constant(kind))]
     limits = [
         form.format(kind[key]) for kind in kinds for key, form in _LIMITS.items() if key in kind
     ]
     return " | ".join([*choices, *([", ".join(limits)] if limits else [])])
+
+
+def _constant(kind: dict[str, Any]) -> list[Any]:
+    return [kind["const"]] if "const" in kind else []
 
 
 def _first_error(error: ValidationError, cls: type) -> SettingError:

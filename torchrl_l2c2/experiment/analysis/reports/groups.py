@@ -120,8 +120,8 @@ def settings_notes(groups: Sequence[Group]) -> list[str]:
                 listed = ", ".join(f"`{name}={value}`" for name, value in settings.items())
                 notes[f"{which}: {listed}."].append(where)
     # One note for all tasks with the same settings.
-    common = [f"{'; '.join(tasks)}: {note}" for note, tasks in notes.items()]
-    return [*common, *_pooled_versions(groups)]
+    written = [f"{'; '.join(tasks)}: {note}" for note, tasks in notes.items()]
+    return [*written, *_pooled_versions(groups)]
 
 
 def _pooled_versions(groups: Sequence[Group]) -> list[str]:
