@@ -43,8 +43,8 @@ def smooth(
     ``loss_*`` keys, need no change. The penalty is reported as ``penalty_*``.
 
     The presets are in ``torchrl_l2c2.presets.PRESETS``. The gains for PPO and TD3 rise with the
-    progress of training: call ``loss.set_progress(frames / total_frames)`` after every rollout.
-    Without this call the gains stay at their final value.
+    progress of training: call ``loss.set_progress(frames / total_frames)`` before the updates on
+    every rollout. Without this call the gains stay at their final value.
 
     Args:
         loss (LossModule): a loss with a policy that is trained on transitions.

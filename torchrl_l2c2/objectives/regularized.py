@@ -337,7 +337,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
     def set_progress(self, progress: float) -> None:
         """Sets the progress of training, which sets the gain of a :meth:`ramp`.
 
-        Call it after every rollout or episode. It has no effect on a loss without a ramp. It works
+        Call it before the updates on every rollout or episode. It has no effect on a loss without a ramp. It works
         between calls of a compiled loss. The ``state_dict`` contains the progress.
 
         Args:
