@@ -232,7 +232,7 @@ class CheckSweep(Callback):
 
 
 def _check_job(overrides: Sequence[str], job: Mapping[str, str]) -> str | None:
-    """Returns what is wrong with the settings of a sweep's job, or ``None``."""
+    """Returns the error in the settings of a sweep's job, or ``None``."""
     common = [each for each in overrides if each.partition("=")[0] not in job]
     swept = [f"{name}={value}" for name, value in job.items()]
     try:
