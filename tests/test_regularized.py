@@ -39,6 +39,7 @@ from torchrl.data import Bounded
 from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.modules import (
     Actor,
+    BatchRenorm1d,
     LSTMModule,
     MaskedCategorical,
     NormalParamExtractor,
@@ -951,6 +952,25 @@ class TestEvaluationsThatAreSpared:
             loss(batch.exclude("neighbor", ("next", "observation")))
         torch.testing.assert_close(loss.value_regularizer(other)["loss_l2c2_value"], expected)
 
+    @pytest.mark.parametrize("layer", [nn.BatchNorm1d, BatchRenorm1d])
+    def test_both_sides_of_a_comparison_are_normalized_alike(self, layer):
+        """Normalized separately, all states would be the same as all next states."""
+        torch.manual_seed(0)
+        net = nn.Sequential(layer(OBSERVATION), mlp(OBSERVATION, 2 * ACTION))
+        module = nn.Sequential(net, NormalParamExtractor())
+        actor = ProbabilisticActor(
+            TensorDictModule(module, ["observation"], ["loc", "scale"]),
+            in_keys=["loc", "scale"],
+            distribution_class=TanhNormal,
+        )
+        batch = on_policy(64)
+        batch["next", "observation"] = batch["observation"] + 0.3
+        both = torch.cat((batch["observation"], batch["next", "observation"]))
+        here, there = copy.deepcopy(net)(both)[:, :ACTION].chunk(2)
+        loss = CATSLoss(PPORPELoss(actor, make_critic(OBSERVATION)), lambda_temporal=1.0)
+        expected = (here - there).square().sum(-1).mean()
+        torch.testing.assert_close(loss(batch)["loss_cats"], expected)
+
 
 def replayed(size: int) -> TensorDict:
     """Transitions for PPO-RPE, with neighbors."""
@@ -1031,8 +1051,8 @@ class TestOnePass:
         if case == "drawn by the loss":
             del batch["neighbor"]
         rows, *terms = self.both(loss, batch, monkeypatch)
-        # Without dropout the batch is evaluated again, beside its neighbors.
-        assert rows[-2:] == ([32, 64] if case == "dropout" else [32, 32])
+        # With such a layer the batch is evaluated again, next to its neighbors.
+        assert rows[-2:] == ([32, 32] if case == "drawn by the loss" else [32, 64])
         for key in ("loss_actor", "loss_l2c2_actor", "loss_l2c2_critic"):
             assert torch.equal(terms[1][key], terms[0][key])
 
