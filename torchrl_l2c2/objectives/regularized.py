@@ -861,7 +861,11 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             each = each if rows is None else spread_rows(each, rows, shape)
             check_of_each(each.shape, shape)
             each = as_masked(each, tensordict, self._loss_mask_keys()) if masked else each
-            return self._reduce_loss(each, tensordict, weights=weights, reduction=reduction)
+            each_weight = weights
+            if weights is not None and weights.shape != each.shape:  # [*B, 1], or several agents
+                more = (1,) * (each.ndim - len(shape))
+                each_weight = weights.reshape(*shape, *more).expand_as(each)
+            return self._reduce_loss(each, tensordict, weights=each_weight, reduction=reduction)
 
         if counts is None:
             return reduce(value)
