@@ -215,7 +215,8 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         else:
             terms.update(added)
         if not is_compiling() and self.training and torch.is_grad_enabled():
-            self._watch.see_forward(self, tensordict, terms)
+            self._watch.see_call(self, tensordict)
+            self._watch.see_forward(self, terms)
             self._warn_of_changed_base()
         networks = (f"{name}_params" for name in self._evaluation.specs)
         self._clear_weakrefs(tensordict, terms, *networks)
