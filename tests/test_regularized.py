@@ -118,6 +118,19 @@ class Declaring(RegularizedLoss):
         self.declare_terms(**kinds)
 
 
+class Misspelled(Stillness):
+    """Returns another key than it declares, or both."""
+
+    def __init__(self, base_loss: LossModule, also: bool) -> None:
+        super().__init__(base_loss)
+        self.also = also
+
+    def policy_regularizer(self, tensordict):
+        terms = super().policy_regularizer(tensordict)
+        terms["loss_stilness"] = terms["loss_stillness"]
+        return terms if self.also else terms.exclude("loss_stillness")
+
+
 class Doubled(Stillness):
     """A regularizer with a forward of its own."""
 
@@ -279,6 +292,16 @@ class TestTheClass:
                 Declaring(ddpg(), **{kind: ["size"]})
         with pytest.raises(ValueError, match="a diagnostic must not start with 'loss_'"):
             Declaring(ddpg(), diagnostics=["loss_size"])
+
+    @pytest.mark.parametrize("fold", [False, True])
+    @pytest.mark.parametrize("also", [False, True])
+    def test_terms_that_were_not_declared_are_told(self, fold, also):
+        """A folded term of another name would be reported, and not trained."""
+        loss = Misspelled(L2C2Loss(ddpg(), NEAR), also)
+        loss = loss.fold() if fold else loss
+        message = r"declared terms \['loss_l2c2_actor', .*, 'loss_stillness'\] of .*stilness'\]\."
+        with pytest.raises(ValueError, match=message):
+            loss(with_neighbors(transitions(4)))
 
     def test_methods_are_not_hidden_by_chance(self):
         """A loss whose own method has the name of one of ours would break: it is refused."""
