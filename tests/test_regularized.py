@@ -18,9 +18,11 @@ from losses import (
     action_values,
     batch_norm_qvalue,
     composite_actor,
+    composite_batch,
     critic,
     deterministic_actor,
     gaussian_actor,
+    make_composite_ppo,
     mlp,
     on_policy,
     one_hot_batch,
@@ -531,6 +533,21 @@ class TestWhatIsRefused:
         with pytest.raises(TypeError, match=message):
             loss.policy_regularizer(batch)
 
+    def test_observations_that_are_a_tensordict(self):
+        """Its entries are the states, and a network has to name them."""
+
+        class Net(nn.Linear):
+            def forward(self, state):
+                return super().forward(state["position"])
+
+        actor = TensorDictModule(Net(OBSERVATION, ACTION), ["state"], ["action"])
+        batch = transitions(4)
+        for root in (batch, batch["next"]):
+            root["state"] = TensorDict({"position": torch.randn(4, OBSERVATION)}, [4])
+        message = r"actor_network, got the TensorDict 'state'.*\('state', 'position'\)\]\."
+        with pytest.raises(TypeError, match=message):
+            CATSLoss(DDPGLoss(actor, qvalue())).policy_regularizer(batch)
+
     def test_a_name_of_torchrls_own_is_told_to_be_the_reason(self):
         """An observation that begins with an underscore has the right type."""
         hidden = Actor(mlp(OBSERVATION, ACTION), in_keys=["_observation"])
@@ -790,6 +807,13 @@ class TestNetworks:
         batch["next", "observation"] = successor
         with pytest.raises(error, match=rf"\('next', 'observation'\) must .*{message}"):
             loss.policy_regularizer(batch)
+
+    def test_parameters_of_the_heads_are_no_state(self):
+        """A composite policy reads them as one TensorDict, after it has written them."""
+        loss = L2C2Loss(make_composite_ppo(), NEAR)
+        assert loss.networks["actor_network"].states == ("observation",)
+        batch = loss.neighbor_transform()(composite_batch(4))
+        assert list(batch["neighbor"].keys()) == ["observation", "distance"]
 
     def test_inputs_that_the_policy_overwrites_are_states(self):
         """A policy may write its normalized observation where it was."""

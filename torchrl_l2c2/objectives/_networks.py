@@ -93,9 +93,10 @@ def inspect_network(loss: LossModule, network: str) -> NetworkSpec:
         output = next((key for key in actions if key in made), None)
     else:
         output = _value_key(loss, network)
+    computed = made.union(actions, _parents(made))
     return NetworkSpec(
         inputs=tuple(key for key in inputs if key not in trunk),
-        states=tuple(k for k in inputs if k not in made.union(actions) and not _is_private(k)),
+        states=tuple(key for key in inputs if key not in computed and not _is_private(key)),
         trunk=tuple(trunk),
         trains_trunk=_trains_trunk(loss, network),
         output=output,
@@ -104,6 +105,12 @@ def inspect_network(loss: LossModule, network: str) -> NetworkSpec:
         rowwise=not any(isinstance(m, _BatchNorm | _DropoutNd) for m in net.modules()),
         has_dropout=any(isinstance(m, _DropoutNd) for m in net.modules()),
     )
+
+
+def _parents(keys: Iterable[NestedKey]) -> set[NestedKey]:
+    """Keys of the TensorDicts around entries, such as a composite policy's parameters."""
+    nested = [key for key in keys if isinstance(key, tuple)]
+    return {unravel_key(key[:end]) for key in nested for end in range(1, len(key))}
 
 
 def _unnamed_action(loss: LossModule, actor: Any, made: set[NestedKey]) -> NestedKey:
