@@ -80,6 +80,19 @@ class TestByHand:
         share = gradient_shares(loss, batch)["loss_l2c2_actor"]
         assert share == pytest.approx(norms["loss_l2c2_actor"] / norms["loss_actor"], rel=1e-4)
 
+    @pytest.mark.parametrize("fold", [False, True])
+    def test_keys_that_were_selected_change_no_share(self, fold):
+        """A loop may select the terms that it sums; the penalty is part of them if folded."""
+        torch.manual_seed(0)
+        case = next(case for case in CASES if case.name == "SAC")
+        loss, batch = CAPSLoss(case.make()), case.batch(8)
+        loss = loss.fold() if fold else loss
+        expected = gradient_shares(loss, batch)
+        assert set(expected) == loss.added_terms
+        loss.select_out_keys("loss_actor", "loss_qvalue")
+        assert gradient_shares(loss, batch) == expected
+        assert loss.out_keys == ["loss_actor", "loss_qvalue"]
+
     def test_measuring_changes_nothing(self):
         """Neither the loss, which keeps a threshold, nor the batch, nor the global generator."""
         torch.manual_seed(0)

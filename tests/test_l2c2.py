@@ -9,6 +9,7 @@ import warnings
 import pytest
 import torch
 from losses import (
+    ACTION,
     AGENTS,
     BOUNDS,
     OBSERVATION,
@@ -240,6 +241,26 @@ class TestThePenalty:
             alone.append(L2C2Loss(base, NEAR).policy_regularizer(one)["loss_l2c2_actor"])
         found = loss.policy_regularizer(batch)["loss_l2c2_actor"]
         torch.testing.assert_close(found, torch.maximum(*alone))
+
+    @pytest.mark.parametrize("count", [4, AGENTS])
+    def test_priority_weights_of_a_team_weight_each_of_its_agents(self, count):
+        """Weights [B] for differences [B, agents], also in a batch of as many rows as agents."""
+        keys = [("agents", "observation"), ("agents", "action")]
+        net = nn.Sequential(mlp(OBSERVATION, ACTION), nn.Tanh())
+        actor = TensorDictModule(net, keys[:1], keys[1:])
+        value = TensorDictModule(mlp(OBSERVATION + ACTION, 1), keys, ["state_action_value"])
+        batch = NeighborTransform(NEAR, keys[:1])(agents_batch(count))
+        weights = torch.rand(count)
+        found = {}
+        for reduction in ("mean", "sum", "none"):
+            loss = L2C2Loss(DDPGLoss(actor, value, reduction=reduction), NEAR, beta=0.0)
+            plain = loss.policy_regularizer(batch.exclude("priority_weight"))["loss_l2c2_actor"]
+            batch["priority_weight"] = weights
+            found[reduction] = loss.policy_regularizer(batch)["loss_l2c2_actor"]
+        weighted = weights[:, None] * plain
+        torch.testing.assert_close(found["none"], weighted)
+        torch.testing.assert_close(found["sum"], weighted.sum())
+        torch.testing.assert_close(found["mean"], weighted.sum() / (AGENTS * weights.sum()))
 
     @pytest.mark.parametrize("last", [(), (1,)], ids=["[B, agents]", "[B, agents, 1]"])
     def test_a_mask_of_agents_leaves_agents_out(self, last):

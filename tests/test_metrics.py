@@ -223,6 +223,14 @@ def test_saturation_counts_what_is_at_the_bounds():
     assert saturation(actions, low, high, margin=0.0).item() == pytest.approx(1 / 6)
 
 
+def test_saturation_of_actions_that_are_nan_is_nan():
+    """As for the other measures; of the other episode it is a number, also with infinity."""
+    actions = torch.tensor([[[math.nan], [0.0]], [[math.inf], [0.0]]])
+    found = saturation(actions, -1.0, 1.0)
+    assert found.isnan().tolist() == action_variation(actions).isnan().tolist() == [True, False]
+    assert found[1].item() == 0.5
+
+
 def test_of_a_range_that_is_open_only_the_bound_counts():
     """It has no width to take a share of; the end that is not there is never met."""
     actions = torch.tensor([[0.0], [0.001], [5.0], [-1.0]])

@@ -13,6 +13,7 @@ from torchrl.modules import IndependentNormal, NormalParamExtractor, Probabilist
 
 from torchrl_l2c2 import (
     CAPSLoss,
+    CATSLoss,
     L2C2Loss,
     PPORPELoss,
     TSoftUpdate,
@@ -353,6 +354,17 @@ def test_weights_of_shape_b_1_are_those_of_shape_b():
     found = loss(batch)
     for key in ("loss_actor", "loss_critic"):
         torch.testing.assert_close(found[key], expected[key])
+
+
+@pytest.mark.parametrize("reduction", ["mean", "sum", "none"])
+def test_a_regularizers_weights_of_shape_b_1_are_those_of_shape_b(reduction):
+    """Each transition's term times its own weight."""
+    loss, batch = paper_loss_and_batch()
+    loss.reduction = reduction
+    loss = CATSLoss(loss)
+    expected = loss(batch.clone())["loss_cats"]
+    batch["priority_weight"] = batch["priority_weight"].unsqueeze(-1)
+    assert torch.equal(loss(batch)["loss_cats"], expected)
 
 
 def test_the_threshold_adapts_in_training_alone():

@@ -18,9 +18,11 @@ from losses import (
     action_values,
     batch_norm_qvalue,
     composite_actor,
+    composite_batch,
     critic,
     deterministic_actor,
     gaussian_actor,
+    make_composite_ppo,
     mlp,
     on_policy,
     one_hot_batch,
@@ -39,6 +41,7 @@ from torchrl.data import Bounded
 from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.modules import (
     Actor,
+    BatchRenorm1d,
     LSTMModule,
     MaskedCategorical,
     NormalParamExtractor,
@@ -115,6 +118,19 @@ class Declaring(RegularizedLoss):
 
     def __init__(self, base_loss: LossModule, **kinds: list[str]) -> None:
         self.declare_terms(**kinds)
+
+
+class Misspelled(Stillness):
+    """Returns another key than it declares, or both."""
+
+    def __init__(self, base_loss: LossModule, also: bool) -> None:
+        super().__init__(base_loss)
+        self.also = also
+
+    def policy_regularizer(self, tensordict):
+        terms = super().policy_regularizer(tensordict)
+        terms["loss_stilness"] = terms["loss_stillness"]
+        return terms if self.also else terms.exclude("loss_stillness")
 
 
 class Doubled(Stillness):
@@ -278,6 +294,16 @@ class TestTheClass:
                 Declaring(ddpg(), **{kind: ["size"]})
         with pytest.raises(ValueError, match="a diagnostic must not start with 'loss_'"):
             Declaring(ddpg(), diagnostics=["loss_size"])
+
+    @pytest.mark.parametrize("fold", [False, True])
+    @pytest.mark.parametrize("also", [False, True])
+    def test_terms_that_were_not_declared_are_told(self, fold, also):
+        """A folded term of another name would be reported, and not trained."""
+        loss = Misspelled(L2C2Loss(ddpg(), NEAR), also)
+        loss = loss.fold() if fold else loss
+        message = r"declared terms \['loss_l2c2_actor', .*, 'loss_stillness'\] of .*stilness'\]\."
+        with pytest.raises(ValueError, match=message):
+            loss(with_neighbors(transitions(4)))
 
     def test_methods_are_not_hidden_by_chance(self):
         """A loss whose own method has the name of one of ours would break: it is refused."""
@@ -506,6 +532,21 @@ class TestWhatIsRefused:
         message = r"actor_network needs a floating-point.*'observation'.*int64"
         with pytest.raises(TypeError, match=message):
             loss.policy_regularizer(batch)
+
+    def test_observations_that_are_a_tensordict(self):
+        """Its entries are the states, and a network has to name them."""
+
+        class Net(nn.Linear):
+            def forward(self, state):
+                return super().forward(state["position"])
+
+        actor = TensorDictModule(Net(OBSERVATION, ACTION), ["state"], ["action"])
+        batch = transitions(4)
+        for root in (batch, batch["next"]):
+            root["state"] = TensorDict({"position": torch.randn(4, OBSERVATION)}, [4])
+        message = r"actor_network, got the TensorDict 'state'.*\('state', 'position'\)\]\."
+        with pytest.raises(TypeError, match=message):
+            CATSLoss(DDPGLoss(actor, qvalue())).policy_regularizer(batch)
 
     def test_a_name_of_torchrls_own_is_told_to_be_the_reason(self):
         """An observation that begins with an underscore has the right type."""
@@ -767,6 +808,13 @@ class TestNetworks:
         with pytest.raises(error, match=rf"\('next', 'observation'\) must .*{message}"):
             loss.policy_regularizer(batch)
 
+    def test_parameters_of_the_heads_are_no_state(self):
+        """A composite policy reads them as one TensorDict, after it has written them."""
+        loss = L2C2Loss(make_composite_ppo(), NEAR)
+        assert loss.networks["actor_network"].states == ("observation",)
+        batch = loss.neighbor_transform()(composite_batch(4))
+        assert list(batch["neighbor"].keys()) == ["observation", "distance"]
+
     def test_inputs_that_the_policy_overwrites_are_states(self):
         """A policy may write its normalized observation where it was."""
         torch.manual_seed(0)
@@ -951,6 +999,25 @@ class TestEvaluationsThatAreSpared:
             loss(batch.exclude("neighbor", ("next", "observation")))
         torch.testing.assert_close(loss.value_regularizer(other)["loss_l2c2_value"], expected)
 
+    @pytest.mark.parametrize("layer", [nn.BatchNorm1d, BatchRenorm1d])
+    def test_both_sides_of_a_comparison_are_normalized_alike(self, layer):
+        """Normalized separately, all states would be the same as all next states."""
+        torch.manual_seed(0)
+        net = nn.Sequential(layer(OBSERVATION), mlp(OBSERVATION, 2 * ACTION))
+        module = nn.Sequential(net, NormalParamExtractor())
+        actor = ProbabilisticActor(
+            TensorDictModule(module, ["observation"], ["loc", "scale"]),
+            in_keys=["loc", "scale"],
+            distribution_class=TanhNormal,
+        )
+        batch = on_policy(64)
+        batch["next", "observation"] = batch["observation"] + 0.3
+        both = torch.cat((batch["observation"], batch["next", "observation"]))
+        here, there = copy.deepcopy(net)(both)[:, :ACTION].chunk(2)
+        loss = CATSLoss(PPORPELoss(actor, make_critic(OBSERVATION)), lambda_temporal=1.0)
+        expected = (here - there).square().sum(-1).mean()
+        torch.testing.assert_close(loss(batch)["loss_cats"], expected)
+
 
 def replayed(size: int) -> TensorDict:
     """Transitions for PPO-RPE, with neighbors."""
@@ -1031,8 +1098,8 @@ class TestOnePass:
         if case == "drawn by the loss":
             del batch["neighbor"]
         rows, *terms = self.both(loss, batch, monkeypatch)
-        # Without dropout the batch is evaluated again, beside its neighbors.
-        assert rows[-2:] == ([32, 64] if case == "dropout" else [32, 32])
+        # With such a layer the batch is evaluated again, next to its neighbors.
+        assert rows[-2:] == ([32, 32] if case == "drawn by the loss" else [32, 64])
         for key in ("loss_actor", "loss_l2c2_actor", "loss_l2c2_critic"):
             assert torch.equal(terms[1][key], terms[0][key])
 

@@ -290,13 +290,20 @@ def test_an_explicit_ramp_goes_before_the_runners_iterations() -> None:
         assert ppo.regularization.loss.regularizer_gain == (1.0 if updates is None else 0.0)
 
 
-@pytest.mark.parametrize("method", ["caps", "lcp", "sr2l"])
-def test_other_methods_train(method: str) -> None:
+@pytest.mark.parametrize(
+    "cfg",
+    [
+        {"method": "caps"},
+        {"method": "lcp"},
+        {"method": "lcp", "of": "log_prob"},
+        {"method": "sr2l"},
+    ],
+    ids=["caps", "lcp", "lcp of log_prob", "sr2l"],
+)
+def test_other_methods_train(cfg: dict[str, Any]) -> None:
     """Their terms are logged, and the actor's update is another."""
-    plain, ppo = (
-        make(PPO),
-        make(rsl.RegularizedPPO, regularizer_cfg={"method": method, "strength": 100.0}),
-    )
+    method = cfg["method"]
+    plain, ppo = make(PPO), make(rsl.RegularizedPPO, regularizer_cfg=cfg | {"strength": 100.0})
     losses = [update(collected(each)) for each in (plain, ppo)]
     assert all(value > 0 for name, value in losses[1].items() if name.startswith(method))
     assert losses[1].keys() > losses[0].keys()

@@ -19,11 +19,13 @@ from losses import (
     deterministic_actor,
     gaussian_actor,
     heads_critic,
+    mlp,
     on_policy,
     qvalue,
     transitions,
 )
 from torch import nn
+from torchrl.modules import ValueOperator
 from torchrl.objectives import (
     BCLoss,
     ClipPPOLoss,
@@ -31,6 +33,7 @@ from torchrl.objectives import (
     CrossQLoss,
     DDPGLoss,
     DTLoss,
+    GAILLoss,
     IQLLoss,
     PPOLoss,
     SACLoss,
@@ -744,6 +747,10 @@ class TestPresets:
             smooth(nn.Linear(1, 1))
         with pytest.raises(TypeError, match="sequences"):
             smooth(DTLoss(gaussian_actor()))
+        discriminator = ValueOperator(mlp(5, 1), in_keys=["expert_action", "expert_observation"])
+        for method in ("l2c2", "caps"):
+            with pytest.raises(TypeError, match=r"nothing to regularize: GAILLoss has no"):
+                smooth(GAILLoss(discriminator), method)
 
     def test_a_folded_loss_takes_no_further_regularizer(self):
         with pytest.raises(TypeError, match=r"call fold\(\) on the outermost"):

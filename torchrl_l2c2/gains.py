@@ -233,9 +233,7 @@ def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]
         2.0
     """
     names = getattr(loss, "added_terms", ())
-    shown = {f"penalty_{key.removeprefix('loss_')}": key for key in names}
-    added = [shown.get(key, key) for key in loss.out_keys if key in names or key in shown]
-    if not added:
+    if not names:
         return {}
     check_takes_gradients("gradient_shares")
     if hasattr(loss, "_watch") and (unused := loss._watch.unused()):
@@ -248,6 +246,7 @@ def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]
     devices = {parameter.device for parameter in loss.parameters() if parameter.is_cuda}
     with torch.random.fork_rng(devices=devices):
         twin = deepcopy(loss)
+        twin.reset_out_keys()  # All terms are needed, also if only some were selected.
         if getattr(twin, "folded", False):
             twin.unfold()
         terms = twin(batch.copy())
@@ -256,6 +255,7 @@ def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]
             "gradient_shares needs terms that are single numbers, one for the whole batch: make "
             "the loss with reduction='mean'."
         )
+    added = [key for key in twin.out_keys if key in names]
     parameters = [parameter for parameter in twin.parameters() if parameter.requires_grad]
 
     def gradients(value: Tensor) -> tuple[Tensor | None, ...]:

@@ -16,7 +16,7 @@ from torchrl_l2c2._checks import as_number, check_real
 from torchrl_l2c2.neighborhood import Neighborhood
 from torchrl_l2c2.objectives import RegularizedLoss
 from torchrl_l2c2.objectives._batch import check_evaluates_states
-from torchrl_l2c2.objectives._networks import POLICY_NETWORK
+from torchrl_l2c2.objectives._networks import POLICY_NETWORK, VALUE_NETWORKS
 from torchrl_l2c2.presets import (
     GAIN_SETTING,
     KINDS,
@@ -140,6 +140,11 @@ def _of_nearest(loss: LossModule, method: str, overrides: Mapping[str, Any]) -> 
     """
     name = type(loss).__name__
     without = "" if getattr(loss, POLICY_NETWORK, None) is not None else f" and no {POLICY_NETWORK}"
+    if all(getattr(loss, network, None) is None for network in (POLICY_NETWORK, *VALUE_NETWORKS)):
+        raise TypeError(
+            f"smooth finds nothing to regularize: {name} has no {POLICY_NETWORK}, and no value "
+            f"function among {', '.join(VALUE_NETWORKS)}."
+        )
     if without and method != "l2c2":
         raise TypeError(
             f"{method} needs a policy: {name} has none. 'l2c2' smooths value functions, too."

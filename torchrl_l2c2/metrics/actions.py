@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -193,7 +195,8 @@ def saturation(
             bound on one side has no margin. Default 0.01.
 
     Returns:
-        Tensor: the measure of each episode, shape ``[*B]``, over its steps and dimensions.
+        Tensor: the measure of each episode, shape ``[*B]``, over its steps and dimensions; NaN
+        where an action is NaN.
 
     Raises:
         TypeError: the actions are no floating-point tensor, or the margin is no number.
@@ -210,7 +213,8 @@ def saturation(
     low, high = torch.as_tensor(low), torch.as_tensor(high)
     width = margin * (high - low)
     width = width.where(width.isfinite(), 0.0)
-    return ((actions <= low + width) | (actions >= high - width)).float().mean((-2, -1))
+    ends = ((actions <= low + width) | (actions >= high - width)).float()
+    return ends.where(~actions.isnan(), math.nan).mean((-2, -1))
 
 
 def check_episodes(name: str, actions: Tensor, least: int) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.objectives import (
     ACTLoss,
@@ -144,7 +144,7 @@ def find_states(
         dict: states by key, ``[*B, *F]``.
 
     Raises:
-        TypeError: no state is floating point.
+        TypeError: no state is floating point, or the states are the entries of a TensorDict.
     """
     keys = list(keys)
     if not keys:
@@ -156,6 +156,13 @@ def find_states(
     found = {key: tensordict.get(key, None) for key in keys}
     floating = {key: state for key, state in found.items() if is_floating_point(state)}
     if not floating:
+        for key, state in found.items():
+            if isinstance(state, TensorDictBase):
+                leaves = [unravel_key((key, leaf)) for leaf in state.keys(True, True)]
+                raise TypeError(
+                    f"Expected tensors as the inputs of {network}, got the TensorDict {key!r}. "
+                    f"Name its entries in the in_keys of the network: {leaves}."
+                )
         kinds = {key: getattr(s, "dtype", type(s).__name__) for key, s in found.items()}
         raise TypeError(
             f"{network} needs a floating-point observation among its inputs to be regularized, "

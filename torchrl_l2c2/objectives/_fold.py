@@ -122,6 +122,9 @@ def make_part(
         # Within forward, the penalty is added there.
         if self._evaluation.forward_pass is not None or not torch.is_grad_enabled():
             return out
+        if kind == "policy" and not is_compiling() and self.training:
+            self._watch.see_call(self, tensordict)
+            self._warn_of_changed_base()
         if not self.folded:
             self._watch.see_part(self, kind)
             return out
@@ -154,17 +157,18 @@ class TermWatch:
     def __init__(self) -> None:
         self.progress_set = False
         self.pending: set[str] | None = None
+        self._calls = 0
         self._forwards = 0
         self._parts = 0
         self._counted = 0
         self._warned: set[str] = set()
 
-    def see_forward(self, loss: Any, batch: TensorDictBase, terms: TensorDictBase) -> None:
-        """Counts a call of a loss in training, and follows the gradients of its added terms."""
-        self._forwards += 1
-        if self._forwards == 1 and loss._followed:
+    def see_call(self, loss: Any, batch: TensorDictBase) -> None:
+        """Counts a call of a loss, or of its ``actor_loss``, in training."""
+        self._calls += 1
+        if self._calls == 1 and loss._followed:
             _warn_of_several_steps(batch)
-        if self._forwards == PATIENCE and loss._ramp is not None and not self.progress_set:
+        if self._calls == PATIENCE and loss._ramp is not None and not self.progress_set:
             warnings.warn(
                 f"the gain of {type(loss).__name__} follows the progress of training, and "
                 f"set_progress was not called in {PATIENCE} updates: it stays at "
@@ -173,7 +177,7 @@ class TermWatch:
                 "choose ramp=None.",
                 stacklevel=4,
             )
-        stands = self._forwards == STANDSTILL and self.progress_set and loss.strength > 0
+        stands = self._calls == STANDSTILL and self.progress_set and loss.strength > 0
         if stands and not loss.regularizer_gain:
             warnings.warn(
                 f"the penalty of {type(loss).__name__} was 0 until now, because the progress of "
@@ -181,6 +185,10 @@ class TermWatch:
                 "loss.set_progress(frames / total_frames) after every rollout, with / and not //.",
                 stacklevel=4,
             )
+
+    def see_forward(self, loss: Any, terms: TensorDictBase) -> None:
+        """Counts a call of a loss in training, and follows the gradients of its added terms."""
+        self._forwards += 1
         if loss.folded:
             return
         if self.pending is None:

@@ -93,9 +93,10 @@ def inspect_network(loss: LossModule, network: str) -> NetworkSpec:
         output = next((key for key in actions if key in made), None)
     else:
         output = _value_key(loss, network)
+    computed = made.union(actions, _parents(made))
     return NetworkSpec(
         inputs=tuple(key for key in inputs if key not in trunk),
-        states=tuple(k for k in inputs if k not in made.union(actions) and not _is_private(k)),
+        states=tuple(key for key in inputs if key not in computed and not _is_private(key)),
         trunk=tuple(trunk),
         trains_trunk=_trains_trunk(loss, network),
         output=output,
@@ -104,6 +105,12 @@ def inspect_network(loss: LossModule, network: str) -> NetworkSpec:
         rowwise=not any(isinstance(m, _BatchNorm | _DropoutNd) for m in net.modules()),
         has_dropout=any(isinstance(m, _DropoutNd) for m in net.modules()),
     )
+
+
+def _parents(keys: Iterable[NestedKey]) -> set[NestedKey]:
+    """Keys of the TensorDicts around entries, such as a composite policy's parameters."""
+    nested = [key for key in keys if isinstance(key, tuple)]
+    return {unravel_key(key[:end]) for key in nested for end in range(1, len(key))}
 
 
 def _unnamed_action(loss: LossModule, actor: Any, made: set[NestedKey]) -> NestedKey:
@@ -318,13 +325,17 @@ class EvaluatedNetworks:
         """Evaluates a network as the loss does, and caches the result for the forward pass.
 
         Results are not cached if the inputs have a gradient: a regularizer does not train encoders.
+        Nor are they if the network normalizes by its batch, or keeps running statistics: only the
+        states of one evaluation are normalized alike.
         Compiled losses evaluate small batches together with the other states, if these are known.
         This changes the rounding, as compiling does; eager losses do not do it.
         """
         spec = self.specs.get(network)
         if self.forward_pass is None or spec is None or _requires_grad(tensordict, spec.inputs):
             return evaluate(network, tensordict)
-        if spec.has_dropout:  # The loss evaluates with dropout, a regularizer without.
+        # Dropout is not rowwise: the loss evaluates with it, a regularizer without. A loss that is
+        # not functional is rsl_rl's, whose statistics do not change in a forward pass.
+        if not spec.rowwise or (spec.has_buffers and loss.functional):
             return evaluate(network, tensordict)
         states = None
         alone = not is_compiling() or autocast_at(tensordict)
@@ -353,7 +364,7 @@ class EvaluatedNetworks:
 
     def _fits_one_pass(self, network: str, tensordict: TensorDictBase) -> bool:
         spec = self.specs[network]
-        if spec.trunk or spec.has_buffers or not spec.rowwise:
+        if spec.trunk or spec.has_buffers:
             return False
         return tensordict.ndim == 1 and tensordict.numel() <= ONE_PASS_STATES
 

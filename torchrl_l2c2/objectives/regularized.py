@@ -195,6 +195,9 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             folded penalty is part of the loss's own terms and is reported as ``penalty_*`` instead
             of ``loss_*``. Under ``torch.no_grad()`` a folded penalty is not computed: the terms are
             the base loss's terms, and the regularizer's entries are NaN.
+
+        Raises:
+            ValueError: the regularizer returns other ``loss_*`` keys than it declared.
         """
         if self._folded and not torch.is_grad_enabled():
             terms = super().forward(tensordict)
@@ -210,12 +213,14 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             added.update(self.value_regularizer(tensordict))
         finally:
             self._evaluation.end_forward_pass(outer)
+        self._check_declared(added)
         if self._folded:
             self._add_penalties(terms, added)
         else:
             terms.update(added)
         if not is_compiling() and self.training and torch.is_grad_enabled():
-            self._watch.see_forward(self, tensordict, terms)
+            self._watch.see_call(self, tensordict)
+            self._watch.see_forward(self, terms)
             self._warn_of_changed_base()
         networks = (f"{name}_params" for name in self._evaluation.specs)
         self._clear_weakrefs(tensordict, terms, *networks)
@@ -403,6 +408,16 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
                 folded = self._folded_value(key, value)
                 terms.set(target, add_penalty(terms.get(target), folded, target))
             terms.set(penalty_key(key), value.detach())
+
+    def _check_declared(self, added: TensorDictBase) -> None:
+        """Refuses other terms than the declared ones, which would not be trained."""
+        returned = {key for key in added.keys() if key.startswith("loss_")}
+        if returned != self.added_terms:
+            raise ValueError(
+                f"Expected the declared terms {sorted(self.added_terms)} of {type(self).__name__}, "
+                f"got {sorted(returned)}. Give them the same names in declare_terms, and in "
+                "policy_regularizer or value_regularizer."
+            )
 
     def _folded_value(self, key: str, term: Tensor) -> Tensor:
         """A term as it is added to another: an auxiliary term adds its gradient but no value."""
@@ -861,7 +876,11 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             each = each if rows is None else spread_rows(each, rows, shape)
             check_of_each(each.shape, shape)
             each = as_masked(each, tensordict, self._loss_mask_keys()) if masked else each
-            return self._reduce_loss(each, tensordict, weights=weights, reduction=reduction)
+            each_weight = weights
+            if weights is not None and weights.shape != each.shape:  # [*B, 1], or several agents
+                more = (1,) * (each.ndim - len(shape))
+                each_weight = weights.reshape(*shape, *more).expand_as(each)
+            return self._reduce_loss(each, tensordict, weights=each_weight, reduction=reduction)
 
         if counts is None:
             return reduce(value)

@@ -143,6 +143,7 @@ class Regularization:
         transitions = batch.observations[:count]
         parameters = tuple(part[:count] for part in actor.output_distribution_params)
         transitions = write_parameters(transitions, parameters)
+        transitions.set("action", batch.actions[:count])
         transitions.set("next", batch.next_observations).set(VALID, batch.has_next)
         return transitions if self.neighbors is None else self.neighbors(transitions)
 
