@@ -236,6 +236,31 @@ def test_a_reward_may_be_an_array_of_one_number(monkeypatch, name, settings):
             run.train()
 
 
+@pytest.mark.parametrize("flags", [(1, 0), (np.array([True]), None), (np.int64(1), np.bool_(0))])
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [("sac", {}), ("ppo", {}), ("ppo", {"algorithm": SEVERAL_ENVS})],
+    ids=["frame by frame", "episodes", "rollouts"],
+)
+def test_the_ends_of_an_episode_need_not_be_booleans(monkeypatch, name, settings, flags):
+    """Integers would be learned from as integers, where not 0 is -1."""
+    step = Still.step
+
+    def ended(self, action):
+        seen, reward, *_ = step(self, action)
+        return seen, reward, *flags, {}
+
+    monkeypatch.setattr(Still, "step", ended)
+    still(monkeypatch)
+    run = experiment(name, task(episodes=2, max_steps=3), **settings)
+    monkeypatch.setattr(run.learner.replay, "empty", lambda *_: None)
+    run.train()
+    stored = run.learner.replay[:]["next"]
+    for key in ("done", "terminated"):
+        assert stored[key].dtype == torch.bool and stored[key].all(), key
+    assert run.test(1).lengths == [1]
+
+
 @pytest.mark.parametrize(
     ("method", "raises", "message"),
     [
