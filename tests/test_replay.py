@@ -133,6 +133,18 @@ def test_an_update_is_what_sampling_updating_and_prioritizing_by_hand_gives(name
     same(*results, rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("name", ["prioritized", "sac"])
+def test_a_batch_of_one_transition_has_a_weight_and_gets_a_priority(name):
+    """Of the same shapes as larger batches."""
+    replay = PrioritizedReplayConfig(capacity=50, batch_size=1)
+    experiment = trained(replace(CASES[name], replay=replay))
+    draw = experiment.learner.update.draw()
+    assert draw.weight.shape == draw.rows.shape == (1,)
+    before = learned(experiment)["priorities"]
+    assert experiment.learner.update(True).isfinite().all()
+    assert (learned(experiment)["priorities"] != before).sum() == 1
+
+
 def test_the_batch_has_the_entries_and_neighbors_that_the_buffer_gives():
     """Whatever the buffer's transform writes, at its own random numbers."""
     experiment = trained(PAPER)
