@@ -282,6 +282,21 @@ def test_what_a_task_raises_before_it_plays_names_it(monkeypatch, method, raises
     assert raised.value.__cause__ is raises
 
 
+def test_a_task_that_cannot_be_seeded_is_named(monkeypatch):
+    """Its reset raises only if it gets a seed."""
+    still(monkeypatch)
+    reset = Still.reset
+
+    def seeded(self, *, seed=None, options=None):
+        if seed == 7:
+            raise RuntimeError("seeds are even")
+        return reset(self, seed=seed)
+
+    monkeypatch.setattr(Still, "reset", seeded)
+    with pytest.raises(SimulatorError, match=r"Still-v0 could not start: .*seeds are even"):
+        make_env(task(), 7)
+
+
 @pytest.mark.parametrize(
     ("where", "settings"),
     [

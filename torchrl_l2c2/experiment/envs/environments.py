@@ -85,13 +85,13 @@ def make_env(task: TaskConfig, seed: int, *, render: Drawing | None = None) -> E
         with _task_errors(task), quiet_output():
             env = GymWrapper(simulator)
             env.reset()
+            env.set_seed(seed)  # Resets the task, too.
     except SimulatorError as error:
         if render is not None and isinstance(
             error.__cause__, NotImplementedError
         ):  # Gymnasium's own render()
             raise _cannot_render(task) from error.__cause__
         raise
-    env.set_seed(seed)
     if not task.noise_scale:
         return env
     generator = torch.Generator().manual_seed(seed + NOISE_SEED)
