@@ -26,7 +26,7 @@ from torchrl_l2c2.experiment import (
 from torchrl_l2c2.experiment.agents.build import make_agent
 from torchrl_l2c2.experiment.envs.environments import ActionRatePenalty, time_limit
 from torchrl_l2c2.experiment.envs.pictures import Drawing
-from torchrl_l2c2.experiment.errors import SimulatorError
+from torchrl_l2c2.experiment.errors import SimulatorError, UserError
 from torchrl_l2c2.experiment.run.evaluation import evaluate_task
 
 INF = float("inf")
@@ -280,6 +280,16 @@ def test_what_a_task_raises_before_it_plays_names_it(monkeypatch, method, raises
     with pytest.raises(SimulatorError, match=message) as raised:
         make_env(task(), 0)
     assert raised.value.__cause__ is raises
+
+
+@pytest.mark.parametrize(("name", "settings"), [("sac", {}), ("ppo", {"algorithm": SEVERAL_ENVS})])
+def test_a_task_of_an_old_generator_is_refused(monkeypatch, name, settings):
+    """Its state could not be saved as that of NumPy's generators."""
+    still(monkeypatch)
+    monkeypatch.setattr(Still, "np_random", np.random.RandomState(0))
+    found = "Expected a numpy.random.Generator as np_random of Still, got RandomState"
+    with pytest.raises(UserError, match=found):
+        experiment(name, task(), **settings)
 
 
 def test_a_task_that_cannot_be_seeded_is_named(monkeypatch):
