@@ -294,6 +294,14 @@ def test_a_rollout_that_is_shorter_than_a_batch_is_learned_from_whole():
     assert len(example["observation"].unique(dim=0)) == 60
 
 
+@pytest.mark.parametrize(("num_envs", "rows"), [(2, 40), (None, 40 + 60)])
+def test_a_buffer_of_rollouts_has_room_for_the_longest(num_envs, rows):
+    """Exactly the frames from several simulators; of whole episodes, the last may go beyond."""
+    algorithm = PPOConfig(hidden=(8,), frames=40, num_envs=num_envs)
+    replay = make_replay(replace(CASES["rollout"], algorithm=algorithm))
+    assert replay.storage.max_size == rows
+
+
 def begin(experiment, state):
     """At a state, with the random numbers that SAC's actions are drawn with."""
     experiment.load_state_dict(copy.deepcopy(state))
