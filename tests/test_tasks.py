@@ -365,6 +365,20 @@ def test_an_action_with_equal_bounds_has_no_action_rate_penalty(monkeypatch):
     assert rewards == [0.0, -3.0 * 2.0**2 / 2, 0.0]
 
 
+def test_the_action_rate_is_that_of_the_given_actions(monkeypatch):
+    """The task changes them in place: by 0, then 2 halves of the range, as without the change."""
+    env = ActionRatePenalty(Still(), weight=3.0)
+
+    def step(self, action):
+        action *= 0.1
+        return self.seen, 0.0, False, False, {}
+
+    monkeypatch.setattr(Still, "step", step)
+    env.reset()
+    rewards = [env.step(np.float32([u]))[1] for u in (-1.0, -1.0, 1.0)]
+    assert rewards == [0.0, 0.0, -3.0 * 2.0**2]
+
+
 def test_a_failed_test_closes_its_environment(monkeypatch):
     """Some simulators keep a window or a process."""
     closed = []

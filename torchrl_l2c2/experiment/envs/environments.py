@@ -143,11 +143,12 @@ class ActionRatePenalty(gymnasium.Wrapper[Any, Any, Any, Any]):
         return self.env.reset(**options)
 
     def step(self, action: Any) -> Any:
+        given = np.array(action)  # A copy: the task may change the action in place.
         observation, reward, *rest = self.env.step(action)
         if self._previous is not None:
-            change = (action - self._previous) / self._half_range
+            change = (given - self._previous) / self._half_range
             reward = float(reward) - self._weight * float(np.mean(np.square(change)))
-        self._previous = np.array(action)
+        self._previous = given
         return observation, reward, *rest
 
 
