@@ -156,7 +156,9 @@ class TestFolders:
     @pytest.mark.parametrize(
         ("name", "old", "new", "told"),
         [
-            ("metrics.csv", "\n3,300,", "\n3,3x,", "line 4: frames must be a number, got '3x'"),
+            ("metrics.csv", "\n3,300,", "\n3,3x,", "line 4: frames must be a finite number"),
+            ("metrics.csv", "\n3,300,30,", "\n3,300,inf,", "updates must be a finite number"),
+            ("evaluation.json", '"return_mean": 21.0', '"return_mean": 1e400', "finite numbers"),
             ("metrics.csv", None, "episode,frames\n", "has 0 episodes, fewer than the 1"),
             ("evaluation.json", '"return_mean": 21.0', f'"return_mean": {"9" * 400}', "too large"),
             ("versions.json", None, "[" * 99999, "too many nested brackets"),
