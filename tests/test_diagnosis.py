@@ -139,10 +139,10 @@ class TestWords:
         text = said(made_up(square), "bang-bang").text
         assert "in 100% of the steps" in text and "9 times, one in 11 steps" in text
 
-    def test_without_bounds_nothing_is_bang_bang(self):
-        """The largest action that was seen is no bound."""
+    def test_without_bounds_nothing_is_bang_bang_or_wide(self):
+        """Or wide: the largest action that was seen is no bound."""
         square = torch.where((STEPS // 10) % 2 == 0, 1.0, -1.0).unsqueeze(-1)
-        assert "bang-bang" not in kinds(made_up(square, bounded=False))
+        assert not {"bang-bang", "wide"} & set(kinds(made_up(square, bounded=False, spread=0.9)))
 
     def test_one_bound_is_pinned(self):
         """What moves in four tenths of the steps is no jumping between bounds."""
@@ -432,6 +432,31 @@ class TestRun:
             found = diagnose_run(tmp_path / str(target), episodes=1, with_pictures=False)
             shares[target] = found.shares["l2c2_actor"].gradient
         assert shares[1e-9] > 10 * shares[1e3]
+
+    @pytest.mark.filterwarnings("ignore:all transitions of the batch")
+    @pytest.mark.parametrize("normalize", [True, False])
+    def test_the_largest_step_is_left_out_where_it_is_of_normalized_observations(
+        self, tmp_path, normalize
+    ):
+        """In standard deviations it means nothing for the observations that the policy reads."""
+        more = {"clip_actions": True, "log_scale": 0.0, "normalize_observations": normalize}
+        experiment = Experiment(
+            ExperimentConfig(
+                task=TaskConfig("task", "Pendulum-v1", episodes=2, max_steps=40),
+                algorithm=replace(ALGORITHMS["ppo"], num_envs=2, **more),
+                regularizer=L2C2Config(max_step=1e-6),
+                replay=RolloutReplayConfig(batch_size=16),
+                compile=False,
+                late_share=0.0,
+            ),
+            tmp_path,
+        )
+        experiment.train()
+        experiment.save()
+        experiment.close()
+        found = diagnose_run(tmp_path, episodes=1, with_pictures=False)
+        assert found.distance.isfinite().all() == normalize
+        assert found.policy_lipschitz.isnan().all() == (not normalize)
 
     def test_gradients_are_of_what_training_learns_from(self, monkeypatch):
         """Rewards of 1, 50 and -200 are cut off at 10 before they are scaled by .01."""

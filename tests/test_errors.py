@@ -81,6 +81,7 @@ def test_too_little_memory_is_told_with_the_settings_that_need_it(error):
     error = too_large(error) if isinstance(error, int) else error
     told = _print_error(error)
     assert "Not enough memory: decrease algorithm.hidden, replay.capacity" in told
+    assert "algorithm.frames, task.max_steps or threads." in told  # of rollouts
 
 
 def test_help_may_have_no_reader():

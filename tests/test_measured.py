@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -24,9 +25,10 @@ from torchrl_l2c2.experiment import (
 )
 from torchrl_l2c2.experiment.agents.normalization import Normalization
 from torchrl_l2c2.experiment.agents.optimizers import anneal, make_optimizer
+from torchrl_l2c2.experiment.collect.player import make_collector
 from torchrl_l2c2.experiment.envs.environments import NOISE_SEED
 from torchrl_l2c2.experiment.run.checkpoints import list_checkpoints
-from torchrl_l2c2.experiment.run.evaluation import LateTests
+from torchrl_l2c2.experiment.run.evaluation import Evaluation, LateTests
 from torchrl_l2c2.experiment.settings.tasks import Budget
 
 PENDULUM = TaskConfig("pendulum", "Pendulum-v1", noise_scale=0.01, episodes=2, max_steps=40)
@@ -69,6 +71,30 @@ def test_simulators_side_by_side_begin_apart():
     run = Experiment(small(algorithm=algorithm, replay=RolloutReplayConfig(), task=task))
     firsts = [frames["observation"][0] for frames in run.player.play_rollout()[0]]
     assert len(torch.stack(firsts).unique(dim=0)) == 3
+
+
+def test_the_seeds_of_many_simulators_are_seeds_of_numpy(monkeypatch):
+    """Below 2 ** 32; the 278th simulator's is the first that would be above."""
+    seeds = []
+    monkeypatch.setattr(
+        "torchrl_l2c2.experiment.collect.player.make_env", lambda task, seed: seeds.append(seed)
+    )
+    monkeypatch.setattr(
+        "torchrl_l2c2.experiment.collect.player.RolloutCollector", lambda *_, **__: None
+    )
+    algorithm = PPOConfig(num_envs=300, frames=300, hidden=(8,))
+    config = small(algorithm=algorithm, replay=RolloutReplayConfig())
+    make_collector(config, None, SimpleNamespace(policy=None), compile=False)
+    assert len(set(seeds)) == 299 and all(0 <= seed < 2**32 for seed in seeds)
+    assert seeds[:277] == [config.seed + 15_485_863 * i for i in range(1, 278)]
+
+
+def test_an_episode_that_is_too_short_for_a_measure_is_left_out_of_its_mean():
+    """Of the others; without any, the mean is unknown."""
+    sm = {"some": [math.nan, 1.0, 2.0], "none": [math.nan] * 3}
+    summary = Evaluation([1.0, 2.0, 6.0], [0.0] * 3, [3, 9, 9], sm).summary()
+    assert summary["some_mean"] == 1.5 and math.isnan(summary["none_mean"])
+    assert summary["return_mean"] == 3.0 and summary["episodes"] == 3
 
 
 def test_the_variation_in_the_log_is_that_of_the_mean():

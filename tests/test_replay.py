@@ -133,6 +133,18 @@ def test_an_update_is_what_sampling_updating_and_prioritizing_by_hand_gives(name
     same(*results, rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("name", ["prioritized", "sac"])
+def test_a_batch_of_one_transition_has_a_weight_and_gets_a_priority(name):
+    """Of the same shapes as larger batches."""
+    replay = PrioritizedReplayConfig(capacity=50, batch_size=1)
+    experiment = trained(replace(CASES[name], replay=replay))
+    draw = experiment.learner.update.draw()
+    assert draw.weight.shape == draw.rows.shape == (1,)
+    before = learned(experiment)["priorities"]
+    assert experiment.learner.update(True).isfinite().all()
+    assert (learned(experiment)["priorities"] != before).sum() == 1
+
+
 def test_the_batch_has_the_entries_and_neighbors_that_the_buffer_gives():
     """Whatever the buffer's transform writes, at its own random numbers."""
     experiment = trained(PAPER)
@@ -280,6 +292,14 @@ def test_a_rollout_that_is_shorter_than_a_batch_is_learned_from_whole():
     example = experiment.learner.example()
     assert experiment.learner.updates == 2 and len(example) == 60
     assert len(example["observation"].unique(dim=0)) == 60
+
+
+@pytest.mark.parametrize(("num_envs", "rows"), [(2, 40), (None, 40 + 60)])
+def test_a_buffer_of_rollouts_has_room_for_the_longest(num_envs, rows):
+    """Exactly the frames from several simulators; of whole episodes, the last may go beyond."""
+    algorithm = PPOConfig(hidden=(8,), frames=40, num_envs=num_envs)
+    replay = make_replay(replace(CASES["rollout"], algorithm=algorithm))
+    assert replay.storage.max_size == rows
 
 
 def begin(experiment, state):

@@ -14,6 +14,7 @@ from torchrl_l2c2.experiment.analysis.reports import (
     finished_run,
     read_runs,
     result_lines,
+    write_report,
 )
 from torchrl_l2c2.experiment.analysis.reports.figures import styles
 from torchrl_l2c2.experiment.analysis.reports.groups import baseline_of, group_records
@@ -71,6 +72,22 @@ class TestPictures:
         assert looks.keys() == {group.name for group in groups}
         assert len({tuple(look.items()) for look in looks.values()}) == len(looks)
 
+    @pytest.mark.filterwarnings("ignore:Glyph")
+    def test_tasks_of_similar_or_long_names_have_pictures_of_their_own(self, tmp_path):
+        """Their letters are left out of the files' names, and long names are cut."""
+        names = ("任务一", "任务二", "x" * 500, "x" * 499 + "y")
+        for i, name in enumerate(names):
+            config = make_config()
+            task = replace(config.task, name=name)
+            make_run(tmp_path / "runs" / str(i), replace(config, task=task), 1.0, 0.1)
+        found = find_runs([tmp_path / "runs"])
+        page = write_report(
+            tmp_path / "report", table_of([r.record for r in found.runs]), found.runs
+        )
+        assert len(list(page.parent.glob("learning_curves_*_ppo_rpe.svg"))) == 4
+        for text in (page.read_text(), (page.parent / "report.md").read_text()):
+            assert all(f"learning curves {name}, ppo_rpe" in text for name in names)
+
 
 class TestTables:
     def test_runs_of_another_length_are_not_compared(self, field):
@@ -126,10 +143,22 @@ class TestFolders:
         with pytest.raises(FileNotFoundError, match=f"Expected a folder of runs, got .*{name}'"):
             find_runs([tmp_path, tmp_path / name])
 
+    def test_links_are_followed_and_a_run_is_read_once(self, tmp_path):
+        """A link to a run elsewhere, to the same run again, and to the folder that it is in."""
+        make_run(tmp_path / "disk" / "run", make_config(seed=1), 1.0, 0.1)
+        make_run(tmp_path / "outputs" / "own", make_config(seed=2), 1.0, 0.1)
+        for name in ("a", "b"):
+            (tmp_path / "outputs" / name).symlink_to(tmp_path / "disk", target_is_directory=True)
+        (tmp_path / "outputs" / "own" / "up").symlink_to(tmp_path / "outputs")
+        found = find_runs([tmp_path / "outputs"])
+        assert sorted(run.seed for run in found.runs) == [1, 2] and found.notes == []
+
     @pytest.mark.parametrize(
         ("name", "old", "new", "told"),
         [
-            ("metrics.csv", "\n3,300,", "\n3,3x,", "line 4: frames must be a number, got '3x'"),
+            ("metrics.csv", "\n3,300,", "\n3,3x,", "line 4: frames must be a finite number"),
+            ("metrics.csv", "\n3,300,30,", "\n3,300,inf,", "updates must be a finite number"),
+            ("evaluation.json", '"return_mean": 21.0', '"return_mean": 1e400', "finite numbers"),
             ("metrics.csv", None, "episode,frames\n", "has 0 episodes, fewer than the 1"),
             ("evaluation.json", '"return_mean": 21.0', f'"return_mean": {"9" * 400}', "too large"),
             ("versions.json", None, "[" * 99999, "too many nested brackets"),

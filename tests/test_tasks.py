@@ -26,7 +26,7 @@ from torchrl_l2c2.experiment import (
 from torchrl_l2c2.experiment.agents.build import make_agent
 from torchrl_l2c2.experiment.envs.environments import ActionRatePenalty, time_limit
 from torchrl_l2c2.experiment.envs.pictures import Drawing
-from torchrl_l2c2.experiment.errors import SimulatorError
+from torchrl_l2c2.experiment.errors import SimulatorError, UserError
 from torchrl_l2c2.experiment.run.evaluation import evaluate_task
 
 INF = float("inf")
@@ -236,6 +236,31 @@ def test_a_reward_may_be_an_array_of_one_number(monkeypatch, name, settings):
             run.train()
 
 
+@pytest.mark.parametrize("flags", [(1, 0), (np.array([True]), None), (np.int64(1), np.bool_(0))])
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [("sac", {}), ("ppo", {}), ("ppo", {"algorithm": SEVERAL_ENVS})],
+    ids=["frame by frame", "episodes", "rollouts"],
+)
+def test_the_ends_of_an_episode_need_not_be_booleans(monkeypatch, name, settings, flags):
+    """Integers would be learned from as integers, where not 0 is -1."""
+    step = Still.step
+
+    def ended(self, action):
+        seen, reward, *_ = step(self, action)
+        return seen, reward, *flags, {}
+
+    monkeypatch.setattr(Still, "step", ended)
+    still(monkeypatch)
+    run = experiment(name, task(episodes=2, max_steps=3), **settings)
+    monkeypatch.setattr(run.learner.replay, "empty", lambda *_: None)
+    run.train()
+    stored = run.learner.replay[:]["next"]
+    for key in ("done", "terminated"):
+        assert stored[key].dtype == torch.bool and stored[key].all(), key
+    assert run.test(1).lengths == [1]
+
+
 @pytest.mark.parametrize(
     ("method", "raises", "message"),
     [
@@ -255,6 +280,31 @@ def test_what_a_task_raises_before_it_plays_names_it(monkeypatch, method, raises
     with pytest.raises(SimulatorError, match=message) as raised:
         make_env(task(), 0)
     assert raised.value.__cause__ is raises
+
+
+@pytest.mark.parametrize(("name", "settings"), [("sac", {}), ("ppo", {"algorithm": SEVERAL_ENVS})])
+def test_a_task_of_an_old_generator_is_refused(monkeypatch, name, settings):
+    """Its state could not be saved as that of NumPy's generators."""
+    still(monkeypatch)
+    monkeypatch.setattr(Still, "np_random", np.random.RandomState(0))
+    found = "Expected a numpy.random.Generator as np_random of Still, got RandomState"
+    with pytest.raises(UserError, match=found):
+        experiment(name, task(), **settings)
+
+
+def test_a_task_that_cannot_be_seeded_is_named(monkeypatch):
+    """Its reset raises only if it gets a seed."""
+    still(monkeypatch)
+    reset = Still.reset
+
+    def seeded(self, *, seed=None, options=None):
+        if seed == 7:
+            raise RuntimeError("seeds are even")
+        return reset(self, seed=seed)
+
+    monkeypatch.setattr(Still, "reset", seeded)
+    with pytest.raises(SimulatorError, match=r"Still-v0 could not start: .*seeds are even"):
+        make_env(task(), 7)
 
 
 @pytest.mark.parametrize(
@@ -313,6 +363,20 @@ def test_an_action_with_equal_bounds_has_no_action_rate_penalty(monkeypatch):
     env.reset()
     rewards = [env.step(np.float32([u, 0.5]))[1] for u in (-1.0, 1.0, 1.0)]
     assert rewards == [0.0, -3.0 * 2.0**2 / 2, 0.0]
+
+
+def test_the_action_rate_is_that_of_the_given_actions(monkeypatch):
+    """The task changes them in place: by 0, then 2 halves of the range, as without the change."""
+    env = ActionRatePenalty(Still(), weight=3.0)
+
+    def step(self, action):
+        action *= 0.1
+        return self.seen, 0.0, False, False, {}
+
+    monkeypatch.setattr(Still, "step", step)
+    env.reset()
+    rewards = [env.step(np.float32([u]))[1] for u in (-1.0, -1.0, 1.0)]
+    assert rewards == [0.0, 0.0, -3.0 * 2.0**2]
 
 
 def test_a_failed_test_closes_its_environment(monkeypatch):

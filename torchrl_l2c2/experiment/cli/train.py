@@ -70,7 +70,10 @@ LAUNCHERS = {
     "slurm_cluster": ("hydra_plugins.hydra_submitit_launcher", "slurm"),
 }
 
-MEMORY_SETTINGS = "algorithm.hidden, replay.capacity, replay.batch_size or threads"
+MEMORY_SETTINGS = (
+    "algorithm.hidden, replay.capacity, replay.batch_size, algorithm.frames, task.max_steps or "
+    "threads"
+)
 
 
 def check_launcher(arguments: Sequence[str]) -> None:

@@ -23,8 +23,10 @@ Played = TypeVar("Played")
 
 # Metrics of an episode, by their names in metrics.csv.
 EPISODE_COLUMNS = ("return", "action_variation", "policy_scale", "length")
-# Distance of the seeds of a run's simulators, large enough to differ from other runs' seeds.
+# Distance of the seeds of a run's simulators, large enough to differ from other runs' seeds. It is
+# odd, so seeds also differ after the division by NumPy's limit.
 SEED_STRIDE = 15_485_863
+SEED_LIMIT = 2**32
 
 
 def make_collector(
@@ -46,7 +48,8 @@ def make_collector(
         "keep_previous": config.regularizer.reads_previous,
     }
     if algorithm.num_envs is not None:
-        seeds = (config.seed + SEED_STRIDE * i for i in range(1, algorithm.num_envs))
+        numbers = range(1, algorithm.num_envs)
+        seeds = ((config.seed + SEED_STRIDE * i) % SEED_LIMIT for i in numbers)
         envs = [env, *(make_env(config.task, seed) for seed in seeds)]
         return RolloutCollector(envs, agent.policy, frames_per_batch=algorithm.frames, **options)
     return EpisodeCollector(

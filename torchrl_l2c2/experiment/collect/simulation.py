@@ -14,6 +14,7 @@ from torchrl.envs import Compose, EnvBase, GymWrapper, Transform, TransformedEnv
 
 from torchrl_l2c2.experiment.agents._torchrl_internals import add_noise, simulator_of
 from torchrl_l2c2.experiment.envs.frames import PREVIOUS, Frame, reward_to_float
+from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.transforms import ObservationNoise
 
 
@@ -39,7 +40,8 @@ class Simulation:
         next_observation: Next observation for the policy; ``None`` before a reset.
 
     Raises:
-        ValueError: If the environment is batched or has other transforms.
+        ValueError: If the environment is batched or has other transforms, or its ``np_random`` is
+            not a ``numpy.random.Generator``.
     """
 
     def __init__(self, env: EnvBase, *, keep_previous: bool = False) -> None:
@@ -80,7 +82,9 @@ class Simulation:
             outputs[PREVIOUS] = self.frames[-1].observation if self.frames else before
         seen, reward, terminated, truncated, _ = self._gymnasium.step(action)
         after = self._observe(seen)
-        frame = Frame(before, outputs, after, reward_to_float(reward), terminated, truncated)
+        # Integers would stay integers in the replay buffer, where ~0 is -1.
+        ends = bool(terminated), bool(truncated)
+        frame = Frame(before, outputs, after, reward_to_float(reward), *ends)
         self.next_observation = None if frame.done else after
         self.frames.append(frame)
         return frame
@@ -91,16 +95,14 @@ class Simulation:
 
     def generators(self) -> dict[str, Any]:
         """Returns the states of the simulator's and the noise's random generators."""
-        generator = self._gymnasium.unwrapped.np_random.bit_generator
         return {
-            "simulator": json.dumps(generator.state),
+            "simulator": json.dumps(self._bit_generator().state),
             "noise": None if self.noise is None else self.noise.get_extra_state(),
         }
 
     def set_generators(self, states: Mapping[str, Any]) -> None:
         """Restores states of :meth:`generators`. The next frame starts a new episode."""
-        generator = self._gymnasium.unwrapped.np_random.bit_generator
-        generator.state = json.loads(states["simulator"])
+        self._bit_generator().state = json.loads(states["simulator"])
         if self.noise is not None:
             self.noise.set_extra_state(states["noise"])
         self.discard_episode()
@@ -139,6 +141,17 @@ class Simulation:
                 stacklevel=5,
             )
             self.discard_episode()
+
+    def _bit_generator(self) -> Any:
+        task = self._gymnasium.unwrapped
+        found = getattr(task.np_random, "bit_generator", None)
+        if found is None:
+            raise UserError(
+                f"Expected a numpy.random.Generator as np_random of {type(task).__name__}, got "
+                f"{type(task.np_random).__name__}. Use Gymnasium's np_random in the task, which "
+                "super().reset(seed=seed) seeds."
+            )
+        return found
 
     def _observe(self, seen: np.ndarray) -> Tensor:
         """Converts an observation to a tensor with noise, a copy: simulators may reuse arrays."""

@@ -85,13 +85,13 @@ def make_env(task: TaskConfig, seed: int, *, render: Drawing | None = None) -> E
         with _task_errors(task), quiet_output():
             env = GymWrapper(simulator)
             env.reset()
+            env.set_seed(seed)  # Resets the task, too.
     except SimulatorError as error:
         if render is not None and isinstance(
             error.__cause__, NotImplementedError
         ):  # Gymnasium's own render()
             raise _cannot_render(task) from error.__cause__
         raise
-    env.set_seed(seed)
     if not task.noise_scale:
         return env
     generator = torch.Generator().manual_seed(seed + NOISE_SEED)
@@ -143,11 +143,12 @@ class ActionRatePenalty(gymnasium.Wrapper[Any, Any, Any, Any]):
         return self.env.reset(**options)
 
     def step(self, action: Any) -> Any:
+        given = np.array(action)  # A copy: the task may change the action in place.
         observation, reward, *rest = self.env.step(action)
         if self._previous is not None:
-            change = (action - self._previous) / self._half_range
+            change = (given - self._previous) / self._half_range
             reward = float(reward) - self._weight * float(np.mean(np.square(change)))
-        self._previous = np.array(action)
+        self._previous = given
         return observation, reward, *rest
 
 

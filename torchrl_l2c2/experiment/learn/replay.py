@@ -35,8 +35,9 @@ def make_replay(config: ExperimentConfig) -> TensorDictReplayBuffer:
         SettingError: If replay is prioritized, and TorchRL's compiled trees do not support the
             installed version of torch.
     """
-    # The last episode may exceed the rollout's frames.
-    longest = config.algorithm.frames + time_limit(config.task)
+    longest = config.algorithm.frames
+    if config.algorithm.num_envs is None:  # The last episode may exceed the rollout's frames.
+        longest += time_limit(config.task)
     buffer = make_buffer(config.replay, config.seed, longest, config.device)
     # A different seed from the sampler's: otherwise both would sample the same numbers, and a
     # transition's row would determine its neighbor.

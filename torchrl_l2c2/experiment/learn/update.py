@@ -184,7 +184,9 @@ class ReplayUpdate:
     def _rows(self) -> tuple[Tensor, Tensor | None]:
         """Returns rows from the buffer's sampler, and their importance weights if prioritized."""
         rows, info = self._sampler.sample(self._storage, self._batch_size)
-        return rows, info.get("priority_weight")
+        weight = info.get("priority_weight")
+        # TorchRL's weight of a single row has no dimension.
+        return rows, None if weight is None else weight.reshape(rows.shape)
 
     def example(self) -> TensorDictBase:
         """Returns a batch from the whole storage, without changing the run's random numbers."""

@@ -78,14 +78,17 @@ class Evaluation:
     measures: dict[str, list[float]] = field(default_factory=dict)
 
     def summary(self) -> dict[str, float | int]:
-        """Returns means and standard deviations over the episodes."""
+        """Returns means and standard deviations over the episodes.
+
+        The mean of a measure is over the episodes that are long enough for it, or else NaN.
+        """
         return {
             "episodes": len(self.returns),
             "return_mean": statistics.fmean(self.returns),
             "return_std": statistics.pstdev(self.returns),
             "action_variation_mean": statistics.fmean(self.action_variations),
             "action_variation_std": statistics.pstdev(self.action_variations),
-            **{f"{name}_mean": statistics.fmean(each) for name, each in self.measures.items()},
+            **{f"{name}_mean": _known_mean(each) for name, each in self.measures.items()},
         }
 
     def to_dict(self) -> dict[str, Any]:
@@ -203,6 +206,10 @@ def evaluate_task(
     # Seeding an environment also seeds the process.
     with ProcessState(seed, threads), closing(make_env(task.for_test(), seed)) as env:
         return evaluate_policy(policy, env, episodes, max_steps=time_limit(task), **options)
+
+
+def _known_mean(values: list[float]) -> float:
+    return statistics.fmean([v for v in values if not math.isnan(v)] or [math.nan])
 
 
 def _return(episode: TensorDictBase) -> float:

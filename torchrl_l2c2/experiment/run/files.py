@@ -185,7 +185,7 @@ def read_evaluation(run: str | Path) -> dict[str, Any]:
     """Reads a run's ``evaluation.json``.
 
     Raises:
-        ValueError: If a summary has other values than numbers, and as :func:`read_json`.
+        ValueError: If a summary has other values than finite numbers, and as :func:`read_json`.
     """
     path = Path(run) / "evaluation.json"
     evaluation = read_json(path)
@@ -193,10 +193,11 @@ def read_evaluation(run: str | Path) -> dict[str, Any]:
         summary = test.get("summary", {}) if isinstance(test, dict) else None
         # Unknown values are null.
         numbers = isinstance(summary, dict) and all(
-            value is None or isinstance(value, int | float) for value in summary.values()
+            value is None or (isinstance(value, int | float) and value not in (math.inf, -math.inf))
+            for value in summary.values()
         )
         if not numbers:
-            raise UserError(f"{path} must contain numbers, got {test!r:.40}: {REMEDY}")
+            raise UserError(f"{path} must contain finite numbers, got {test!r:.40}: {REMEDY}")
     if not isinstance(evaluation.get("training", {}), dict):
         raise UserError(f"{path} must contain an object 'training': {REMEDY}")
     return evaluation

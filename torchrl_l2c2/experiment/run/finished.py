@@ -309,8 +309,11 @@ def _check_numbers(path: Path, metrics: Sequence[dict[str, str]]) -> None:
     for line, row in enumerate(metrics, 2):
         for name, cell in row.items():
             try:
-                float(cell or "nan")
+                usable = not math.isinf(float(cell or "nan"))
             except ValueError:
+                usable = False
+            if not usable:
                 raise UserError(
-                    f"{path}, line {line}: {name} must be a number, got {cell!r:.40}: {REMEDY}"
-                ) from None
+                    f"{path}, line {line}: {name} must be a finite number, got {cell!r:.40}: "
+                    f"{REMEDY}"
+                )

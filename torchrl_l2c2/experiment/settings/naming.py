@@ -104,7 +104,16 @@ def plain(value: Any) -> str:
     return re.sub(r"[^A-Za-z0-9.+_-]+", "-", str(value)).rstrip(".")
 
 
+def unique(text: str) -> str:
+    """Formats a text for a file name of at most 64 characters, a different one for each text."""
+    written = plain(text)
+    return _hashed(written, text) if written != text else _short(text)
+
+
 def _short(part: str) -> str:
-    if len(part) <= MAX_PART_LENGTH:
-        return part
-    return f"{part[: MAX_PART_LENGTH - 9]}_{hashlib.sha256(part.encode()).hexdigest()[:8]}"
+    return part if len(part) <= MAX_PART_LENGTH else _hashed(part, part)
+
+
+def _hashed(written: str, text: str) -> str:
+    digest = hashlib.sha256(text.encode()).hexdigest()[:8]
+    return f"{written[: MAX_PART_LENGTH - 9]}_{digest}"

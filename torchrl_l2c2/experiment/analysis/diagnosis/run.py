@@ -41,6 +41,7 @@ from torchrl_l2c2.experiment.run.process import ProcessState
 from torchrl_l2c2.experiment.settings.config import ExperimentConfig
 from torchrl_l2c2.experiment.settings.regularizers import GainConfig
 from torchrl_l2c2.gains import gradient_shares
+from torchrl_l2c2.neighborhood import Neighborhood
 from torchrl_l2c2.objectives._networks import VALUE_NETWORKS, EvaluatedNetworks, is_ensemble
 
 # The film of the page. Without a graphics card, drawing takes most of the time.
@@ -58,6 +59,9 @@ def diagnose_run(
     with_pictures: bool = True,
 ) -> Diagnosis:
     """Diagnoses a run's policy, with its own neighborhood, value function and training.
+
+    With ``algorithm.normalize_observations``, the neighborhood is without ``max_step``, which is
+    in standard deviations then: the policy reads observations that are not normalized.
 
     Args:
         folder (str or Path): The run's folder, finished or not.
@@ -91,7 +95,7 @@ def diagnose_run(
             name=name or str(folder),
             episodes=episodes,
             max_steps=max_steps,
-            neighborhood=make_neighborhood(config.regularizer),
+            neighborhood=_neighborhood(config),
             value=None if agent is None else value_function(agent.loss, agent.normalization),
             noise_scale=noise or 0.01,
         )
@@ -134,6 +138,13 @@ def value_function(loss: LossModule, normalization: Normalization | None = None)
         return there.movedim(dim + 1, 0).flatten(1)
 
     return value
+
+
+def _neighborhood(config: ExperimentConfig) -> Neighborhood | None:
+    near = make_neighborhood(config.regularizer)
+    if near is not None and getattr(config.algorithm, "normalize_observations", False):
+        return replace(near, max_step=None)
+    return near
 
 
 def _trained(folder: Path, config: ExperimentConfig, env: EnvBase) -> Agent | None:

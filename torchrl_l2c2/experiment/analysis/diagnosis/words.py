@@ -188,7 +188,8 @@ def _reasons(diagnosis: Diagnosis) -> Iterator[Finding]:
                 f"{constants[step]:.3g}, {ratio:.0f} times its median of {median:.3g}."
             )
             yield Finding("steep", text)
-    if diagnosis.spread >= threshold("WIDE"):
+    # Without bounds, the range is only that of the played actions.
+    if diagnosis.bounded and diagnosis.spread >= threshold("WIDE"):
         text = (
             f"Its samples are wide: their standard deviation is {diagnosis.spread:.2f} of half the "
             "range; uniform samples have 0.58. Training explores with large steps even if the mean "

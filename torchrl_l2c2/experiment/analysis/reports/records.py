@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import io
+import os
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -38,7 +39,7 @@ class Found:
 
 
 def find_runs(folders: Iterable[str | Path], *, required: bool = False) -> Found:
-    """Reads every finished run below folders, at any depth.
+    """Reads every finished run below folders, at any depth, also behind symbolic links.
 
     If several runs have the same settings and seed, the most recent run is used.
 
@@ -57,10 +58,9 @@ def find_runs(folders: Iterable[str | Path], *, required: bool = False) -> Found
         raise FileNotFoundError(
             f"Expected a folder of runs, got {absent[0]!r}, which {found}. Check the path."
         )
-    below = {path.parent for folder in searched for path in folder.rglob("config.json")}
     unfinished, unreadable, repeated = [], [], []
     newest: dict[tuple[Any, ...], FinishedRun] = {}
-    for folder in sorted(below, key=_finished_at):
+    for folder in sorted(_run_folders(searched), key=_finished_at):
         if not (folder / "evaluation.json").exists():
             unfinished.append(str(folder))
             continue
@@ -183,6 +183,20 @@ def _place(record: Any) -> tuple[Any, ...]:
     setup = (len(others), others, unit, int(amount))
     method = (*method_order(record.method), len(own), own, record.settings)
     return (task, record.task, record.algorithm, *setup, *method, record.seed)
+
+
+def _run_folders(folders: Iterable[Path]) -> Iterator[Path]:
+    """Yields each folder with a ``config.json`` once; ``rglob`` does not follow links."""
+    walked = set()
+    for top in folders:
+        for place, inner, files in os.walk(top, followlinks=True):
+            real = os.path.realpath(place)
+            if real in walked:  # Links may form a loop.
+                inner.clear()
+                continue
+            walked.add(real)
+            if "config.json" in files:
+                yield Path(place)
 
 
 def _finished_at(folder: Path) -> tuple[float, str]:

@@ -15,7 +15,7 @@ from torchrl_l2c2.experiment.analysis.reports.records import find_runs, records_
 from torchrl_l2c2.experiment.analysis.reports.table import comparison_table, known_tests
 from torchrl_l2c2.experiment.run.files import make_folder, read_back, write_atomically
 from torchrl_l2c2.experiment.run.finished import QUANTITIES, FinishedRun
-from torchrl_l2c2.experiment.settings.naming import plain
+from torchrl_l2c2.experiment.settings.naming import unique
 
 
 def result_lines(run: FinishedRun) -> str:
@@ -84,18 +84,19 @@ def write_report(
     test = known_tests(groups)[0]
     table = comparison_table(test, groups)
     notes = [*notes, *settings_notes(groups)]
+    titles = {"plane.svg": "plane"}
     with TemporaryDirectory() as drawn:
         for task, algorithm in dict.fromkeys((run.task, run.algorithm) for run in runs):
             together = [run for run in runs if (run.task, run.algorithm) == (task, algorithm)]
-            name = f"learning_curves_{plain(task)}_{algorithm}.svg"
+            name = f"learning_curves_{unique(task)}_{algorithm}.svg"
+            titles[name] = f"learning curves {task}, {algorithm}"
             draw_learning_curves(together, Path(drawn) / name)
         tested = [group for group in groups if len(group.scores(test, "return"))]
         draw_plane(tested, test, Path(drawn) / "plane.svg")
         pictures = {path.name: path.read_bytes() for path in sorted(Path(drawn).iterdir())}
-    titles = {name: Path(name).stem.replace("_", " ") for name in pictures}
     shown = {titles[name]: data_uri(content) for name, content in pictures.items()}
     page = render("report.html", title="Runs", notes=notes, table=table, pictures=shown)
-    links = [f"![{title}]({name})" for name, title in titles.items()]
+    links = [f"![{titles[name]}]({name})" for name in pictures]
     text = "\n\n".join(["# Runs", *notes, table.markdown(), *links])
     folder = make_folder(folder)
     for name, content in pictures.items():
