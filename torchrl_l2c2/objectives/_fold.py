@@ -173,8 +173,8 @@ class TermWatch:
                 f"the gain of {type(loss).__name__} follows the progress of training, and "
                 f"set_progress was not called in {PATIENCE} updates: it stays at "
                 f"{loss.regularizer_gain.item():g}. Call "
-                "loss.set_progress(frames / total_frames) after every rollout, or "
-                "choose ramp=None.",
+                "loss.set_progress(frames / total_frames) before the updates on every rollout, "
+                "first with 0, or choose ramp=None.",
                 stacklevel=4,
             )
         stands = self._calls == STANDSTILL and self.progress_set and loss.strength > 0
@@ -182,7 +182,8 @@ class TermWatch:
             warnings.warn(
                 f"the penalty of {type(loss).__name__} was 0 until now, because the progress of "
                 f"training is still 0 after {STANDSTILL} updates. Call "
-                "loss.set_progress(frames / total_frames) after every rollout, with / and not //.",
+                "loss.set_progress(frames / total_frames) before the updates on every rollout, "
+                "with / and not //.",
                 stacklevel=4,
             )
 

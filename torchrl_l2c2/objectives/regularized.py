@@ -342,8 +342,8 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
     def set_progress(self, progress: float) -> None:
         """Sets the progress of training, which sets the gain of a :meth:`ramp`.
 
-        Call it before the updates on every rollout or episode. It has no effect on a loss without a ramp. It works
-        between calls of a compiled loss. The ``state_dict`` contains the progress.
+        Call it before the updates on every rollout or episode. It has no effect on a loss without a
+        ramp. It works between calls of a compiled loss. The ``state_dict`` contains the progress.
 
         Args:
             progress (float): completed share of training, from 0 to 1. Values from 1 to 2 count as
