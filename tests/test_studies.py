@@ -663,12 +663,12 @@ class TestProse:
         shares = (ours / baseline)["last_mean_action_variation"]
         smoother = shares[["Ant-v5", "BipedalWalker-v3", "HalfCheetah-v5"]]
         assert f"{100 * smoother.min():.0f} to {smoother.max():.0%} of the baseline's" in page
-        assert 1 < shares["Reacher-v5"] < 1.1
+        assert 0.95 < shares["Reacher-v5"] < 1.05
         returns = {name: side["last_mean_return"] for name, side in (("l", ours), ("b", baseline))}
         gained = (returns["l"] - returns["b"]) / returns["b"].abs()
-        assert set(gained[gained < 0].index) == {"HalfCheetah-v5", "Reacher-v5"}
+        assert set(gained[gained < -0.01].index) == {"HalfCheetah-v5"}
+        assert set(gained[gained > 0.01].index) == {"Ant-v5", "BipedalWalker-v3", "Swimmer-v5"}
         assert f"on HalfCheetah ({gained['HalfCheetah-v5']:.0%})" in page
-        assert f"Reacher ({gained['Reacher-v5']:.0%})" in page
         ant = [returns[side]["Ant-v5"] for side in "bl"]
         assert f"return {ant[0]:.0f} on average, and with L2C2 {ant[1]:.0f}" in page
         swimmer = records("new_tasks").query("task == 'Swimmer-v5'").set_index(["method", "seed"])
