@@ -188,7 +188,7 @@ def _reasons(diagnosis: Diagnosis) -> Iterator[Finding]:
                 f"{constants[step]:.3g}, {ratio:.0f} times its median of {median:.3g}."
             )
             yield Finding("steep", text)
-    # Without bounds, the range is only that of the played actions.
+    # Without bounds, the range is only the span of the played actions.
     if diagnosis.bounded and diagnosis.spread >= threshold("WIDE"):
         text = (
             f"Its samples are wide: their standard deviation is {diagnosis.spread:.2f} of half the "
