@@ -20,16 +20,6 @@ from torchrl_l2c2.experiment.settings.optimizers import OptimizerConfig
 from torchrl_l2c2.experiment.settings.regularizers import RegularizerConfig
 
 
-def _target_entropy(config: SACConfig, env: EnvBase) -> float | str:
-    if config.target_entropy is None:
-        return "auto"
-    if config.target_entropy != "scaled":
-        return config.target_entropy
-    space = env.action_spec.space
-    half_range = (space.high - space.low) / 2
-    return float(half_range.log().sum()) - half_range.numel()
-
-
 def make_sac(
     config: SACConfig, env: EnvBase, regularizer: RegularizerConfig, optimizer: OptimizerConfig
 ) -> Agent:
@@ -56,3 +46,13 @@ def make_sac(
         target_updater=SoftUpdate(loss, tau=config.tau),
         policy_terms=frozenset({"loss_actor"}),
     )
+
+
+def _target_entropy(config: SACConfig, env: EnvBase) -> float | str:
+    if config.target_entropy is None:
+        return "auto"
+    if config.target_entropy != "scaled":
+        return config.target_entropy
+    space = env.action_spec.space
+    half_range = (space.high - space.low) / 2
+    return float(half_range.log().sum()) - half_range.numel()

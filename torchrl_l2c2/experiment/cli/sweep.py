@@ -321,16 +321,9 @@ def list_jobs(overrides: Sequence[str], params: Mapping[str, str]) -> list[dict[
 
 
 def list_jobs_to_check(overrides: Sequence[str], params: Mapping[str, str]) -> list[dict[str, str]]:
-    """Returns the first job of a sweep, and one further job for each further value of a setting.
+    """Returns the first job of :func:`list_jobs`, and one more for each further value of a setting.
 
     A range counts with its first and its last value.
-
-    Args:
-        overrides (sequence of str): Overrides of the command, which replace ``params``.
-        params (Mapping): Sweeps in the configuration, by setting.
-
-    Raises:
-        HydraException: If a sweep has no list of values, as a glob or an interval.
 
     Examples:
         >>> jobs = list_jobs_to_check(["seed=range(0,18)", "beta=1,2,-3"], {})
