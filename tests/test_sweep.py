@@ -13,8 +13,8 @@ import pytest
 from omegaconf import OmegaConf
 from processes import start_train
 
+from torchrl_l2c2.experiment.cli.arguments import check_launcher, check_one_value, check_sweep
 from torchrl_l2c2.experiment.cli.sweep import ShareSweep, Sweep, begin_sweep
-from torchrl_l2c2.experiment.cli.train import check_launcher, check_one_value, check_sweep
 from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.run.checkpoints import list_checkpoints, load_checkpoint
 from torchrl_l2c2.experiment.settings.fields import SettingError
@@ -188,7 +188,7 @@ def test_a_process_that_waits_for_a_job_ends_with_its_sweep(tmp_path):
 @pytest.mark.parametrize("name", ["ray", "slurm"])
 def test_a_launcher_says_what_it_needs(name, monkeypatch):
     """Where its plugin is not installed."""
-    monkeypatch.setattr("torchrl_l2c2.experiment.cli.train.find_spec", lambda plugin: None)
+    monkeypatch.setattr("torchrl_l2c2.experiment.cli.arguments.find_spec", lambda plugin: None)
     with pytest.raises(SystemExit, match=rf"{name}_cluster needs the extra {name}: pip install"):
         check_launcher(["train.py", "-m", f"hydra/launcher={name}_cluster"])
     check_launcher(["train.py", "-m", "hydra/launcher=joblib"])

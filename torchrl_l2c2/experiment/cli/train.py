@@ -11,44 +11,43 @@ import signal
 import sys
 import traceback
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import hydra
-from hydra import compose
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException
-from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
+from torchrl_l2c2.experiment.cli.arguments import (
+    check_launcher,
+    check_one_value,
+    check_sweep,
+    check_task_and_logger,
+    error_line,
+    is_multirun,
+)
 from torchrl_l2c2.experiment.cli.composition import (
     CONF,
     composition_errors,
     describe_preset,
-    one_line_message,
     read,
     register,
     show_sweep_hint,
 )
 from torchrl_l2c2.experiment.cli.manual import manual
-from torchrl_l2c2.experiment.cli.sweep import Sweep, begin_sweep, list_jobs, list_jobs_to_check
+from torchrl_l2c2.experiment.cli.sweep import Sweep, begin_sweep
 from torchrl_l2c2.experiment.errors import (
     UserError,
     allow_closed_output,
-    is_lack_of_memory,
     is_one_line_error,
     show_cause,
     warnings_as_lines,
 )
 from torchrl_l2c2.experiment.run.files import make_folder
-from torchrl_l2c2.experiment.run.metrics_log import check_installed
 from torchrl_l2c2.experiment.run.progress import log, show_and_log
 from torchrl_l2c2.experiment.run.signals import (
     Interrupted,
@@ -57,79 +56,12 @@ from torchrl_l2c2.experiment.run.signals import (
     terminate,
 )
 from torchrl_l2c2.experiment.settings.config import ExperimentConfig
-from torchrl_l2c2.experiment.settings.fields import SettingError
 
 if TYPE_CHECKING:
     from torchrl_l2c2.experiment.run.finished import FinishedRun
 
 # Maximum time for which a file server holds the lock of a crashed machine.
 LOST_SECONDS = 180.0
-# Launchers in conf/hydra/launcher/: plugin, and the extra that installs it.
-LAUNCHERS = {
-    "ray_cluster": ("hydra_plugins.hydra_ray_launcher", "ray"),
-    "slurm_cluster": ("hydra_plugins.hydra_submitit_launcher", "slurm"),
-}
-
-MEMORY_SETTINGS = (
-    "algorithm.hidden, replay.capacity, replay.batch_size, algorithm.frames, task.max_steps or "
-    "threads"
-)
-
-
-def check_launcher(arguments: Sequence[str]) -> None:
-    """Checks that a launcher's extra is installed, before Hydra fails to load the launcher.
-
-    Raises:
-        SystemExit: If the extra is missing, with the command that installs it.
-    """
-    for name, (plugin, extra) in LAUNCHERS.items():
-        if f"hydra/launcher={name}" in arguments and find_spec(plugin) is None:
-            needed = f"pip install 'torchrl-l2c2[{extra}]'"
-            sys.exit(f"error: hydra/launcher={name} needs the extra {extra}: {needed}.")
-
-
-def check_sweep(arguments: Sequence[str]) -> None:
-    """Checks that a sweep has jobs, only one comparison, and no interval.
-
-    Raises:
-        SystemExit: If not, with the reason.
-    """
-    try:
-        for comparison in OverridesParser.create().parse_overrides(
-            [each for each in arguments if each.lstrip("+").startswith("experiment=")]
-        ):
-            if comparison.is_sweep_override() or isinstance(comparison.value(), list):
-                sys.exit(
-                    f"error: {comparison.input_line}: each comparison has its own seeds and "
-                    "launcher, which a sweep over comparisons would ignore. Run one command per "
-                    "comparison."
-                )
-        empty = not list_jobs(arguments, {})
-    except HydraException as error:  # Hydra reports other errors itself, and resolves globs.
-        if "INTERVAL" in str(error):
-            sys.exit("error: sweeps do not support intervals: use examples/search.py.")
-        return
-    if empty:
-        sys.exit(f"error: the sweep has no jobs: one of {' '.join(arguments)} has no value.")
-
-
-def check_one_value(arguments: Sequence[str]) -> None:
-    """Checks that no setting of a single run has several values.
-
-    Raises:
-        SystemExit: If one has, with the option that runs all of them.
-    """
-    try:
-        parsed = OverridesParser.create().parse_overrides(
-            [each for each in arguments if not each.startswith("-")]
-        )
-    except HydraException:  # Hydra reports it.
-        return
-    if several := [str(each.input_line) for each in parsed if each.is_sweep_override()]:
-        sys.exit(
-            f"error: {' '.join(several)}: one run has one value of each setting. Add -m to train "
-            "one run for each value."
-        )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -152,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if "" not in sys.path:  # As with python -m: the folder may have modules with tasks.
         sys.path.append(os.getcwd())
     register()
-    if not any(map(_is_multirun, sys.argv[1:])):
+    if not any(map(is_multirun, sys.argv[1:])):
         check_one_value(sys.argv[1:])
         try:
             with composition_errors(), allow_closed_output():
@@ -174,12 +106,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         stopped_by, failures = sweep.stopped_by, sweep.failures
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # Nothing is left to save.
     sys.exit(bool(failures) if stopped_by is None else 128 + stopped_by)
-
-
-def _is_multirun(argument: str) -> bool:
-    """Checks for Hydra's option ``--multirun``, which may be abbreviated."""
-    abbreviated = argument.startswith("--m") and "--multirun".startswith(argument)
-    return abbreviated or argument in ("-m", "hydra.mode=MULTIRUN")
 
 
 def show_sweep_end(sweep: Sweep) -> None:
@@ -210,44 +136,6 @@ def _main(values: DictConfig) -> None:
     except Exception as error:
         _print_error(error)
         sys.exit(1)
-
-
-class CheckSweep(Callback):
-    """Hydra callback that checks a sweep's values before its first run, one job for each value."""
-
-    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        """Composes and checks the jobs.
-
-        Raises:
-            SystemExit: If a value is wrong, after a line for each. Hydra would swallow other
-                errors.
-        """
-        overrides = [*config.hydra.overrides.hydra, *config.hydra.overrides.task]
-        try:
-            jobs = list_jobs_to_check(overrides, config.hydra.sweeper.params or {})
-        except HydraException:  # A glob: only Hydra knows its values.
-            return
-        wrong = [message for job in jobs if (message := _check_job(overrides, job))]
-        for message in dict.fromkeys(wrong):
-            print(f"error: {message}", file=sys.stderr)
-        if wrong:
-            sys.exit(1)
-
-
-def _check_job(overrides: Sequence[str], job: Mapping[str, str]) -> str | None:
-    """Returns the error in the settings of a sweep's job, or ``None``."""
-    common = [each for each in overrides if each.partition("=")[0] not in job]
-    swept = [f"{name}={value}" for name, value in job.items()]
-    try:
-        composed = compose("config", [*common, *swept], return_hydra_config=True)
-        own = OmegaConf.masked_copy(composed, [str(name) for name in composed if name != "hydra"])
-        values: Any = OmegaConf.to_container(own, resolve=True)
-        check_task_and_logger(*read(values, composed.hydra))
-    except UserError as error:
-        return _error_line(error)
-    except (HydraException, OmegaConfBaseException) as error:
-        return one_line_message(error)
-    return None
 
 
 def _run_job(values: dict[str, Any], sweep: Sweep) -> None:
@@ -295,35 +183,9 @@ def _print_error(error: Exception) -> str:
         traceback.print_exception(error)
         return "".join(traceback.format_exception_only(error)).strip()
     show_cause(error)
-    message = _error_line(error)
+    message = error_line(error)
     print(f"error: {message}", file=sys.stderr)
     return message
-
-
-def _error_line(error: Exception) -> str:
-    message = str(error) or type(error).__name__
-    if isinstance(error, SettingError):
-        return f"{message} --help lists every setting."
-    if is_lack_of_memory(error):
-        return f"{message.rstrip('.')}. Not enough memory: decrease {MEMORY_SETTINGS}."
-    return message
-
-
-def check_task_and_logger(config: ExperimentConfig, folder: Path) -> None:
-    """Checks that the task and the logger of an unfinished run are installed.
-
-    Args:
-        config (ExperimentConfig): Settings of the run.
-        folder (Path): Run folder.
-
-    Raises:
-        UserError: If Gymnasium does not know the task, or the logger's package is missing.
-    """
-    from torchrl_l2c2.experiment.envs.spaces import check_env_id  # Takes a second to import.
-
-    if not (folder / "evaluation.json").exists():
-        check_installed(config.logger.name)
-        check_env_id(config.task.env_id)
 
 
 def run(
