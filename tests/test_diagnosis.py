@@ -602,6 +602,21 @@ class TestCommand:
         other = folder("sigma-2/seed_0", regularizer=replace(tuned, sigma=2.0))
         assert run_names([first, other]) == ["0ddc7233/seed_0", "sigma-2/seed_0"]
 
+    def test_baselines_come_first_also_behind_links(self, run, tmp_path):
+        """By their settings: the folder's name says nothing, and one config is damaged."""
+        chosen = {"c": NoRegularizerConfig(), "a": NoRegularizerConfig(), "b": L2C2Config()}
+        for name, regularizer in chosen.items():
+            path = tmp_path / "elsewhere" / name / "config.json"
+            make_parent_folder(path)
+            write_json(path, ExperimentConfig(regularizer=regularizer).to_dict())
+        (tmp_path / "elsewhere" / "none").mkdir()
+        (tmp_path / "elsewhere" / "none" / "config.json").touch()
+        above = tmp_path / "above"
+        above.mkdir()
+        (above / "link").symlink_to(tmp_path / "elsewhere")
+        sorted_below = [str(above / "link" / name) for name in ("a", "c", "b", "none")]
+        assert run_folders([str(above), str(run)]) == [*sorted_below, str(run)]
+
     def test_ctrl_c_is_one_line(self, run, monkeypatch, capsys):
         """Of every command that tells its errors so."""
 
@@ -627,15 +642,11 @@ class TestCommand:
             assert message in capsys.readouterr().err
         with pytest.raises(SystemExit, match=r"^error: '.*' is not a run folder"):
             main([str(tmp_path)])
-        for name in ("a", "none/seed_1", "none/seed_0"):
-            (tmp_path / "above" / name).mkdir(parents=True)
+        for name in ("a", "b"):
+            make_parent_folder(tmp_path / "above" / name / "config.json")
             (tmp_path / "above" / name / "config.json").touch()
-        assert run_folders([str(tmp_path / "above"), str(run)]) == [
-            *(str(tmp_path / "above" / name) for name in ("none/seed_0", "none/seed_1", "a")),
-            str(run),
-        ]
         with pytest.raises(SystemExit):
             main([str(tmp_path / "above"), "--names", "one"])
-        assert "--names must have 3 names, one per run" in capsys.readouterr().err
+        assert "--names must have 2 names, one per run" in capsys.readouterr().err
         with pytest.raises(SystemExit, match=r"^error: Expected each run once"):
             main([str(run), str(run)])

@@ -259,6 +259,7 @@ def test_the_ends_of_an_episode_need_not_be_booleans(monkeypatch, name, settings
     for key in ("done", "terminated"):
         assert stored[key].dtype == torch.bool and stored[key].all(), key
     assert run.test(1).lengths == [1]
+    assert len(make_env(task(max_steps=3), 0).rollout(3)) == 1  # as for diagnose
 
 
 @pytest.mark.parametrize(

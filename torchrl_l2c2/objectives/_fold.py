@@ -241,8 +241,9 @@ class TermWatch:
             if not bool(counts.any()):
                 self._warned.add("counts")
                 warnings.warn(
-                    f"all transitions of the batch are longer than max_step={max_step:g}, so the "
-                    f"penalty of {name} is 0: raise max_step, or choose max_step=None.",
+                    f"all transitions of the batch are longer than max_step={max_step:g} or not "
+                    f"finite, so the penalty of {name} is 0: raise max_step, or choose "
+                    "max_step=None.",
                     stacklevel=5,
                 )
         elif not bool(counts.all()):

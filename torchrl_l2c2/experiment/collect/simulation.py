@@ -82,9 +82,7 @@ class Simulation:
             outputs[PREVIOUS] = self.frames[-1].observation if self.frames else before
         seen, reward, terminated, truncated, _ = self._gymnasium.step(action)
         after = self._observe(seen)
-        # Integers would stay integers in the replay buffer, where ~0 is -1.
-        ends = bool(terminated), bool(truncated)
-        frame = Frame(before, outputs, after, reward_to_float(reward), *ends)
+        frame = Frame(before, outputs, after, reward_to_float(reward), terminated, truncated)
         self.next_observation = None if frame.done else after
         self.frames.append(frame)
         return frame

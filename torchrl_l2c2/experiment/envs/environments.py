@@ -75,7 +75,7 @@ def make_env(task: TaskConfig, seed: int, *, render: Drawing | None = None) -> E
             or its observations or actions are not vectors of numbers.
         SimulatorError: If the environment raises an error when it is created or reset.
     """
-    simulator = with_vector_action(_make(task, render))
+    simulator = with_vector_action(BooleanEnds(_make(task, render)))
     simulator = with_vector_observation(simulator, flatten=task.flatten)
     if task.action_rate:
         simulator = ActionRatePenalty(simulator, task.action_rate)
@@ -96,6 +96,17 @@ def make_env(task: TaskConfig, seed: int, *, render: Drawing | None = None) -> E
         return env
     generator = torch.Generator().manual_seed(seed + NOISE_SEED)
     return TransformedEnv(env, ObservationNoise(task.noise_scale, generator=generator))
+
+
+class BooleanEnds(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Converts ``terminated`` and ``truncated`` to booleans, from integers, arrays or ``None``.
+
+    Integers would stay integers in the replay buffer, where ``~0`` is -1.
+    """
+
+    def step(self, action: Any) -> Any:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, reward, bool(terminated), bool(truncated), info
 
 
 class ActionRatePenalty(gymnasium.Wrapper[Any, Any, Any, Any]):

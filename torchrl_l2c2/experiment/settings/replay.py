@@ -55,7 +55,9 @@ class RolloutReplayConfig:
     """Frames of one rollout, each used once per epoch, for on-policy learning."""
 
     name: str = "rollout"
-    batch_size: int = Field(default=64, ge=1, description="transitions per update")
+    batch_size: int = Field(
+        default=64, ge=1, description="transitions per update; at most a whole rollout"
+    )
 
 
 ReplayConfig = PrioritizedReplayConfig | UniformReplayConfig | RolloutReplayConfig

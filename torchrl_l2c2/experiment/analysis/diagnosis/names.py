@@ -7,23 +7,26 @@ from collections.abc import Iterable, Sequence
 from itertools import compress
 from pathlib import Path
 
-from torchrl_l2c2.experiment.analysis.reports.names import name_with_settings
+from torchrl_l2c2.experiment.analysis.reports.names import method_name, name_with_settings
+from torchrl_l2c2.experiment.analysis.reports.records import walk_runs
 from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.run.files import read_config
 from torchrl_l2c2.experiment.settings.identity import differences
 
 
 def run_folders(folders: Iterable[str]) -> list[str]:
-    """Finds the runs at or below folders, baselines first; a folder without any stays.
+    """Finds the runs at or below folders, baselines first; a folder without runs stays.
 
-    A diagnosis compares the other runs with the first.
+    A diagnosis compares the first run with the others.
     """
-    below = [
-        sorted(Path(folder).rglob("config.json"), key=lambda path: ("none" not in path.parts, path))
-        or [Path(folder, "_")]
-        for folder in folders
-    ]
-    return [str(path.parent) for paths in below for path in paths]
+    below = [sorted(walk_runs([folder]), key=_place) or [Path(folder)] for folder in folders]
+    return [str(run) for runs in below for run in runs]
+
+
+def _place(folder: Path) -> tuple[bool, Path]:
+    """Sort key of runs below the same folder."""
+    described = _description(folder)
+    return described is None or described[2] != method_name("none"), folder
 
 
 def run_names(folders: Sequence[str]) -> list[str]:

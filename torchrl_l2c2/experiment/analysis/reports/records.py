@@ -60,7 +60,7 @@ def find_runs(folders: Iterable[str | Path], *, required: bool = False) -> Found
         )
     unfinished, unreadable, repeated = [], [], []
     newest: dict[tuple[Any, ...], FinishedRun] = {}
-    for folder in sorted(_run_folders(searched), key=_finished_at):
+    for folder in sorted(walk_runs(searched), key=_finished_at):
         if not (folder / "evaluation.json").exists():
             unfinished.append(str(folder))
             continue
@@ -90,6 +90,20 @@ def find_runs(folders: Iterable[str | Path], *, required: bool = False) -> Found
         text = f"Expected finished runs (evaluation.json) below {places}, got none."
         raise FileNotFoundError(" ".join([text, *notes, "Name an output folder of train.py."]))
     return Found(runs, notes)
+
+
+def walk_runs(folders: Iterable[str | Path]) -> Iterator[Path]:
+    """Yields each folder of a run once, finished or not, also behind symbolic links."""
+    walked = set()
+    for top in folders:
+        for place, inner, files in os.walk(top, followlinks=True):
+            real = os.path.realpath(place)
+            if real in walked:  # Links may form a loop.
+                inner.clear()
+                continue
+            walked.add(real)
+            if "config.json" in files:
+                yield Path(place)
 
 
 def read_runs(folder: str | Path) -> list[FinishedRun]:
@@ -183,20 +197,6 @@ def _place(record: Any) -> tuple[Any, ...]:
     setup = (len(others), others, unit, int(amount))
     method = (*method_order(record.method), len(own), own, record.settings)
     return (task, record.task, record.algorithm, *setup, *method, record.seed)
-
-
-def _run_folders(folders: Iterable[Path]) -> Iterator[Path]:
-    """Yields each folder with a ``config.json`` once; ``rglob`` does not follow links."""
-    walked = set()
-    for top in folders:
-        for place, inner, files in os.walk(top, followlinks=True):
-            real = os.path.realpath(place)
-            if real in walked:  # Links may form a loop.
-                inner.clear()
-                continue
-            walked.add(real)
-            if "config.json" in files:
-                yield Path(place)
 
 
 def _finished_at(folder: Path) -> tuple[float, str]:
