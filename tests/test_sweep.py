@@ -250,10 +250,11 @@ def test_a_sweep_whose_outputs_cannot_be_written_to_says_so_in_a_line(tmp_path):
     assert Sweep(tmp_path / "file" / "sweep", ("", 0), ()).stopped_by == signal.SIGTERM
 
 
-def test_a_sweep_says_how_much_of_it_is_left():
+@pytest.mark.parametrize("task", ["task", "task.env_id"])
+def test_a_sweep_says_how_much_of_it_is_left(task):
     """By each task's mean of what is finished, and the tasks' mean for one of which none is."""
     with begin_sweep(["-m", "seed=0,1,2", "~logger"]) as begun:
-        params = {"seed": "range(0,18)", "task": "a,b,c", "regularizer": "none,caps"}
+        params = {"seed": "range(0,18)", task: "a,b,c", "regularizer": "none,caps"}
         assert begun.status(1, params) == "run 1 of 18"
         # Of a 30 minutes and 50, of b 20; then c takes 30, and five of each are 7.5 hours.
         for number, seconds in enumerate((1800.0, 3000.0, 1200.0, float("nan"))):

@@ -190,17 +190,18 @@ class Sweep:
             params (Mapping): Sweeps in the configuration, by setting.
         """
         try:
-            tasks = [job.get("task") for job in list_jobs(self.overrides, params)]
+            jobs = list_jobs(self.overrides, params)
         except HydraException:  # A glob: only Hydra knows the number of jobs.
             return f"run {number}"
-        seconds: dict[str | None, list[float]] = defaultdict(list)
+        # Durations differ between tasks; tasks without a finished run count with the mean.
+        tasks = [(job.get("task"), job.get("task.env_id")) for job in jobs]
+        seconds: dict[tuple[str | None, ...], list[float]] = defaultdict(list)
         for finished, (_, each) in self._all("finished"):
             if math.isfinite(each):
                 seconds[tasks[finished]].append(each)
-        place = f"run {number} of {len(tasks)}"
+        place = f"run {number} of {len(jobs)}"
         if not seconds:
             return place
-        # Durations differ between tasks; tasks without a finished run count with the mean.
         of_task = {task: statistics.fmean(each) for task, each in seconds.items()}
         mean = statistics.fmean(of_task.values())
         left = sum(of_task.get(task, mean) for task in tasks[number - 1 :])
