@@ -212,3 +212,15 @@ def test_a_command_names_the_packages_that_are_missing(monkeypatch):
     monkeypatch.setattr("torchrl_l2c2.experiment.cli.main.find_spec", lambda name: None)
     with pytest.raises(SystemExit, match=r"error: evaluate needs the packages gymnasium, hydra"):
         main(["evaluate", "anywhere"])
+
+
+def test_ctrl_c_while_a_command_is_imported_is_one_line(monkeypatch, capsys):
+    """Its packages take a second."""
+
+    def stopped(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("torchrl_l2c2.experiment.cli.main.import_module", stopped)
+    with pytest.raises(SystemExit) as ended:
+        main(["train"])
+    assert ended.value.code == 130 and capsys.readouterr().err == "interrupted.\n"

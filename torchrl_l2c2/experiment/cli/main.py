@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -52,5 +53,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             f"error: {name} needs the packages {', '.join(missing)}. In a clone of the repository, "
             'run: pip install -e ".[experiment]"'
         )
-    command = import_module(f"torchrl_l2c2.experiment.cli.{COMMANDS[name][0]}")
+    try:
+        command = import_module(f"torchrl_l2c2.experiment.cli.{COMMANDS[name][0]}")
+    except KeyboardInterrupt:  # Imports take a second.
+        print("interrupted.", file=sys.stderr)
+        sys.exit(128 + signal.SIGINT)
     command.main(rest)
