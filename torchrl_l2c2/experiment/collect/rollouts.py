@@ -141,5 +141,5 @@ class RolloutCollector:
                 simulation.env.close()
 
     def _to_action(self, action: Tensor) -> np.ndarray:
-        clipped: np.ndarray = np.clip(action.numpy(), self._low, self._high)
+        clipped: np.ndarray = action.numpy().clip(self._low, self._high)
         return clipped

@@ -103,7 +103,13 @@ class _Program:
 
 
 def _split(tree: Any) -> tuple[list[Tensor], list[Any], Any]:
-    """Splits nested values into tensors, all values without tensors, and the nesting."""
+    """Splits nested values into tensors, all values without tensors, and the nesting.
+
+    The nesting of a tuple of tensors is its length: ``tree_flatten`` takes longer than the kernels
+    of a small policy.
+    """
+    if type(tree) is tuple and all(isinstance(leaf, Tensor) for leaf in tree):
+        return list(tree), [Tensor] * len(tree), len(tree)
     leaves, spec = tree_flatten(tree)
     tensors = [leaf for leaf in leaves if isinstance(leaf, Tensor)]
     return tensors, [Tensor if isinstance(leaf, Tensor) else leaf for leaf in leaves], spec
@@ -111,6 +117,8 @@ def _split(tree: Any) -> tuple[list[Tensor], list[Any], Any]:
 
 def _join(tensors: Iterable[Tensor], rest: list[Any], spec: Any) -> Any:
     """Rebuilds the nested values of :func:`_split`."""
+    if isinstance(spec, int):
+        return tuple(tensors)
     given = iter(tensors)
     return tree_unflatten([next(given) if leaf is Tensor else leaf for leaf in rest], spec)
 
