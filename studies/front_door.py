@@ -42,12 +42,14 @@ METHODS = ("baseline", "smooth")
 COLUMNS = ["algorithm", "method", "seed", "return", "action_variation", "seconds", "commit"]
 
 
-def train_sac(seed: int, strength: float | None, frames: int = 5_000) -> torch.nn.Module:
+def train_sac(
+    seed: int, strength: float | None, gamma: float = 0.95, frames: int = 5_000
+) -> torch.nn.Module:
     """SAC, an update every other frame, on losses that are summed by name."""
     env = pendulum(seed)
     actor, qvalue = make_actor(3, env.action_spec, hidden=(64, 64)), make_qvalue()
     loss: LossModule = SACLoss(actor, qvalue, action_spec=env.action_spec)
-    loss.make_value_estimator(gamma=0.95)
+    loss.make_value_estimator(gamma=gamma)
     if strength is not None:
         loss = smooth(loss, strength=strength)
     updater = SoftUpdate(loss, tau=0.01)
@@ -70,7 +72,9 @@ def train_sac(seed: int, strength: float | None, frames: int = 5_000) -> torch.n
     return actor
 
 
-def train_td3(seed: int, strength: float | None, frames: int = 5_000) -> torch.nn.Module:
+def train_td3(
+    seed: int, strength: float | None, gamma: float = 0.95, frames: int = 5_000
+) -> torch.nn.Module:
     """TD3, which calls the parts of the loss by themselves."""
     env = pendulum(seed)
     network = MLP(in_features=3, out_features=1, num_cells=[64, 64])
@@ -78,7 +82,7 @@ def train_td3(seed: int, strength: float | None, frames: int = 5_000) -> torch.n
     actor = TensorDictSequential(Actor(network, out_keys=["action"]), squash)
     noise = AdditiveGaussianModule(env.action_spec, sigma_init=0.2, sigma_end=0.2)
     loss: LossModule = TD3Loss(actor, make_qvalue(), action_spec=env.action_spec)
-    loss.make_value_estimator(gamma=0.95)
+    loss.make_value_estimator(gamma=gamma)
     if strength is not None:
         loss = smooth(loss, strength=strength)
     updater = SoftUpdate(loss, tau=0.01)
@@ -112,12 +116,14 @@ def train_td3(seed: int, strength: float | None, frames: int = 5_000) -> torch.n
     return actor
 
 
-def train_ppo(seed: int, strength: float | None, frames: int = 30_720) -> torch.nn.Module:
+def train_ppo(
+    seed: int, strength: float | None, gamma: float = 0.9, frames: int = 30_720
+) -> torch.nn.Module:
     """PPO on rollouts of 2,048 frames, with rewards of about 1."""
     env = TransformedEnv(pendulum(seed), RewardScaling(loc=0.0, scale=0.1))
     actor, critic = make_actor(3, env.action_spec, hidden=(64, 64)), make_critic(3, hidden=(64, 64))
     loss: LossModule = ClipPPOLoss(actor, critic, normalize_advantage=True, entropy_coeff=0.0)
-    advantage = GAE(gamma=0.9, lmbda=0.95, value_network=critic)
+    advantage = GAE(gamma=gamma, lmbda=0.95, value_network=critic)
     if strength is not None:
         loss = smooth(loss, strength=strength)
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
@@ -202,6 +208,25 @@ def table(path: Path, algorithms: Iterable[str] = ALGORITHMS) -> str:
     return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
 
+def strengths_table(path: Path) -> str:
+    """Return and action variation of each run, and their means, by strength."""
+    with path.open(newline="") as file:
+        runs = list(csv.DictReader(file))
+    rows = [["strength", "return by seed", "action variation by seed", "mean return"]]
+    rows[0].append("mean action variation")
+    rows.append(["---"] * 5)
+    for method in dict.fromkeys(run["method"] for run in runs):
+        name = {"baseline": "0 (baseline)", "smooth": "1"}.get(method, method.split()[-1])
+        ours = [run for run in runs if run["method"] == method]
+        cells, means = [], []
+        for quantity, digits in (("return", 0), ("action_variation", 3)):
+            scores = [float(run[quantity]) for run in ours]
+            cells.append(", ".join(f"{score:.{digits}f}" for score in scores))
+            means.append(f"{np.mean(scores):.{max(1, digits)}f}")
+        rows.append([name, *cells, *means])
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Makes the runs that the file lacks."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -209,13 +234,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--algorithms", nargs="+", choices=ALGORITHMS, default=list(ALGORITHMS))
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
     parser.add_argument("--strengths", nargs="+", type=float, default=[1.0])
+    parser.add_argument("--gamma", type=float, help="discount factor (default: 0.95, PPO 0.9)")
     chosen = parser.parse_args(arguments)
     methods = {"baseline": None}
     methods |= {"smooth" if each == 1.0 else f"smooth {each:g}": each for each in chosen.strengths}
+    options = {} if chosen.gamma is None else {"gamma": chosen.gamma}
     add_runs(
         chosen.file,
         product(chosen.seeds, chosen.algorithms, methods),
-        lambda seed, algorithm, method: evaluate(ALGORITHMS[algorithm](seed, methods[method])),
+        lambda seed, algorithm, method: evaluate(
+            ALGORITHMS[algorithm](seed, methods[method], **options)
+        ),
     )
 
 

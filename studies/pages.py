@@ -134,7 +134,10 @@ def pages() -> dict[str, Page]:
         "results/reacher_3000.md": Page({"results": paper_table(short).markdown()}),
         "results/parts.md": Page({"parts": parts()}),
         "results/front_door.md": Page(
-            {"results": front_door.table(ROOT / "results" / "front_door.csv")}
+            {
+                "results": front_door.table(ROOT / "results" / "front_door.csv"),
+                "strengths": front_door.strengths_table(ROOT / "results" / "td3_strength.csv"),
+            }
         ),
         "results/rsl_rl.md": Page({"results": front_door.table(RSL_RL, [rsl_rl.TASK])}),
         "results/td3.md": Page({"test": td3_test(), "choice": td3_choice()}),
