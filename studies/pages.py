@@ -136,6 +136,9 @@ def pages() -> dict[str, Page]:
         "results/front_door.md": Page(
             {
                 "results": front_door.table(ROOT / "results" / "front_door.csv"),
+                "gamma": front_door.table(
+                    ROOT / "results" / "front_door_gamma.csv", ["TD3", "SAC"]
+                ),
                 "strengths": front_door.strengths_table(ROOT / "results" / "td3_strength.csv"),
             }
         ),
