@@ -668,7 +668,13 @@ class TestProse:
         gained = (returns["l"] - returns["b"]) / returns["b"].abs()
         assert set(gained[gained < -0.01].index) == {"HalfCheetah-v5"}
         assert set(gained[gained > 0.01].index) == {"Ant-v5", "BipedalWalker-v3", "Swimmer-v5"}
-        assert f"on HalfCheetah ({gained['HalfCheetah-v5']:.0%})" in page
+        assert f"on HalfCheetah ({gained['HalfCheetah-v5']:.0%}, less than the baseline" in page
+        lost = f"{-gained['HalfCheetah-v5']:.0%} less"
+        pages = ("README.md", "docs/limitations.md")
+        assert all(lost in (ROOT / name).read_text() for name in pages)
+        by_seed = records("new_tasks").pivot_table("last_mean_return", ["task", "seed"], "method")
+        cheetah = by_seed.loc["HalfCheetah-v5"]
+        assert len(cheetah) == 3 and (cheetah["l2c2"] < cheetah["none"]).all()
         ant = [returns[side]["Ant-v5"] for side in "bl"]
         assert f"return {ant[0]:.0f} on average, and with L2C2 {ant[1]:.0f}" in page
         swimmer = records("new_tasks").query("task == 'Swimmer-v5'").set_index(["method", "seed"])

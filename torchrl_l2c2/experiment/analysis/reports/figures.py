@@ -107,6 +107,7 @@ def draw_plane(
         axis.set_title(panel, fontsize=10, parse_math=False)
         axis.set_xlabel(COMPARED[measure][0])
         axis.set_ylabel("return")
+        axis.locator_params(axis="x", nbins=5)  # Long labels would touch.
     for axis in axes[len(panels) :]:
         axis.set_visible(False)
     finish(figure, axes, "; ".join(title))
