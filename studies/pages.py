@@ -143,7 +143,13 @@ def pages() -> dict[str, Page]:
             }
         ),
         "results/rsl_rl.md": Page({"results": front_door.table(RSL_RL, [rsl_rl.TASK])}),
-        "results/td3.md": Page({"test": td3_test(), "choice": td3_choice()}),
+        "results/td3.md": Page(
+            {
+                "test": td3_test(),
+                "choice": td3_choice(records("td3")),
+                "ten": td3_choice(records("td3_ten_seeds")),
+            }
+        ),
         "results/field_gains.md": Page(dict(zip(("rivals", "one", "caps"), chosen, strict=True))),
         "results/targets.md": Page(dict(zip(("all", "swingup", "hopper"), targets, strict=True))),
         "studies/protocol.md": Page({"reacher": reacher_by_seed(runs)}),
@@ -260,12 +266,11 @@ def td3_test() -> str:
     return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
 
-def td3_choice() -> str:
-    """The table of TD3's candidates on seeds 100 to 102."""
+def td3_choice(tried: pd.DataFrame) -> str:
+    """The table of TD3's candidates on seeds of 100 and above."""
     rows = [["setting", "return by seed", "action variation by seed", "mean return"]]
     rows[0].append("mean action variation")
     rows.append(["---"] * 5)
-    tried = records("td3")
     for group in group_records(tried[tried["seed"] >= 100]):
         both = [group.scores("late_mean", q) for q in ("return", "action_variation")]
         each = [", ".join(f"{v:.{d}f}" for v in s.flat) for s, d in zip(both, (0, 3), strict=True)]

@@ -511,7 +511,7 @@ class TestPages:
     def test_every_generated_part_is_that_of_its_records(self):
         """``python -m studies.pages`` would change nothing."""
         made = pages.pages()
-        assert sum(len(page.parts) for page in made.values()) == 27
+        assert sum(len(page.parts) for page in made.values()) == 28
         for name, page in made.items():
             text = (ROOT / name).read_text()
             assert text.count(": start -->") == len(page.parts)
@@ -682,6 +682,21 @@ class TestProse:
         assert varied["none"].min() < varied["l2c2"].min() < varied["l2c2"].max()
         assert varied["l2c2"].max() < varied["none"].max()
         assert total["l2c2"].min() > total["none"].max()
+
+    def test_td3s_second_choice(self):
+        """By its rule, from the records, and the sentence on L2C2."""
+        runs = records("td3_ten_seeds")
+        strength = runs["differences"].str.extract(r"regularizer\.strength=([\d.]+)")[0].fillna("1")
+        scores = ["late_mean_return", "late_mean_action_variation"]
+        means = runs.groupby([runs["method"], strength])[scores].mean()
+        baseline = means.loc[("none", "1")]
+        kept = means[means[scores[0]] >= 1.05 * baseline[scores[0]]].drop(index="none")
+        chosen = kept.groupby("method")[scores[1]].idxmin()
+        assert dict(chosen.values) == {"l2c2": "1", "cats": "0.3"}
+        lower = 1 - means.loc[("l2c2", "1")] / baseline
+        sentence = f"falls by {lower.iloc[1]:.0%}, and the return by {-lower.iloc[0]:.0%}"
+        assert sentence in " ".join((ROOT / "results" / "td3.md").read_text().split())
+        assert runs[runs["method"] == "l2c2"][scores[0]].min() > -300
 
     def test_walkings_gains(self):
         """Every run of the seeds that its gains are chosen on is a cell."""
