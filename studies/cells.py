@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import hashlib
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from torchrl_l2c2.experiment.analysis.reports.groups import Group, baseline_of
@@ -102,3 +103,19 @@ def regrouped(groups: Iterable[Group]) -> pd.DataFrame:
 def digest(groups: Iterable[Group]) -> str:
     """A code of the records of groups, for the description of their picture."""
     return hashlib.sha256(to_csv(regrouped(groups))).hexdigest()[:12]
+
+
+def seeds_table(settings: Mapping[str, tuple[Sequence[float], Sequence[float]]]) -> str:
+    """Markdown table of every run of some settings, with their means.
+
+    Args:
+        settings (Mapping): Returns and action variations by seed, by the setting's name.
+    """
+    columns = ["setting", "return by seed", "action variation by seed"]
+    columns += ["mean return", "mean action variation"]
+    rows = [columns, ["---"] * len(columns)]
+    for name, (returns, variations) in settings.items():
+        each = [", ".join(f"{score:.0f}" for score in returns)]
+        each.append(", ".join(f"{score:.3f}" for score in variations))
+        rows.append([name, *each, f"{np.mean(returns):.1f}", f"{np.mean(variations):.3f}"])
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)

@@ -32,6 +32,7 @@ from torchrl.modules import MLP, Actor, AdditiveGaussianModule, TanhModule, Valu
 from torchrl.objectives import ClipPPOLoss, LossModule, SACLoss, SoftUpdate, TD3Loss
 from torchrl.objectives.value import GAE
 
+from studies.cells import seeds_table
 from torchrl_l2c2 import action_variation, make_actor, make_critic, smooth
 from torchrl_l2c2.experiment.analysis.reports.statistics import mean, probability_of_improvement
 from torchrl_l2c2.experiment.analysis.reports.table import Estimate
@@ -212,19 +213,16 @@ def strengths_table(path: Path) -> str:
     """Return and action variation of each run, and their means, by strength."""
     with path.open(newline="") as file:
         runs = list(csv.DictReader(file))
-    rows = [["strength", "return by seed", "action variation by seed", "mean return"]]
-    rows[0].append("mean action variation")
-    rows.append(["---"] * 5)
+    found = {}
     for method in dict.fromkeys(run["method"] for run in runs):
-        name = {"baseline": "0 (baseline)", "smooth": "1"}.get(method, method.split()[-1])
+        name = {"baseline": "baseline", "smooth": "strength 1"}.get(method)
+        name = name or method.replace("smooth", "strength")
         ours = [run for run in runs if run["method"] == method]
-        cells, means = [], []
-        for quantity, digits in (("return", 0), ("action_variation", 3)):
-            scores = [float(run[quantity]) for run in ours]
-            cells.append(", ".join(f"{score:.{digits}f}" for score in scores))
-            means.append(f"{np.mean(scores):.{max(1, digits)}f}")
-        rows.append([name, *cells, *means])
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+        returns, variations = (
+            [float(run[quantity]) for run in ours] for quantity in ("return", "action_variation")
+        )
+        found[name] = returns, variations
+    return seeds_table(found)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

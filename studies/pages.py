@@ -17,7 +17,13 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 from studies import field, front_door, paper, rsl_rl
-from studies.cells import digest, improvements_over_tasks, number_range, regrouped
+from studies.cells import (
+    digest,
+    improvements_over_tasks,
+    number_range,
+    regrouped,
+    seeds_table,
+)
 from studies.field import BETTER, TEST, field_groups, field_table
 from studies.methods import against_table, choice_table, pairwise_tables
 from studies.paper import (
@@ -135,7 +141,7 @@ def pages() -> dict[str, Page]:
         "results/parts.md": Page({"parts": parts()}),
         "results/front_door.md": Page(
             {
-                "results": front_door.table(ROOT / "results" / "front_door.csv"),
+                "results": front_door.table(FRONT_DOOR),
                 "gamma": front_door.table(
                     ROOT / "results" / "front_door_gamma.csv", ["TD3", "SAC"]
                 ),
@@ -268,15 +274,14 @@ def td3_test() -> str:
 
 def td3_choice(tried: pd.DataFrame) -> str:
     """The table of TD3's candidates on seeds of 100 and above."""
-    rows = [["setting", "return by seed", "action variation by seed", "mean return"]]
-    rows[0].append("mean action variation")
-    rows.append(["---"] * 5)
+    found = {}
     for group in group_records(tried[tried["seed"] >= 100]):
-        both = [group.scores("late_mean", q) for q in ("return", "action_variation")]
-        each = [", ".join(f"{v:.{d}f}" for v in s.flat) for s, d in zip(both, (0, 3), strict=True)]
-        means = [f"{both[0].mean():.1f}", f"{both[1].mean():.3f}"]
-        rows.append([group.name, *each, *means])
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+        returns, variations = (
+            group.scores("late_mean", quantity).ravel().tolist()
+            for quantity in ("return", "action_variation")
+        )
+        found[group.name] = returns, variations
+    return seeds_table(found)
 
 
 def reacher_by_seed(runs: pd.DataFrame) -> str:

@@ -12,6 +12,7 @@ from collections import Counter
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from studies import forest, pages, strength, trace
@@ -682,6 +683,20 @@ class TestProse:
         assert varied["none"].min() < varied["l2c2"].min() < varied["l2c2"].max()
         assert varied["l2c2"].max() < varied["none"].max()
         assert total["l2c2"].min() > total["none"].max()
+
+    def test_how_many_short_trainings_do_not_learn(self):
+        """The counts of results/front_door.md: returns below -200."""
+        counts = {}
+        for name in ("td3_strength", "front_door", "front_door_gamma"):
+            runs = pd.read_csv(ROOT / "results" / f"{name}.csv")
+            failed = runs[runs["return"] < -200].groupby(["algorithm", "method"]).size()
+            counts[name] = {"/".join(key): number for key, number in failed.items()}
+        assert counts["td3_strength"] == {"TD3/smooth": 7, "TD3/smooth 0.1": 2, "TD3/smooth 0.3": 1}
+        baselines = {"SAC/baseline": 1, "TD3/baseline": 1}
+        assert counts["front_door_gamma"] == {**baselines, "SAC/smooth": 3, "TD3/smooth": 3}
+        assert counts["front_door"]["TD3/smooth"] == 4 and counts["front_door"]["SAC/smooth"] == 2
+        learned = runs[runs["return"] >= -200].groupby(["algorithm", "method"])["return"].mean()
+        assert learned.round().to_list() == [-126, -127] * 2
 
     def test_td3s_second_choice(self):
         """By its rule, from the records, and the sentence on L2C2."""

@@ -105,8 +105,8 @@ class _Program:
 def _split(tree: Any) -> tuple[list[Tensor], list[Any], Any]:
     """Splits nested values into tensors, all values without tensors, and the nesting.
 
-    The nesting of a tuple of tensors is its length: ``tree_flatten`` takes longer than the kernels
-    of a small policy.
+    The nesting of a tuple of tensors is its length: ``tree_flatten`` is slow for a policy that is
+    called at every frame.
     """
     if type(tree) is tuple and all(isinstance(leaf, Tensor) for leaf in tree):
         return list(tree), [Tensor] * len(tree), len(tree)
