@@ -149,7 +149,7 @@ def import_rows(effort: Effort) -> Iterable[Row]:
     parts_of_torchrl = "torchrl.data, torchrl.envs, torchrl.modules, torchrl.objectives"
     statements = {
         "import torchrl_l2c2 s": ("import torchrl", "import torchrl_l2c2"),
-        "every name of it beyond those of torchrl s": (
+        "all names of torchrl_l2c2 after torchrl s": (
             f"import {parts_of_torchrl}",
             "from torchrl_l2c2 import *",
         ),

@@ -19,7 +19,7 @@ from torchrl_l2c2.experiment.run.files import write_atomically
 
 PAGE = ROOT / "results" / "README.md"
 PICTURE = ROOT / "results" / "forest.svg"
-# Quantities, and what is written above their panels and columns.
+# Quantities, and the titles of their panels and columns.
 PANELS = {"action_variation": "smoother", "return": "returns more"}
 COLORS = {"better": "#1f6fb4", "worse": "#c44e52", "noise": "#777777"}
 

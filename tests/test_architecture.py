@@ -1,4 +1,4 @@
-"""The layout: imports that point one way, eight rooms, paths that exist."""
+"""The layout: imports that point one way, eight layers, paths that exist."""
 
 import ast
 import os

@@ -132,6 +132,23 @@ class TestWords:
         assert "at step 7, where it observes speed = 7, angle = 49: " in found.text
         assert "is 6 there and 1 in the median" in found.text and not found.fault
 
+    @pytest.mark.parametrize(
+        ("ratio", "differs"), [(0.5, True), (0.6, False), (1.9, False), (2.0, True)]
+    )
+    def test_a_first_episode_that_is_unlike_the_mean_is_said_to_be(self, ratio, differs):
+        """First of all, because the other findings describe that episode."""
+        known = made_up().measures
+        mean = {**known, "action_variation": ratio * known["action_variation"]}
+        assert kinds(made_up(measures=mean)) == ["unlike"] * differs + ["smooth"]
+
+    def test_a_first_episode_at_rest_does_not_hide_the_others(self):
+        """A policy that shakes only after some starts."""
+        still = made_up(torch.zeros(100, 1))
+        shaking = {**still.measures, "action_variation": 0.3}
+        assert kinds(still) == ["still"]
+        assert kinds(made_up(torch.zeros(100, 1), measures=shaking)) == ["unlike", "still"]
+        assert "is 0.3." in findings(made_up(torch.zeros(100, 1), measures=shaking))[0].text
+
     def test_a_square_wave_is_bang_bang(self):
         """From bound to bound every ten steps: nine jumps in a hundred steps."""
         square = torch.where((STEPS // 10) % 2 == 0, 1.0, -1.0).unsqueeze(-1)

@@ -128,6 +128,7 @@ def test_the_pages_have_the_thresholds_of_diagnose() -> None:
         "small terms": [threshold("SMALL")],
         "stands still": [threshold("STILL")],
         "smooth": [threshold("SMOOTH")],
+        "the episodes differ": [threshold("UNLIKE")],
     }.items():
         assert {f"{each:g}" for each in thresholds} <= set(re.findall(r"-?[\d.]*\d", rows[finding]))
     assert f"at least {threshold('CONCENTRATED'):g} of a change" in page

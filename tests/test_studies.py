@@ -63,6 +63,7 @@ from torchrl_l2c2.experiment.analysis.reports.table import improvement
 from torchrl_l2c2.experiment.settings.optimizers import AdamConfig
 from torchrl_l2c2.experiment.settings.regularizers import REGULARIZERS
 from torchrl_l2c2.experiment.settings.tasks import TASKS
+from torchrl_l2c2.presets import preset
 
 
 def read(folder):
@@ -251,11 +252,11 @@ class TestOverTasks:
 class TestField:
     def test_published_rows_are_beside_the_means_over_seeds(self, tmp_path):
         """Of those tasks with PPO and SAC alone; an interval from two runs on; ties are halves."""
-        preset = {"task": "hopper_v5", "algorithm": PPOConfig()}
+        chosen = {"task": "hopper_v5", "algorithm": PPOConfig()}
         for method, seeds in (("none", 1), ("caps", 2), ("l2c2_ramp", 1)):
             for seed in range(seeds):
                 folder = tmp_path / method / str(seed)
-                make_run(folder, make_config(regularizer=method, seed=seed, **preset), 100.0, 0.1)
+                make_run(folder, make_config(regularizer=method, seed=seed, **chosen), 100.0, 0.1)
                 change_summary(folder, sm_asap_mean=0.4 + 0.2 * seed)
         make_run(tmp_path / "paper", make_config(), 10.0, 0.1)
         table = field_table(table_of(read(tmp_path)))
@@ -512,7 +513,7 @@ class TestPages:
     def test_every_generated_part_is_that_of_its_records(self):
         """``python -m studies.pages`` would change nothing."""
         made = pages.pages()
-        assert sum(len(page.parts) for page in made.values()) == 28
+        assert sum(len(page.parts) for page in made.values()) == 29
         for name, page in made.items():
             text = (ROOT / name).read_text()
             assert text.count(": start -->") == len(page.parts)
@@ -700,7 +701,7 @@ class TestProse:
 
     def test_td3s_second_choice(self):
         """By its rule, from the records, and the sentence on L2C2."""
-        runs = records("td3_ten_seeds")
+        runs = records("td3_ten_seeds").query("seed >= 100")
         strength = runs["differences"].str.extract(r"regularizer\.strength=([\d.]+)")[0].fillna("1")
         scores = ["late_mean_return", "late_mean_action_variation"]
         means = runs.groupby([runs["method"], strength])[scores].mean()
@@ -712,6 +713,19 @@ class TestProse:
         sentence = f"falls by {lower.iloc[1]:.0%}, and the return by {-lower.iloc[0]:.0%}"
         assert sentence in " ".join((ROOT / "results" / "td3.md").read_text().split())
         assert runs[runs["method"] == "l2c2"][scores[0]].min() > -300
+
+    def test_td3s_second_choice_on_the_shown_seeds(self):
+        """The chosen strengths return less than the presets, so the presets stay."""
+        score, page = "late_mean_return", (ROOT / "results" / "td3.md").read_text()
+        known = {"cats": (3.0, None), "caps": (1.0, 5.0)}
+        for method, (temporal, spatial) in known.items():
+            weaker = records("td3_ten_seeds").query("seed < 10 and method == @method")[score]
+            present = records("td3").query("seed < 10 and method == @method")[score]
+            assert len(weaker) == len(present) == 10 and weaker.mean() < present.mean()
+            assert f"{weaker.min():.0f}" in page.split("One of ten runs of each")[1]
+            settings = preset(method, "td3").settings
+            assert settings["lambda_temporal"] == temporal
+            assert settings.get("lambda_spatial") == spatial
 
     def test_walkings_gains(self):
         """Every run of the seeds that its gains are chosen on is a cell."""

@@ -161,7 +161,8 @@ def diagnose(
     Keyword Args:
         name (str): name of the policy, for comparisons. Default ``"policy"``.
         episodes (int): number of episodes, at least 1. The measures are means over episodes; all
-            other results are from the first episode. Default 3.
+            other results are from the first episode, and a finding says if it is unlike the mean.
+            Default 3.
         max_steps (int): longest episode. Default 1000.
         neighborhood (Neighborhood, optional): region of the local Lipschitz constants. Default:
             ``Neighborhood()``.

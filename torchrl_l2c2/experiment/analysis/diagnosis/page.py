@@ -116,8 +116,8 @@ def _measures(diagnoses: Sequence[Diagnosis]) -> Table:
     note = (
         "Means over the test episodes with mean actions; the last three rows: the first episode. "
         "Change by noise: root mean square change of the action by noise on observations with "
-        "this standard deviation, and the part of the mean squared change per step that this "
-        "noise explains. Deviation of samples: in units of half the action's range. Smaller is "
+        "this standard deviation, and its square as a part of the mean squared change per step. "
+        "Deviation of samples: in units of half the action's range. Smaller is "
         "smoother, except for the return and the gain on the action before, where 1 is smooth. "
         "Definitions and units: torchrl_l2c2.metrics."
     )

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from torchrl_l2c2.experiment.analysis.diagnosis.measured import Diagnosis
-from torchrl_l2c2.metrics import previous_action_gain, roughness, saturation
+from torchrl_l2c2.metrics import action_variation, previous_action_gain, roughness, saturation
 
 # Value and meaning; the signals that they were calibrated on are in tests/test_diagnosis.py.
 THRESHOLDS = {
@@ -19,10 +19,17 @@ THRESHOLDS = {
     "EITHER_BOUND": (0.05, "smallest share of steps at each bound of a bang-bang action"),
     "ROUGH": (0.2, "smallest roughness of an action that moves like noise; white noise has 0.25"),
     "SMOOTH": (0.02, "largest mean change per step of a smooth policy, of the action's range"),
-    "NOISY": (0.5, "smallest share of the squared change that noise on observations explains"),
+    "NOISY": (
+        0.5,
+        "smallest squared change by noise on observations, as a share of the whole squared change",
+    ),
     "WIDE": (0.4, "smallest standard deviation of wide samples, of half the range; uniform: 0.58"),
     "STEEP": (10.0, "smallest ratio of the largest to the median local Lipschitz constant"),
     "SMALL": (0.001, "share of the gradient, or else of the loss, below which a term is small"),
+    "UNLIKE": (
+        2.0,
+        "smallest ratio between the action variations of the first episode and the mean",
+    ),
     "CONCENTRATED": (0.3, "smallest share of a change in a tenth of the episode that is located"),
 }
 
@@ -53,16 +60,17 @@ def findings(diagnosis: Diagnosis) -> list[Finding]:
     Args:
         diagnosis (Diagnosis): Result of :func:`~.measured.diagnose`.
     """
+    unlike = list(_unlike(diagnosis))
     if (diagnosis.relative.std(0) <= threshold("STILL")).all():
         at = ", ".join(f"{value:.3g}" for value in diagnosis.actions.mean(0).tolist())
         text = (
             f"It stands still: every action stays within {threshold('STILL'):.1%} of its range "
             f"around ({at}). This is smooth, but the policy does not react to its observations."
         )
-        return [Finding("still", text), *_training(diagnosis)]
+        return [*unlike, Finding("still", text), *_training(diagnosis)]
     found = list(_actions(diagnosis))
     found = [*found, *_steepest(diagnosis)] if found else [_movement(diagnosis)]
-    return [*found, *_reasons(diagnosis), *_training(diagnosis)]
+    return [*unlike, *found, *_reasons(diagnosis), *_training(diagnosis)]
 
 
 def summary(diagnosis: Diagnosis) -> str:
@@ -102,6 +110,18 @@ def _compared(first: Diagnosis, other: Diagnosis) -> str:
         f"return is {'higher' if new > old else 'lower' if new < old else 'the same'} "
         f"({new:.4g}, {old:.4g})."
     )
+
+
+def _unlike(diagnosis: Diagnosis) -> Iterator[Finding]:
+    """Finding about a first episode that is unlike the others."""
+    first, mean = action_variation(diagnosis.actions).item(), diagnosis.measures["action_variation"]
+    if min(first, mean) * threshold("UNLIKE") <= max(first, mean) > 0.0:
+        text = (
+            f"The episodes differ: the first one, which all further findings describe, has an "
+            f"action variation of {first:.3g}, and the mean of the episodes is {mean:.3g}. Choose "
+            "another first episode with another seed."
+        )
+        yield Finding("unlike", text, fault=False)
 
 
 def _actions(diagnosis: Diagnosis) -> Iterator[Finding]:
@@ -175,7 +195,7 @@ def _reasons(diagnosis: Diagnosis) -> Iterator[Finding]:
     if shaking and diagnosis.noise_share >= threshold("NOISY"):
         text = (
             f"It is sensitive to noise on its observations: noise of {diagnosis.noise_scale:.2g} "
-            f"moves the action by {diagnosis.noise_action:.2g}, which explains "
+            f"moves the action by {diagnosis.noise_action:.2g}; squared, this is "
             f"{min(1.0, diagnosis.noise_share):.0%} of the squared change from step to step."
         )
         yield Finding("noise", text)

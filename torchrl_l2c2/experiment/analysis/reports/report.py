@@ -42,7 +42,7 @@ def result_lines(run: FinishedRun) -> str:
 def printed_table(records: pd.DataFrame) -> str:
     """Returns the table of records and notes on their settings as Markdown.
 
-    The test is the last policy's with mean actions, or the first other one that was made.
+    It has the test of the last policy with mean actions, or else the first recorded test.
     """
     groups = group_records(records)
     table = comparison_table(known_tests(groups)[0], groups)
