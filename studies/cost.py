@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from studies.pages import fill
+from studies.files import fill
 from torchrl_l2c2.experiment.run.files import write_atomically
 
 ROOT = Path(__file__).parents[1]

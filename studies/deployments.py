@@ -12,8 +12,8 @@ from typing import Any
 import pandas as pd
 
 from studies.cells import number_range
+from studies.files import ROOT, fill
 from studies.filters import CONDITIONS
-from studies.pages import ROOT, fill
 from torchrl_l2c2.experiment.analysis.reports.figures import finish, save, subplots
 from torchrl_l2c2.experiment.analysis.reports.statistics import mean, probability_of_improvement
 from torchrl_l2c2.experiment.analysis.reports.table import Estimate

@@ -1,23 +1,22 @@
-"""Forest plot of the README's rows: how probable it is that a run with L2C2 is better.
+"""Forest plot of the summary: how probable it is that a run with L2C2 is better.
 
-``python -m studies.forest`` reads the records in ``results/*.csv``. It writes
-``results/forest.svg`` and the table of ``results/README.md``.
+``python -m studies.forest`` reads the records in ``results/*.csv`` and writes
+``results/forest.svg``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from studies.field import TEST
-from studies.pages import ROOT, fill, summarized
+from studies.files import ROOT
+from studies.summary import benchmarks
 from torchrl_l2c2.experiment.analysis.reports.figures import save, subplots
 from torchrl_l2c2.experiment.analysis.reports.groups import Group
 from torchrl_l2c2.experiment.analysis.reports.table import Estimate, improvement
-from torchrl_l2c2.experiment.run.files import write_atomically
 
-PAGE = ROOT / "results" / "README.md"
 PICTURE = ROOT / "results" / "forest.svg"
 # Quantities, and the titles of their panels and columns.
 PANELS = {"action_variation": "smoother", "return": "returns more"}
@@ -31,31 +30,17 @@ class Row(NamedTuple):
     better: tuple[Estimate, ...]
 
 
-def rows(pairs: dict[str, tuple[Group, Group]]) -> list[Row]:
-    """A row for each task, the roughest baseline first, and one for the mean over tasks.
+def rows(pairs: Mapping[tuple[str, str], tuple[Group, Group]]) -> list[Row]:
+    """A row for each benchmark, and one for the mean over them.
 
     Args:
-        pairs (dict): The groups with L2C2 and of the baseline, by label.
+        pairs (Mapping): The groups with L2C2 and of the baseline, by task and algorithm.
     """
-    rough = {
-        label: baseline.scores(TEST, "action_variation").mean()
-        for label, (_, baseline) in pairs.items()
-    }
-    ordered = sorted(pairs, key=rough.__getitem__, reverse=True)
     found = [
-        Row(f"{label} ({len(pairs[label][0].seeds)} seeds)", _better([pairs[label]]))
-        for label in ordered
+        Row(f"{', '.join(names)} ({len(pair[0].seeds)} seeds)", _better([pair]))
+        for names, pair in pairs.items()
     ]
     return [*found, Row(f"Mean of the {len(pairs)} rows", _better(list(pairs.values())))]
-
-
-def published() -> list[Row]:
-    """The rows of the README's table."""
-    pairs = {}
-    for label, pair in summarized().items():
-        algorithm, task = label.split(", ")
-        pairs[f"{task}, {algorithm}"] = pair
-    return rows(pairs)
 
 
 def table(shown: Sequence[Row]) -> str:
@@ -80,10 +65,8 @@ def draw(shown: Sequence[Row], path: Path) -> None:
 
 
 def main() -> None:
-    """Writes the picture and the table."""
-    shown = published()
-    write_atomically(PAGE, fill(PAGE.read_text(), "forest", table(shown)).encode())
-    draw(shown, PICTURE)
+    """Draws the picture of the summary."""
+    draw(rows(benchmarks()), PICTURE)
 
 
 def _better(pairs: Sequence[tuple[Group, Group]]) -> tuple[Estimate, ...]:
@@ -123,7 +106,7 @@ def _draw_row(axis: Any, height: float, better: Estimate, *, overall: bool) -> N
     marker = {"marker": "D" if overall else "o", "markersize": 9 if overall else 8}
     # Hollow: the interval contains 0.5.
     face = "white" if kind == "noise" else color
-    axis.plot([better.value], [height], color=color, markerfacecolor=face, mew=1.8, **marker)
+    axis.plot([better.value], [height], color=color, mfc=face, mew=1.8, clip_on=False, **marker)
     text = better.text("{:.2f}".format)
     axis.text(1.06, height, text, va="center", fontsize=9, weight="bold" if overall else None)
 

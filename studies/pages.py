@@ -7,7 +7,6 @@ have changed; to draw it in another way, delete it first.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -16,15 +15,15 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from studies import field, front_door, paper, rsl_rl
+from studies import field, front_door, paper, rsl_rl, summary
 from studies.cells import (
     digest,
     improvements_over_tasks,
-    number_range,
     regrouped,
     seeds_table,
 )
 from studies.field import BETTER, TEST, field_groups, field_table
+from studies.files import ROOT, fill, records
 from studies.methods import against_table, choice_table, pairwise_tables
 from studies.paper import (
     TAU,
@@ -35,6 +34,7 @@ from studies.paper import (
     shown_groups,
     statistics_table,
 )
+from studies.summary import OURS, RSL_RL
 from studies.targets import gain_targets_table
 from torchrl_l2c2.experiment.analysis.reports.figures import draw_plane
 from torchrl_l2c2.experiment.analysis.reports.groups import (
@@ -42,7 +42,7 @@ from torchrl_l2c2.experiment.analysis.reports.groups import (
     group_records,
     settings_notes,
 )
-from torchrl_l2c2.experiment.analysis.reports.records import merge, read_records
+from torchrl_l2c2.experiment.analysis.reports.records import merge
 from torchrl_l2c2.experiment.analysis.reports.statistics import mean
 from torchrl_l2c2.experiment.analysis.reports.table import (
     COMPARED,
@@ -52,35 +52,13 @@ from torchrl_l2c2.experiment.analysis.reports.table import (
 )
 from torchrl_l2c2.experiment.run.files import write_atomically
 
-ROOT = Path(__file__).parents[1]
 FRONT_DOOR = ROOT / "results" / "front_door.csv"
-RSL_RL = ROOT / "results" / "rsl_rl.csv"
 FIELD_PAGES = ("field", "hopper", "sac_lunarlander", "sac_pendulum", "walker2d")
-# PPO's one setting of L2C2, and the methods that one page compares it with.
-OURS = "L2C2, mse 1, ramp"
+# The methods that one page compares PPO's preset of L2C2 with.
 RIVALS = ("baseline", "CAPS", "CAPS, lambda_spatial=0.005", "CATS")
 # Methods of the pictures, each with more than two runs: more than six cannot be told apart.
 PICTURED = (*RIVALS, OURS, "L2C2 as in the paper", "L2C2, means 10", "L2C2, means 10, ramp")
 TARGETS = ("targets", "runs", "sac_pendulum", "field", "walker2d", "hopper")
-HEADLINE = """\
-| | seeds | measure | baseline | with L2C2 | change | P(smoother) | return: baseline | with L2C2 | P(returns more) |
-| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |"""  # noqa: E501
-SUMMARY = """\
-| task | algorithm (seeds) | action change per step: baseline | with L2C2 | change | return: baseline | with L2C2 |
-| --- | --- | --- | --- | --- | --- | --- |"""  # noqa: E501
-# Rows of the table of results: the file of records, the method and the length.
-HEADLINES = {
-    "SAC, Pendulum": ("sac_pendulum", "L2C2, means 10", "30000 frames"),
-    "PPO, LunarLander": ("field", OURS, "500000 frames"),
-    "PPO, Pendulum": ("field", OURS, "500000 frames"),
-    "PPO, Hopper": ("hopper", OURS, "1000000 frames"),
-    "PPO, Walker2d": ("walker2d", OURS, "1000000 frames"),
-    "PPO-RPE, Reacher, as in the paper": ("runs", "L2C2", "4500 episodes"),
-    "PPO-RPE, Swingup, as in the paper": ("runs", "L2C2", "350 episodes"),
-    "PPO-RPE, Swingup, with a target": ("runs", "L2C2, means, target 0.045", "350 episodes"),
-}
-# Rows of the README's table; the text below it has Swingup.
-SUMMARIZED = [label for label in HEADLINES if "Swingup" not in label]
 # Names of the rows in results/parts.md, by their names in other tables.
 PARTS = {
     "baseline": "baseline",
@@ -129,8 +107,8 @@ def pages() -> dict[str, Page]:
     # Only the first one has its title and legend.
     targets[1:] = [text.split("\n\n")[1] for text in targets[1:]]
     return {
-        "README.md": Page({"summary": summary()}),
-        "docs/results.md": Page({"headline": headline()}),
+        "README.md": Page({"summary": summary.short_table()}),
+        "docs/results.md": Page({"summary": summary.long_table(), "sm": summary.sm_table()}),
         "results/paper.md": _paper_page(runs),
         **{f"results/{name}.md": _field_page(name, records(name)) for name in FIELD_PAGES},
         "results/one_setting.md": _field_page("one_setting", one_setting()),
@@ -167,11 +145,6 @@ def pages() -> dict[str, Page]:
     }
 
 
-def records(*names: str) -> pd.DataFrame:
-    """The records of these files in ``results/``."""
-    return merge(*(read_records(ROOT / "results" / f"{name}.csv") for name in names))
-
-
 def one_setting() -> pd.DataFrame:
     """The records of PPO's one setting and of its rivals."""
     groups = group_records(records("field", "walker2d", "hopper"))
@@ -184,48 +157,6 @@ def other_methods() -> pd.DataFrame:
     known = [g for g in group_records(records("field")) if g.name in ("baseline", OURS, "CATS")]
     shown = regrouped(known)
     return merge(own, shown[shown["seed"].isin(own["seed"])])
-
-
-def headline_groups(label: str) -> tuple[Group, Group]:
-    """L2C2 and the baseline on the same seeds, for a row of the table of results."""
-    name, method, length = HEADLINES[label]
-    named = label.split(", ")[1].lower()
-    task = f"{named}_v5" if named in ("hopper", "walker2d") else named
-    found = records(name)
-    found = found[(found["task"] == task) & (found["length"] == length)]
-    # With the usual pace of the target networks.
-    found = found[~found["differences"].str.contains(TAU, regex=False)]
-    (ours,) = (group for group in group_records(found) if group.name == method)
-    same = found[(found["method"] == "none") & found["seed"].isin(ours.seeds)]
-    (baseline,) = group_records(same)
-    assert baseline.seeds == ours.seeds and baseline.setup == ours.setup
-    return ours, baseline
-
-
-def summarized() -> dict[str, tuple[Group, Group]]:
-    """L2C2 and the baseline for each row of the README's table, by algorithm and task."""
-    found = {", ".join(label.split(", ")[:2]): headline_groups(label) for label in SUMMARIZED}
-    return {**found, "PPO of rsl_rl, HalfCheetah": rsl_rl.recorded(RSL_RL)}
-
-
-def summary() -> str:
-    """The README's table: means of the baseline and of L2C2, the roughest baseline first."""
-    rows = {}
-    for label, (ours, baseline) in summarized().items():
-        algorithm, task = label.split(", ")
-        (before, after), (lost, kept) = (
-            [side.scores(TEST, quantity).mean() for side in (baseline, ours)]
-            for quantity in ("action_variation", "return")
-        )
-        cells = [task, f"{algorithm} ({len(ours.seeds)})", f"{before:.3f}", f"{after:.3f}"]
-        cells += [f"**{after / before - 1:+.0%}**", _rounded(lost), _rounded(kept)]
-        rows[before] = f"| {' | '.join(cells)} |"
-    return "\n".join([SUMMARY, *(rows[before] for before in sorted(rows, reverse=True))])
-
-
-def headline() -> str:
-    """The table of results: means of the baseline and of L2C2, and the probabilities."""
-    return "\n".join([HEADLINE, *(row for label in HEADLINES for row in _headline_rows(label))])
 
 
 def parts() -> str:
@@ -371,48 +302,6 @@ def _field_page(name: str, shown: pd.DataFrame) -> Page:
     about = description(groups)
     draw = partial(draw_plane, groups, TEST, measure="sm_asap", more=more, description=about)
     return Page({"results": "\n\n".join(texts)}, groups, draw)
-
-
-def _rounded(total: float) -> str:
-    return f"{total:.{0 if abs(total) >= 100 else 1}f}"
-
-
-def _headline_rows(label: str) -> list[str]:
-    ours, baseline = headline_groups(label)
-
-    def compared(quantity: str, digits: int, *, changes: bool = False) -> list[str]:
-        means = [side.scores(TEST, quantity).mean() for side in (baseline, ours)]
-        cells = [f"{value:.{digits if abs(value) >= 100 or digits else 1}f}" for value in means]
-        cells += [f"{means[1] / means[0] - 1:+.0%}"] if changes else []
-        return [*cells, improvement_cell([ours], [baseline], TEST, quantity)]
-
-    start, of_return, rows = [label, number_range(ours.seeds)], compared("return", 0), []
-    # The paper measures only the action variation.
-    of_paper = HEADLINES[label][0] == "runs"
-    for measure in ("action_variation",) if of_paper else ("sm_asap", "action_variation"):
-        cells = [*start, COMPARED[measure][0], *compared(measure, 3, changes=True), *of_return]
-        rows.append(f"| {' | '.join(cells)} |")
-        start, of_return = ["", ""], ["", "", ""]
-    return rows
-
-
-def fill(text: str, name: str, part: str) -> str:
-    """A page's text with this part between its marks, the last of which keeps their indent.
-
-    Raises:
-        ValueError: The marks are not there, once each and in order.
-
-    Examples:
-        >>> print(fill("<!-- a: start -->\\nold\\n<!-- a: end -->", "a", "new"))
-        <!-- a: start -->
-        new
-        <!-- a: end -->
-    """
-    start, end = f"<!-- {name}: start -->", f"<!-- {name}: end -->"
-    pattern = re.compile(f"( *){start}\n.*?{end}", re.S)
-    if (text.count(start), text.count(end), len(pattern.findall(text))) != (1, 1, 1):
-        raise ValueError(f"Expected {start} and after it {end}, once each.")
-    return pattern.sub(lambda found: f"{found[1]}{start}\n{part}\n{found[1]}{end}", text)
 
 
 def description(shown: Sequence[Group]) -> str:

@@ -15,7 +15,7 @@ import pandas as pd
 
 from studies.cells import number_range
 from studies.field import TEST
-from studies.pages import ROOT, fill, records
+from studies.files import ROOT, fill, records
 from torchrl_l2c2.experiment.analysis.reports.figures import save, subplots
 from torchrl_l2c2.experiment.analysis.reports.groups import Group, group_records
 from torchrl_l2c2.experiment.analysis.reports.records import merge

@@ -17,8 +17,8 @@ from benchmarks.timing import Row, alternate, fill_page, to_markdown
 from benchmarks.zoo import arguments
 from studies import cost as studies_cost
 from studies import gpu
+from studies.files import fill
 from studies.gpu import NOT_MEASURED
-from studies.pages import fill
 
 REPOSITORY = Path(__file__).parent.parent
 WHERE = {

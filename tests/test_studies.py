@@ -20,14 +20,11 @@ from studies.cells import improvements_over_tasks, over_tasks
 from studies.field import BETTER, field_groups, field_table
 from studies.methods import against_table, choice_table, pairwise_tables
 from studies.pages import (
-    HEADLINES,
     OURS,
     ROOT,
     fill,
-    headline_groups,
     is_drawn,
     one_setting,
-    summarized,
 )
 from studies.paper import (
     deployed_table,
@@ -39,6 +36,7 @@ from studies.paper import (
 )
 from studies.protocol import main as score
 from studies.protocol import until, variants
+from studies.summary import benchmarks
 from studies.targets import gain_targets_table
 from tests.test_reports import METHODS, cells, make_config, make_run, table_of
 from torchrl_l2c2.experiment import (
@@ -513,7 +511,7 @@ class TestPages:
     def test_every_generated_part_is_that_of_its_records(self):
         """``python -m studies.pages`` would change nothing."""
         made = pages.pages()
-        assert sum(len(page.parts) for page in made.values()) == 29
+        assert sum(len(page.parts) for page in made.values()) == 30
         for name, page in made.items():
             text = (ROOT / name).read_text()
             assert text.count(": start -->") == len(page.parts)
@@ -548,39 +546,46 @@ class TestPages:
 class TestProse:
     """Numbers within sentences, and tables that were written by hand."""
 
-    def test_returns_seed_by_seed(self):
-        """How often the return of L2C2 is the lower one; pairs of all seeds show less of it."""
-        page = " ".join((ROOT / "docs" / "results.md").read_text().split())
-        for label in HEADLINES:
-            if "PPO-RPE" not in label:
-                ours, plain = (
-                    group.by_seed("last_mean", "return") for group in headline_groups(label)
-                )
-                lower = sum(ours[seed] < plain[seed] for seed in ours)
-                assert f"{lower} of {len(ours)} ({label})" in page
+    def test_the_summary_by_hand(self):
+        """A row of each table, recomputed from the records; the roughest baseline comes first."""
+        runs = records("hopper").set_index("seed")
+        sides = [runs[runs["method"] == method] for method in ("none", "l2c2_ramp")]
+        named = {"action_variation": ".3f", "sm_asap": ".3f", "return": ".0f"}
+        cells, totals, sm = [], [], []
+        for measure, found in zip(named, (cells, sm, totals), strict=True):
+            found += [format(side[f"last_mean_{measure}"].mean(), named[measure]) for side in sides]
+        before, after = (side["last_mean_return"] for side in sides)
+        lower = f"{(after < before).sum()} of 10"
+        change = float(cells[1]) / float(cells[0]) - 1
+        readme, page = ((ROOT / path).read_text() for path in ("README.md", "docs/results.md"))
+        row = ["Hopper", "PPO (10)", *cells, f"**{change:+.0%}**", *totals]
+        assert f"| {' | '.join(row)} |" in readme
+        (row,) = re.findall(r"^\| Hopper \| PPO \(10\) \| 0.*of 10 \|$", page, re.M)
+        assert f"{' | '.join(cells)} |" in row and row.endswith(f"| {lower} |")
+        assert f"| {' | '.join(totals)} |" in row
+        assert f"| Hopper | PPO (10) | {' | '.join(sm)} |" in page
+        rough = [
+            side.scores("last_mean", "action_variation").mean() for _, side in benchmarks().values()
+        ]
+        assert rough == sorted(rough, reverse=True) and len(rough) == 16
 
     def test_the_readmes_sentences(self):
-        """Ranges of the changes, the largest loss of return, its noise, and Swingup."""
+        """The changes of rough and of smooth baselines, the losses of return, and untuned tasks."""
         readme = " ".join((ROOT / "README.md").read_text().split())
-        changes, losses = [], []
-        shown = [*summarized().values(), headline_groups("PPO-RPE, Swingup, as in the paper")]
-        for ours, plain in shown:
+        rough, smooth = [], []
+        for ours, baseline in benchmarks().values():
             after, before = (
-                group.scores("last_mean", "action_variation").mean() for group in (ours, plain)
+                group.scores("last_mean", "action_variation").mean() for group in (ours, baseline)
             )
-            kept, lost = (group.scores("last_mean", "return").mean() for group in (ours, plain))
-            returned = improvement([ours], [plain], "last_mean", "return")
-            assert returned.interval is not None and returned.interval[1] > 0.5
-            changes.append(round(100 * (1 - after / before)))
-            losses.append(round(100 * (lost - kept) / abs(lost)))
-        *others, swingup = changes
-        assert sorted(others) == [7, 9, 38, 44, 62, 64, 73]
-        assert "fell by 38 to 73% where" in readme and "by 7 to 9% where" in readme
-        assert f"up to {max(losses)}% lower (and {-min(losses)}% higher on HalfCheetah)" in readme
-        assert f"from {before:.3f} to {after:.3f} (-{swingup}%)" in readme
-        small = [[group] for group in headline_groups("PPO, Pendulum")]
-        low, high = improvement(*small, "last_mean", "action_variation").interval
-        assert low < 0.5 < high
+            (rough if before > 0.08 else smooth).append(round(100 * (after / before - 1)))
+        assert len(rough) == 11 and len(smooth) == 5
+        said = f"fell by {-max(rough)} to {-min(rough)}% where the baseline shook, and changed by "
+        assert f"{said}{min(smooth)} to {max(smooth):+}% where" in readme
+        cheetah, baseline = benchmarks()["HalfCheetah", "PPO"]
+        returned = [group.scores("last_mean", "return").mean() for group in (cheetah, baseline)]
+        assert f"({returned[0] / returned[1] - 1:.0%}, {len(cheetah.seeds)} seeds)" in readme
+        td3 = benchmarks()["Pendulum", "TD3"][0].by_seed("last_mean", "return").values()
+        assert sum(total < -300 for total in td3) == 1
 
     def test_rivals_over_four_tasks(self):
         """How probable a smoother run is, and one that returns more."""
@@ -672,8 +677,7 @@ class TestProse:
         assert set(gained[gained > 0.01].index) == {"Ant-v5", "BipedalWalker-v3", "Swimmer-v5"}
         assert f"on HalfCheetah ({gained['HalfCheetah-v5']:.0%}, less than the baseline" in page
         lost = f"{-gained['HalfCheetah-v5']:.0%} less"
-        pages = ("README.md", "docs/limitations.md")
-        assert all(lost in (ROOT / name).read_text() for name in pages)
+        assert lost in (ROOT / "docs" / "limitations.md").read_text()
         by_seed = records("new_tasks").pivot_table("last_mean_return", ["task", "seed"], "method")
         cheetah = by_seed.loc["HalfCheetah-v5"]
         assert len(cheetah) == 3 and (cheetah["l2c2"] < cheetah["none"]).all()
@@ -755,9 +759,8 @@ class TestForest:
             (g.first.task, g.first.method): g
             for g in group_records(records_of(read_runs(tmp_path)))
         }
-        # The smoother baseline first, to see that rows are sorted.
         return forest.rows(
-            {task: (groups[task, "l2c2"], groups[task, "none"]) for task in ("reacher", "swingup")}
+            {(t, "PPO"): (groups[t, "l2c2"], groups[t, "none"]) for t in ("swingup", "reacher")}
         )
 
     def test_by_hand(self, shown):
@@ -765,8 +768,8 @@ class TestForest:
         none, one or both with 1/4, 1/2 and 1/4, so the interval is [0, 1]. Reacher: as many pairs
         are smoother as not, with the same interval, and no return is larger."""
         assert forest.table(shown).splitlines()[2:] == [
-            "| swingup (2 seeds) | 1.00 [1.00, 1.00] | 0.50 [0.00, 1.00] |",
-            "| reacher (2 seeds) | 0.50 [0.00, 1.00] | 0.00 [0.00, 0.00] |",
+            "| swingup, PPO (2 seeds) | 1.00 [1.00, 1.00] | 0.50 [0.00, 1.00] |",
+            "| reacher, PPO (2 seeds) | 0.50 [0.00, 1.00] | 0.00 [0.00, 0.00] |",
             "| Mean of the 2 rows | 0.75 [0.50, 1.00] | 0.25 [0.00, 0.50] |",
         ]
 
@@ -779,23 +782,22 @@ class TestForest:
         assert text == second.read_text() and "<text" not in text
         assert forest.table(shown) in text
 
-    def test_page_and_picture_are_of_the_records(self):
-        """The same rows as the README's table, and what the page says of them."""
-        shown = forest.published()
-        page, picture = forest.PAGE.read_text(), forest.PICTURE.read_text()
-        assert forest.table(shown) in page and forest.table(shown) in picture
+    def test_picture_and_sentences_are_of_the_records(self):
+        """The mean over the rows, and the only loss of return beyond seed noise."""
+        shown = forest.rows(benchmarks())
+        assert forest.table(shown) in forest.PICTURE.read_text()
         *rows, overall = shown
-        assert len(rows) == 7 and overall.label == "Mean of the 7 rows"
-        smoother, returns = zip(*(row.better for row in rows), strict=True)
-        assert all(each.value > 0.5 for each in smoother)
-        assert sum(each.interval[0] > 0.5 for each in smoother) == 6
-        assert all(each.interval[1] > 0.5 for each in returns)
-        lines = (ROOT / "README.md").read_text().splitlines()
-        kinds = [re.split(r", | \(", row.label)[:2] for row in rows]
-        starts = [f"| {task} | {algorithm} (" for task, algorithm in kinds]
-        assert [line for line in lines if line.startswith(tuple(starts))] == [
-            next(line for line in lines if line.startswith(start)) for start in starts
-        ]
+        assert overall.label == f"Mean of the {len(rows)} rows"
+        smoother, returned = (each.text("{:.2f}".format) for each in overall.better)
+        for path in ("results/README.md", "docs/results.md"):
+            start = " ".join((ROOT / path).read_text().partition("![")[0].split())
+            assert f"Over {len(rows)} benchmarks" in start
+            assert f"smoother than a run of the baseline with a probability of {smoother}." in start
+            assert f"returns more with a probability of {returned}, which is within" in start
+        low, high = overall.better[1].interval
+        assert low < 0.5 < high
+        lost = [row.label for row in rows if row.better[1].interval[1] < 0.5]
+        assert lost == ["HalfCheetah, PPO (3 seeds)"]
 
 
 class TestStrength:

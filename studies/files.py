@@ -1,0 +1,36 @@
+"""Records below ``results/``, and pages with generated parts."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pandas as pd
+
+from torchrl_l2c2.experiment.analysis.reports.records import merge, read_records
+
+ROOT = Path(__file__).parents[1]
+
+
+def records(*names: str) -> pd.DataFrame:
+    """The records of these files in ``results/``."""
+    return merge(*(read_records(ROOT / "results" / f"{name}.csv") for name in names))
+
+
+def fill(text: str, name: str, part: str) -> str:
+    """A page's text with this part between its marks, the last of which keeps their indent.
+
+    Raises:
+        ValueError: The marks are not there, once each and in order.
+
+    Examples:
+        >>> print(fill("<!-- a: start -->\\nold\\n<!-- a: end -->", "a", "new"))
+        <!-- a: start -->
+        new
+        <!-- a: end -->
+    """
+    start, end = f"<!-- {name}: start -->", f"<!-- {name}: end -->"
+    pattern = re.compile(f"( *){start}\n.*?{end}", re.S)
+    if (text.count(start), text.count(end), len(pattern.findall(text))) != (1, 1, 1):
+        raise ValueError(f"Expected {start} and after it {end}, once each.")
+    return pattern.sub(lambda found: f"{found[1]}{start}\n{part}\n{found[1]}{end}", text)

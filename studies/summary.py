@@ -1,0 +1,172 @@
+"""The summary over all benchmarks of L2C2's presets and of the paper's settings.
+
+It has the README's table and the tables of ``docs/results.md``; ``studies.forest`` draws it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+from studies import rsl_rl
+from studies.field import TEST
+from studies.files import ROOT, records
+from torchrl_l2c2.experiment.analysis.reports.groups import Group, group_records
+from torchrl_l2c2.experiment.analysis.reports.table import improvement_cell
+
+OURS = "L2C2, mse 1, ramp"
+"""PPO's preset, in tables."""
+
+MILLION = "1000000 frames"
+RSL_RL = ROOT / "results" / "rsl_rl.csv"
+Pair = tuple[Group, Group]
+"""The runs with L2C2, and the baseline's runs with the same seeds."""
+
+
+class Benchmark(NamedTuple):
+    """Where the runs of a row are recorded.
+
+    Attributes:
+        task (str): Name of the task in tables.
+        algorithm (str): Name of the algorithm in tables.
+        file (str): Records, below ``results/``.
+        recorded (str): Name of the task in the records.
+        method (str): Name of L2C2's settings in tables.
+        length (str): Length of training in the records.
+    """
+
+    task: str
+    algorithm: str
+    file: str
+    recorded: str
+    method: str
+    length: str
+
+
+BENCHMARKS = (
+    Benchmark("Pendulum", "SAC", "sac_pendulum", "pendulum", "L2C2, means 10", "30000 frames"),
+    Benchmark("Pendulum", "TD3", "td3", "Pendulum-v1", "L2C2, means 10, ramp", "100 episodes"),
+    Benchmark("Pendulum", "PPO", "field", "pendulum", OURS, "500000 frames"),
+    Benchmark("LunarLander", "PPO", "field", "lunarlander", OURS, "500000 frames"),
+    Benchmark("Hopper", "PPO", "hopper", "hopper_v5", OURS, MILLION),
+    Benchmark("Walker2d", "PPO", "walker2d", "walker2d_v5", OURS, MILLION),
+    Benchmark("Ant", "PPO", "new_tasks", "Ant-v5", OURS, MILLION),
+    Benchmark("BipedalWalker", "PPO", "new_tasks", "BipedalWalker-v3", OURS, MILLION),
+    Benchmark("HalfCheetah", "PPO", "new_tasks", "HalfCheetah-v5", OURS, MILLION),
+    Benchmark("Reacher", "PPO", "new_tasks", "Reacher-v5", OURS, MILLION),
+    Benchmark("Swimmer", "PPO", "new_tasks", "Swimmer-v5", OURS, MILLION),
+    Benchmark("noisy Swingup", "PPO-RPE", "runs", "swingup", "L2C2", "350 episodes"),
+    Benchmark("noisy Reacher", "PPO-RPE", "runs", "reacher", "L2C2", "4500 episodes"),
+    Benchmark("noisy Hopper", "PPO-RPE", "runs", "hopper", "L2C2", "750 episodes"),
+    Benchmark("noisy Ant", "PPO-RPE", "runs", "ant", "L2C2", "750 episodes"),
+)
+"""Every benchmark with at least three seeds: of the presets of PPO, SAC and TD3, and of the paper's
+algorithm and settings on its noisy tasks. HalfCheetah with rsl_rl has its own file of records."""
+
+
+def benchmarks() -> dict[tuple[str, str], Pair]:
+    """The runs of every benchmark by task and algorithm, the roughest baseline first."""
+    found = {(each.task, each.algorithm): _groups(each) for each in BENCHMARKS}
+    found["HalfCheetah", "PPO of rsl_rl"] = rsl_rl.recorded(RSL_RL)
+
+    def roughness(names: tuple[str, str]) -> float:
+        _, baseline = found[names]
+        return float(baseline.scores(TEST, "action_variation").mean())
+
+    return {names: found[names] for names in sorted(found, key=roughness, reverse=True)}
+
+
+def short_table() -> str:
+    """The README's table."""
+    return _table(
+        {
+            "action change per step: baseline": lambda *pair: _mean(pair[1], "action_variation"),
+            "with L2C2": lambda *pair: _mean(pair[0], "action_variation"),
+            "change": lambda *pair: f"**{_change(pair, 'action_variation'):+.0%}**",
+            "return: baseline": lambda *pair: _mean(pair[1], "return"),
+            "with L2C2 ": lambda *pair: _mean(pair[0], "return"),
+        }
+    )
+
+
+def long_table() -> str:
+    """The table of results: means, probabilities, and counts of seeds with a lower return."""
+    rows = _table(
+        {
+            "action variation: baseline": lambda *pair: _mean(pair[1], "action_variation"),
+            "with L2C2": lambda *pair: _mean(pair[0], "action_variation"),
+            "P(smoother)": lambda *pair: _better([pair], "action_variation"),
+            "return: baseline": lambda *pair: _mean(pair[1], "return"),
+            "with L2C2 ": lambda *pair: _mean(pair[0], "return"),
+            "P(returns more)": lambda *pair: _better([pair], "return"),
+            "lower return": _lower,
+        }
+    )
+    pairs = list(benchmarks().values())
+    over_all = [_better(pairs, quantity) for quantity in ("action_variation", "return")]
+    return f"{rows}\n| mean of the {len(pairs)} rows | | | | {over_all[0]} | | | {over_all[1]} | |"
+
+
+def sm_table() -> str:
+    """The table of Sm, for the benchmarks with this measure."""
+    return _table(
+        {
+            "Sm: baseline": lambda *pair: _mean(pair[1], "sm_asap"),
+            "with L2C2": lambda *pair: _mean(pair[0], "sm_asap"),
+            "change": lambda *pair: f"{_change(pair, 'sm_asap'):+.0%}",
+            "P(smaller Sm)": lambda *pair: _better([pair], "sm_asap"),
+        },
+        {
+            names: pair
+            for names, pair in benchmarks().items()
+            if all(len(side.scores(TEST, "sm_asap")) for side in pair)
+        },
+    )
+
+
+def _groups(benchmark: Benchmark) -> Pair:
+    found = records(benchmark.file)
+    found = found[(found["task"] == benchmark.recorded) & (found["length"] == benchmark.length)]
+    # Seeds of 100 and above chose the gains. Runs with another tau are another study.
+    other = found["differences"].str.contains("algorithm.tau", regex=False)
+    found = found[(found["seed"] < 100) & ~other]
+    (ours,) = (group for group in group_records(found) if group.name == benchmark.method)
+    same = found[(found["method"] == "none") & found["seed"].isin(ours.seeds)]
+    (baseline,) = group_records(same)
+    assert baseline.seeds == ours.seeds and baseline.setup == ours.setup
+    return ours, baseline
+
+
+def _table(
+    columns: Mapping[str, Callable[[Group, Group], str]],
+    pairs: Mapping[tuple[str, str], Pair] | None = None,
+) -> str:
+    names = ["task", "algorithm (seeds)", *(name.strip() for name in columns)]
+    rows = [names, ["---"] * len(names)]
+    for (task, algorithm), pair in (benchmarks() if pairs is None else pairs).items():
+        cells = [cell(*pair) for cell in columns.values()]
+        rows.append([task, f"{algorithm} ({len(pair[0].seeds)})", *cells])
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def _mean(group: Group, quantity: str) -> str:
+    mean = group.scores(TEST, quantity).mean()
+    if quantity != "return":
+        return f"{mean:.3f}"
+    return f"{mean:.{0 if abs(mean) >= 100 else 1}f}"
+
+
+def _change(pair: Pair, quantity: str) -> float:
+    after, before = (side.scores(TEST, quantity).mean() for side in pair)
+    return float(after / before - 1)
+
+
+def _better(pairs: Sequence[Pair], quantity: str) -> str:
+    ours, baselines = zip(*pairs, strict=True)
+    return improvement_cell(ours, baselines, TEST, quantity)
+
+
+def _lower(ours: Group, baseline: Group) -> str:
+    """The number of seeds on which L2C2 returns less."""
+    after, before = (side.by_seed(TEST, "return") for side in (ours, baseline))
+    return f"{sum(after[seed] < before[seed] for seed in after)} of {len(after)}"
