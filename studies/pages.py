@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from studies import field, front_door, paper, rsl_rl, summary
+from studies import field, front_door, half_cheetah, paper, rsl_rl, summary
 from studies.cells import (
     digest,
     improvements_over_tasks,
@@ -283,7 +283,11 @@ def _new_tasks_page() -> Page:
     table = replace(table, rows=[*table.rows, *across])
     picture = "![Return against action variation on each task](new_tasks.svg)"
     draw = partial(draw_plane, groups, TEST, description=description(groups))
-    return Page({"results": f"{picture}\n\n{table.markdown()}"}, groups, draw)
+    parts = {
+        "results": f"{picture}\n\n{table.markdown()}",
+        "half_cheetah": half_cheetah.table(ROOT / "results" / "half_cheetah.csv"),
+    }
+    return Page(parts, groups, draw)
 
 
 def _field_page(name: str, shown: pd.DataFrame) -> Page:

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from studies import forest, pages, strength, trace
+from studies import forest, half_cheetah, pages, strength, trace
 from studies.cells import improvements_over_tasks, over_tasks
 from studies.field import BETTER, field_groups, field_table
 from studies.methods import against_table, choice_table, pairwise_tables
@@ -511,7 +511,7 @@ class TestPages:
     def test_every_generated_part_is_that_of_its_records(self):
         """``python -m studies.pages`` would change nothing."""
         made = pages.pages()
-        assert sum(len(page.parts) for page in made.values()) == 30
+        assert sum(len(page.parts) for page in made.values()) == 31
         for name, page in made.items():
             text = (ROOT / name).read_text()
             assert text.count(": start -->") == len(page.parts)
@@ -681,6 +681,14 @@ class TestProse:
         by_seed = records("new_tasks").pivot_table("last_mean_return", ["task", "seed"], "method")
         cheetah = by_seed.loc["HalfCheetah-v5"]
         assert len(cheetah) == 3 and (cheetah["l2c2"] < cheetah["none"]).all()
+        gait = pd.read_csv(ROOT / "results" / "half_cheetah.csv").set_index(["method", "seed"])
+        assert set(gait.index) == set(cheetah.stack().index.swaplevel())
+        on_back = gait["on_back"] > 0.5
+        counts = on_back.groupby("method").sum()
+        assert counts["l2c2"] == 3 and counts["none"] == 1
+        totals = gait["return"]
+        assert totals[on_back].max() < totals[~on_back].min() / 2
+        assert 0.85 < totals[on_back]["l2c2"].mean() / totals[on_back]["none"].mean() < 1.0
         ant = [returns[side]["Ant-v5"] for side in "bl"]
         assert f"return {ant[0]:.0f} on average, and with L2C2 {ant[1]:.0f}" in page
         swimmer = records("new_tasks").query("task == 'Swimmer-v5'").set_index(["method", "seed"])
@@ -871,3 +879,27 @@ class TestTrace:
             experiment.close()
         trace.main([str(tmp_path / "none"), str(tmp_path / "l2c2"), str(tmp_path / "a.svg")])
         assert (tmp_path / "a.svg").stat().st_size > 1000
+
+
+class TestHalfCheetah:
+    def test_runs_of_the_task_are_played(self, tmp_path, monkeypatch):
+        """A policy at rest stays upright; runs of other tasks are left out."""
+        for name, env_id in (("cheetah", "HalfCheetah-v5"), ("swimmer", "Swimmer-v5")):
+            task = TaskConfig(env_id, env_id=env_id, episodes=4, max_steps=5)
+            make_run(tmp_path / name, ExperimentConfig(task=task, regularizer=L2C2Config()), 1.0, 0.1)
+        monkeypatch.setattr(half_cheetah, "act", lambda run: lambda seen: np.zeros(6, np.float32))
+        half_cheetah.main(tmp_path, path := tmp_path / "half_cheetah.csv")
+        (row,) = pd.read_csv(path).to_dict("records")
+        assert row["method"] == "l2c2" and row["on_back"] == 0.0 and abs(row["return"]) < 5
+
+    def test_the_table_by_hand(self, tmp_path):
+        """Seeds in order, methods in the order of tables."""
+        lines = ["method,seed,return,on_back,commit", "l2c2,1,10,1,c", "l2c2,0,20.6,0.004,c"]
+        lines += ["none,0,7,0.985,c", "none,1,8,0,c", "cats,0,3,0,c", "cats,1,4,0.5,c"]
+        (tmp_path / "runs.csv").write_text("\n".join(lines))
+        assert half_cheetah.table(tmp_path / "runs.csv").splitlines()[2:] == [
+            "| baseline | 7, 8 | 99%, 0% |",
+            "| L2C2 | 21, 10 | 0%, 100% |",
+            "| CATS | 3, 4 | 0%, 50% |",
+        ]
+        assert "seeds 0, 1" in half_cheetah.table(tmp_path / "runs.csv")

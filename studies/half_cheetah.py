@@ -1,0 +1,75 @@
+"""How much of an episode policies of HalfCheetah-v5 spend on their backs (results/new_tasks.md).
+
+``python -m studies.half_cheetah FOLDER FILE.csv`` plays the runs below a folder, and writes a line
+for each of them.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from studies.cells import number_range
+from studies.filters import EPISODES, SEED, act, make_task, play
+from torchrl_l2c2.experiment import ExperimentConfig
+from torchrl_l2c2.experiment.analysis.reports import find_runs
+
+COLUMNS = ["method", "seed", "return", "on_back", "commit"]
+METHODS = {"none": "baseline", "l2c2": "L2C2", "cats": "CATS"}
+PITCH = 1
+"""Entry of the observation with the trunk's pitch, in radians; 0 is upright."""
+
+
+def share_on_back(observations: NDArray[np.floating]) -> float:
+    """Share of the steps in which the trunk is turned by more than a quarter of a circle.
+
+    Args:
+        observations (array): Observations of an episode, ``[T, 17]``.
+
+    Examples:
+        >>> pitch = np.array([0.1, -1.5, 1.6, 3.3, 6.2])
+        >>> share_on_back(np.stack([0 * pitch, pitch], 1))
+        0.4
+    """
+    return float((np.cos(observations[:, PITCH]) < 0).mean())
+
+
+def main(folder: Path, path: Path) -> None:
+    """Plays the runs of HalfCheetah-v5 below a folder, and writes the file."""
+    rows = []
+    for run in find_runs([folder], required=True).runs:
+        if run.task != "HalfCheetah-v5":
+            continue
+        policy, env = act(run.folder), make_task(ExperimentConfig.from_dict(run.config).task)
+        played = [play(env, policy, SEED + episode) for episode in range(EPISODES)]
+        env.close()
+        total = np.mean([episode[0] for episode in played])
+        on_back = np.mean([share_on_back(episode[2]) for episode in played])
+        commit = run.versions.get("commit", "")
+        rows.append([run.regularizer, run.seed, f"{total:.6g}", f"{on_back:.4g}", commit])
+        print(*rows[-1], flush=True)
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([COLUMNS, *sorted(rows)])
+
+
+def table(path: Path) -> str:
+    """The returns by seed and the shares of steps on the back, as Markdown."""
+    runs = pd.read_csv(path).sort_values("seed")
+    seeds = number_range(runs["seed"].unique().tolist())
+    rows = [["method", f"return, seeds {seeds}", "steps on the back"], ["---"] * 3]
+    for method, name in METHODS.items():
+        own = runs[runs["method"] == method]
+        shares = [f"{math.floor(100 * share + 0.5)}%" for share in own["on_back"]]
+        returns = [f"{total:.0f}" for total in own["return"]]
+        rows.append([name, ", ".join(returns), ", ".join(shares)])
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]))
