@@ -1,7 +1,7 @@
 """Picture and table of the strength against smoothness and return.
 
 ``python -m studies.strength`` reads ``strength.csv`` in ``results/``. It writes ``strength.svg``,
-and the table of ``results/strength.md``.
+and the tables of ``results/strength.md``.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import pandas as pd
 from studies.cells import number_range
 from studies.field import TEST
 from studies.files import ROOT, fill, records
+from studies.methods import choice_table
 from torchrl_l2c2.experiment.analysis.reports.figures import save, subplots
 from torchrl_l2c2.experiment.analysis.reports.groups import Group, group_records
 from torchrl_l2c2.experiment.analysis.reports.records import merge
@@ -25,7 +26,8 @@ from torchrl_l2c2.experiment.run.files import write_atomically
 PAGE = ROOT / "results" / "strength.md"
 PICTURE = ROOT / "results" / "strength.svg"
 MEASURES = ("action_variation", "sm_asap", "return")
-SEEDS = 3  # Seeds from 100 on choose a preset.
+SEEDS = 3
+CANDIDATES = range(100, 105)  # Seeds that choose a preset.
 SETTING = "regularizer.strength"
 
 
@@ -51,6 +53,15 @@ def shown() -> pd.DataFrame:
     settings = ["task", "algorithm", "length"]
     same = pd.MultiIndex.from_frame(others[settings]).isin(pd.MultiIndex.from_frame(own[settings]))
     return merge(own, others[same & (others["method"] == "none") & (others["seed"] < SEEDS)])
+
+
+def candidates() -> pd.DataFrame:
+    """The records that choose a preset, with those of other tables with the same settings."""
+    own, others = records("strength"), records("one_gain", "hopper_targets")
+    preset = others["differences"].str.contains("lambda_min=1 .*=mse")
+    same = (others["method"] == "none") | ((others["method"] == "l2c2_ramp") & preset)
+    found = merge(own, others[same])
+    return found[found["seed"].isin(CANDIDATES)]
 
 
 def curves(found: pd.DataFrame) -> list[Curve]:
@@ -113,9 +124,13 @@ def _draw_panel(axis: Any, curve: Curve, measure: str) -> None:
 
 
 def main() -> None:
-    """Writes the picture and the table."""
+    """Writes the picture and the tables."""
     found = curves(shown())
-    write_atomically(PAGE, fill(PAGE.read_text(), "strength", table(found)).encode())
+    parts = {"strength": table(found), "choice": choice_table(candidates()).markdown()}
+    text = PAGE.read_text()
+    for name, part in parts.items():
+        text = fill(text, name, part)
+    write_atomically(PAGE, text.encode())
     draw(found, PICTURE)
 
 

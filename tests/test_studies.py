@@ -886,7 +886,8 @@ class TestHalfCheetah:
         """A policy at rest stays upright; runs of other tasks are left out."""
         for name, env_id in (("cheetah", "HalfCheetah-v5"), ("swimmer", "Swimmer-v5")):
             task = TaskConfig(env_id, env_id=env_id, episodes=4, max_steps=5)
-            make_run(tmp_path / name, ExperimentConfig(task=task, regularizer=L2C2Config()), 1.0, 0.1)
+            config = ExperimentConfig(task=task, regularizer=L2C2Config())
+            make_run(tmp_path / name, config, 1.0, 0.1)
         monkeypatch.setattr(half_cheetah, "act", lambda run: lambda seen: np.zeros(6, np.float32))
         half_cheetah.main(tmp_path, path := tmp_path / "half_cheetah.csv")
         (row,) = pd.read_csv(path).to_dict("records")

@@ -24,7 +24,7 @@ from torchrl_l2c2.experiment import (
     make_env,
 )
 from torchrl_l2c2.experiment.agents.build import make_agent
-from torchrl_l2c2.experiment.envs.environments import ActionRatePenalty, time_limit
+from torchrl_l2c2.experiment.envs.environments import TEST_SEED, ActionRatePenalty, time_limit
 from torchrl_l2c2.experiment.envs.pictures import Drawing
 from torchrl_l2c2.experiment.errors import SimulatorError, UserError
 from torchrl_l2c2.experiment.run.evaluation import evaluate_task
@@ -332,6 +332,21 @@ def test_what_a_task_raises_in_a_test_is_told_as_in_training(monkeypatch, where,
     with pytest.raises(SimulatorError, match=f"failed in {where}: KeyError: 'cable'"):
         trained.train()
         trained.test(1)
+
+
+def test_a_reset_that_fails_in_a_late_test_is_told_as_well(monkeypatch):
+    """It is reset with the seed of the test after episode 1."""
+    still(monkeypatch)
+    trained, reset = experiment("sac", task(episodes=1), late_share=1.0), Still.reset
+
+    def fail(self, *, seed=None, options=None):
+        if seed == trained.config.seed + TEST_SEED + 1:
+            raise KeyError("cable")
+        return reset(self, seed=seed)
+
+    monkeypatch.setattr(Still, "reset", fail)
+    with pytest.raises(SimulatorError, match="failed in the test after episode 1: KeyError"):
+        trained.train()
 
 
 class Drawn(Still):

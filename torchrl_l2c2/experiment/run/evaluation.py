@@ -288,8 +288,8 @@ class LateTests:
             # Created here: many short trainings play no test episode.
             if self._collector is None:
                 self._collector = self._make_collector()
-            self._collector.set_seed(self._seed + number)
             with simulator_errors(f"{self._task.env_id} failed in the test after episode {number}"):
+                self._collector.set_seed(self._seed + number)
                 episode = self._collector.rollout()
         check_finite(episode, 0, test=True)
         values = _return(episode), _variation(episode["action"])
