@@ -850,6 +850,25 @@ class TestStrength:
         """``python -m studies.strength`` would change nothing."""
         table = strength.table(strength.curves(strength.shown()))
         assert table in strength.PAGE.read_text() and table in strength.PICTURE.read_text()
+        assert choice_table(strength.candidates()).markdown() in strength.PAGE.read_text()
+
+    def test_no_weaker_preset_by_the_rule(self):
+        """On Pendulum every strength returns more than 5% less than the baseline."""
+        found = strength.candidates()
+        given = found["differences"].str.extract(r"regularizer\.strength=([\d.]+)")[0].fillna("1")
+        named = given.where(found["method"] != "none", "baseline")
+        means = found.groupby(["task", named]).mean(numeric_only=True)
+        assert found.groupby(["task", named]).size().loc[["pendulum", "lunarlander"]].eq(5).all()
+        total = means["last_mean_return"].loc["pendulum"]
+        lost = (total["baseline"] - total.drop("baseline")) / abs(total["baseline"])
+        assert list(lost.index) == ["0.1", "0.3", "1"] and (lost > 0.05).all()
+        page = " ".join(strength.PAGE.read_text().split())
+        assert f"at strength 0.1 is {lost['0.1']:.1%} below the baseline" in page
+        assert f"at 1 the return is {lost['1']:.0%} below" in page
+        sm = means["last_mean_sm_asap"].unstack("task")[["pendulum", "lunarlander"]]
+        ratios = np.exp(np.log(sm / sm.loc["baseline"]).mean(axis=1))
+        said = "Sm is {:.2f} (strength 0.1) and {:.2f} (0.3) of the baseline's, and {:.2f} at"
+        assert said.format(*ratios[["0.1", "0.3", "1"]]) in page
 
 
 class TestTrace:
