@@ -12,7 +12,7 @@ from studies import rsl_rl
 from studies.field import TEST
 from studies.files import ROOT, records
 from torchrl_l2c2.experiment.analysis.reports.groups import Group, group_records
-from torchrl_l2c2.experiment.analysis.reports.table import improvement_cell
+from torchrl_l2c2.experiment.analysis.reports.table import improvement, improvement_cell
 
 OURS = "L2C2, mse 1, ramp"
 """PPO's preset, in tables."""
@@ -82,7 +82,7 @@ def short_table() -> str:
         {
             "action change per step: baseline": lambda *pair: _mean(pair[1], "action_variation"),
             "with L2C2": lambda *pair: _mean(pair[0], "action_variation"),
-            "change": lambda *pair: f"**{_change(pair, 'action_variation'):+.0%}**",
+            "change": _bold_change,
             "return: baseline": lambda *pair: _mean(pair[1], "return"),
             "with L2C2 ": lambda *pair: _mean(pair[0], "return"),
         }
@@ -159,6 +159,16 @@ def _mean(group: Group, quantity: str) -> str:
 def _change(pair: Pair, quantity: str) -> float:
     after, before = (side.scores(TEST, quantity).mean() for side in pair)
     return float(after / before - 1)
+
+
+def _bold_change(*pair: Group) -> str:
+    """The change of the action variation, in bold if it is beyond seed noise."""
+    ours, baseline = pair
+    found = improvement([ours], [baseline], TEST, "action_variation")
+    assert found is not None and found.interval is not None
+    low, high = found.interval
+    text = f"{_change((ours, baseline), 'action_variation'):+.0%}"
+    return text if low <= 0.5 <= high else f"**{text}**"
 
 
 def _better(pairs: Sequence[Pair], quantity: str) -> str:
