@@ -242,6 +242,36 @@ class TestThePenalty:
         found = loss.policy_regularizer(batch)["loss_l2c2_actor"]
         torch.testing.assert_close(found, torch.maximum(*alone))
 
+    @pytest.mark.parametrize("neighbors", ["box", "line"])
+    def test_neighbors_of_other_observations_are_told_once(self, neighbors):
+        """As of a transform before ObservationNorm: the stored distances look right."""
+        torch.manual_seed(0)
+        near = Neighborhood(sigma=1.0, neighbors=neighbors)
+        loss = L2C2Loss(DDPGLoss(deterministic_actor(), qvalue()), near)
+        batch = loss.neighbor_transform()(transitions(6))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            loss.policy_regularizer(batch)
+        scaled = batch.clone()
+        for key in ("observation", ("next", "observation")):
+            scaled[key] = 10.0 * batch[key]
+        other = L2C2Loss(DDPGLoss(deterministic_actor(), qvalue()), near)
+        with pytest.warns(UserWarning, match=r"not near its 'observation'.*after all transforms"):
+            other.policy_regularizer(scaled)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            other.policy_regularizer(scaled)
+
+    def test_a_nested_key_without_a_list_is_told_to_be_put_into_one(self):
+        """A tuple is a sequence of names elsewhere."""
+        keys = [("agents", "observation"), ("agents", "action")]
+        actor = TensorDictModule(mlp(OBSERVATION, ACTION), keys[:1], keys[1:])
+        value = TensorDictModule(mlp(OBSERVATION + ACTION, 1), keys, ["state_action_value"])
+        with pytest.raises(ValueError, match=r"into a list, \[\('agents', 'observation'\)\]\."):
+            L2C2Loss(DDPGLoss(actor, value), NEAR, moved_keys=("agents", "observation"))
+        with pytest.raises(ValueError, match=r"names \['obs'\], .*: name one or several of"):
+            L2C2Loss(DDPGLoss(actor, value), NEAR, moved_keys=["obs"])
+
     @pytest.mark.parametrize("count", [4, AGENTS])
     def test_priority_weights_of_a_team_weight_each_of_its_agents(self, count):
         """Weights [B] for differences [B, agents], also in a batch of as many rows as agents."""

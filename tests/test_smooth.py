@@ -735,8 +735,11 @@ class TestPresets:
         """Not with settings to pass."""
         with pytest.raises(TypeError, match=r"a loss without a regularizer, got a L2C2Loss\[SAC"):
             smooth(smooth(sac()), "cats")
-        with pytest.raises(TypeError, match="Call smooth before the loss is compiled"):
-            smooth(torch.compile(sac(), backend="eager"))
+        for module in (torch.compile(sac(), backend="eager"), sac().actor_network):
+            with pytest.raises(
+                TypeError, match=r"Call smooth on the loss, such as SACLoss.*before"
+            ):
+                smooth(module)
         with pytest.raises(
             TypeError, match=r"the class SACLoss: make the loss first, SACLoss\(\.\."
         ):
@@ -803,6 +806,14 @@ class TestProgress:
         twin = pickle.loads(pickle.dumps(loss))
         twin.set_progress(0.5)
         assert (twin.regularizer_gain.item(), loss.regularizer_gain.item()) == (0.5, 0.25)
+
+    def test_a_checkpoint_with_a_ramp_loads_without_one(self):
+        """Also as a part of another module; the gain is the new loss's own."""
+        loss, constant = smooth(ppo()), smooth(ppo(), ramp=None, strength=2.0)
+        loss.set_progress(0.25)
+        saved = nn.ModuleDict({"loss": loss}).state_dict()
+        nn.ModuleDict({"loss": constant}).load_state_dict(saved)
+        assert constant.regularizer_gain.item() == 2.0 and "loss.regularizer_progress" in saved
 
     def test_a_checkpoint_of_the_baseline_loads(self):
         """The progress stays."""

@@ -181,8 +181,8 @@ def _what(loss: object) -> str:
     """Describes an argument that is no loss, and the remedy."""
     if isinstance(loss, type):
         return f"the class {loss.__name__}: make the loss first, {loss.__name__}(...)"
-    hint = ". Call smooth before the loss is compiled" if isinstance(loss, nn.Module) else ""
-    return f"a {type(loss).__name__}{hint}"
+    hint = ". Call smooth on the loss, such as SACLoss(policy, ...), before the loss is compiled"
+    return f"a {type(loss).__name__}{hint if isinstance(loss, nn.Module) else ''}"
 
 
 def _shown(settings: Mapping[str, Any]) -> str:

@@ -12,6 +12,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.compiler import is_compiling
 
+from torchrl_l2c2.objectives._batch import next_key
+
 POLICY_LOSSES = ("loss_actor", "loss_objective", "loss_bc")
 """Keys of the term that trains the policy."""
 
@@ -256,6 +258,32 @@ class TermWatch:
                 "effect: keep the true next observations.",
                 stacklevel=5,
             )
+
+    def see_neighbors(
+        self, name: str, neighbors: TensorDictBase, batch: TensorDictBase, radius: float
+    ) -> None:
+        """Warns of neighbors that were drawn before a transform changed the observations.
+
+        Observations with neighbors are floating point.
+        """
+        if "neighbors" in self._warned or not isinstance(neighbors, TensorDictBase):
+            return
+        self._warned.add("neighbors")
+        for key, there in neighbors.items(include_nested=True, leaves_only=True):
+            here, following = batch.get(key, None), batch.get(next_key(key), None)
+            if here is None or following is None or here.shape != following.shape:
+                continue
+            # [*B, K, *F] and [*B, *F]
+            there = there.movedim(neighbors.batch_dims, 0)
+            span = radius * (following - here).abs()
+            rounding = 16 * torch.finfo(here.dtype).eps * (here.abs() + following.abs())
+            if bool(((there - here).abs() > 1.01 * span + rounding).any()):
+                warnings.warn(
+                    f"the neighbors in the batch are not near its {key!r}, so the penalty of "
+                    f"{name} is wrong: append neighbor_transform() after all transforms that "
+                    "change observations, such as ObservationNorm.",
+                    stacklevel=6,
+                )
 
 
 def _warn_of_several_steps(batch: TensorDictBase) -> None:

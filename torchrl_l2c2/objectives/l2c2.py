@@ -379,8 +379,9 @@ class L2C2Loss(RegularizedLoss):
         neighbor = tensordict.get(self.l2c2_neighbor_key, None)
         if neighbor is None:
             neighbor = self._draw(tensordict, rows)
-        elif rows is not None:
-            neighbor = at_rows(neighbor, rows)
+        else:
+            self.warn_misplaced(neighbor, tensordict, self.l2c2_neighborhood.radius)
+            neighbor = neighbor if rows is None else at_rows(neighbor, rows)
         states, distance = _read_neighbors(neighbor, self.l2c2_neighbor_key)
         counts = distance[0].isfinite()
         self.warn_uncounted(counts, self.l2c2_neighborhood.max_step)
@@ -469,10 +470,12 @@ def _read_moved_keys(
         )
     there = sorted({key for states in read.values() for key in states}, key=str)
     if unread := [key for key in keys if key not in there]:
-        raise ValueError(
-            f"moved_keys names {unread}, and the networks read {there}; what begins with '_' is "
-            "TorchRL's own and no observation."
-        )
+        hint = f"name one or several of {there}."
+        if tuple(keys) in there:
+            hint = f"put the nested key into a list, [{tuple(keys)!r}]."
+        elif any(str(key).startswith("_") for key in unread):
+            hint = "an entry that begins with '_' is TorchRL's own, and no observation."
+        raise ValueError(f"moved_keys names {unread}, and the networks read {there}: {hint}")
     if still := [name for name, states in read.items() if not set(keys) & set(states)]:
         raise ValueError(
             f"moved_keys names {keys}, but {still[0]} reads only {list(read[still[0]])}, which "

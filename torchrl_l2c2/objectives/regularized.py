@@ -382,7 +382,8 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
     def _load_from_state_dict(
         self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
     ) -> None:
-        if self._ramp is None:
+        if self._ramp is None:  # The checkpoint may be of a loss with a ramp.
+            state_dict.pop(prefix + PROGRESS, None)
             super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
             return
         saved = prefix + PROGRESS in state_dict
@@ -811,6 +812,19 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         """
         if not is_compiling():
             self._watch.see_counts(type(self).__name__, counts, max_step)
+
+    def warn_misplaced(
+        self, neighbors: TensorDictBase, batch: TensorDictBase, radius: float
+    ) -> None:
+        """Warns if the first neighbors of a batch are not near its observations; eager only.
+
+        Args:
+            neighbors: the batch's entry of :class:`~torchrl_l2c2.NeighborTransform`, ``[*B]``.
+            batch: the batch, ``[*B]``.
+            radius: half the width of the neighborhood, in units of the step to the next state.
+        """
+        if not is_compiling():
+            self._watch.see_neighbors(type(self).__name__, neighbors, batch, radius)
 
     def reduce_term(
         self,
