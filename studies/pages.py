@@ -15,12 +15,11 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from studies import field, front_door, half_cheetah, paper, rsl_rl, summary
+from studies import field, front_door, half_cheetah, paper, rsl_rl, summary, td3
 from studies.cells import (
     digest,
     improvements_over_tasks,
     regrouped,
-    seeds_table,
 )
 from studies.field import BETTER, TEST, field_groups, field_table
 from studies.files import ROOT, fill, records
@@ -43,12 +42,9 @@ from torchrl_l2c2.experiment.analysis.reports.groups import (
     settings_notes,
 )
 from torchrl_l2c2.experiment.analysis.reports.records import merge
-from torchrl_l2c2.experiment.analysis.reports.statistics import mean
 from torchrl_l2c2.experiment.analysis.reports.table import (
     COMPARED,
-    Estimate,
     comparison_table,
-    improvement_cell,
 )
 from torchrl_l2c2.experiment.run.files import write_atomically
 
@@ -129,14 +125,9 @@ def pages() -> dict[str, Page]:
         "results/rsl_rl.md": Page({"results": front_door.table(RSL_RL, [rsl_rl.TASK])}),
         "results/td3.md": Page(
             {
-                "test": td3_test(),
-                "choice": td3_by_seed(records("td3").query("seed >= 100")),
-                "ten": td3_by_seed(records("td3_ten_seeds").query("seed >= 100")),
-                "again": td3_by_seed(
-                    records("td3", "td3_ten_seeds").query(
-                        "seed < 10 and method in ['cats', 'caps']"
-                    )
-                ),
+                "test": td3.test_table(),
+                "last": td3.last_policy_table(),
+                "choice": td3.first_choice_table(),
             }
         ),
         "results/field_gains.md": Page(dict(zip(("rivals", "one", "caps"), chosen, strict=True))),
@@ -177,47 +168,6 @@ def parts() -> str:
             if row := shown.get((task, method)):
                 rows.append([task, setting, *(row[column] for column in kept)])
     return "\n".join(f"| {' | '.join(row)} |" for row in rows)
-
-
-TD3_TESTED = {
-    "none": "baseline",
-    "l2c2_ramp": "L2C2, `lambda_min=10`, ramp",
-    "cats": "CATS, `lambda_temporal=3`",
-    "caps": "CAPS, `lambda_temporal=1`, `lambda_spatial=5`",
-}
-
-
-def td3_test() -> str:
-    """The table of TD3's presets on seeds 0 to 9, of the policies of the last 10% of training."""
-    found = records("td3")
-    found = found[(found["seed"] < 10) & found["method"].isin(list(TD3_TESTED))]
-    groups = {group.first.method: group for group in group_records(found)}
-    columns = ["setting", "return", "action variation", "P(returns more)", "P(smoother)"]
-    rows = [columns, ["---"] * len(columns)]
-    for method, name in TD3_TESTED.items():
-        group, test = groups[method], "late_mean"
-        scores = [group.scores(test, quantity) for quantity in ("return", "action_variation")]
-        means = [Estimate.of(mean, each) for each in scores]
-        cells = [
-            "" if found is None else found.text(f"{{:.{digits}f}}".format)
-            for found, digits in zip(means, (1, 3), strict=True)
-        ]
-        better = ("return", "action_variation")
-        compared = [improvement_cell([group], [groups["none"]], test, each) for each in better]
-        rows.append([name, *cells, *(compared if method != "none" else ["", ""])])
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
-
-
-def td3_by_seed(tried: pd.DataFrame) -> str:
-    """The table of TD3's runs by seed, of the policies of the last 10% of training."""
-    found = {}
-    for group in group_records(tried):
-        returns, variations = (
-            group.scores("late_mean", quantity).ravel().tolist()
-            for quantity in ("return", "action_variation")
-        )
-        found[group.name] = returns, variations
-    return seeds_table(found)
 
 
 def reacher_by_seed(runs: pd.DataFrame) -> str:

@@ -633,7 +633,7 @@ class TestPresets:
         assert message.startswith(f"{base} takes the preset of {nearest}")
         assert f"not tried with {base}" in message
         assert told[0].filename == __file__
-        assert loss.l2c2_neighborhood.lambda_max in (100.0, 1000.0)
+        assert loss.l2c2_neighborhood.lambda_max in (100.0, 300.0, 1000.0)
 
     @pytest.mark.parametrize("method", METHODS)
     @pytest.mark.parametrize("name", WITHOUT)

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from studies import forest, half_cheetah, pages, strength, trace
+from studies import forest, half_cheetah, pages, strength, td3, trace
 from studies.cells import improvements_over_tasks, over_tasks
 from studies.field import BETTER, field_groups, field_table
 from studies.methods import against_table, choice_table, pairwise_tables
@@ -511,7 +511,7 @@ class TestPages:
     def test_every_generated_part_is_that_of_its_records(self):
         """``python -m studies.pages`` would change nothing."""
         made = pages.pages()
-        assert sum(len(page.parts) for page in made.values()) == 31
+        assert sum(len(page.parts) for page in made.values()) == 30
         for name, page in made.items():
             text = (ROOT / name).read_text()
             assert text.count(": start -->") == len(page.parts)
@@ -591,8 +591,7 @@ class TestProse:
         returned = [group.scores("last_mean", "return").mean() for group in (cheetah, baseline)]
         assert f"{returned[0] / returned[1] - 1:.0%}, with three seeds" in readme
         assert len(cheetah.seeds) == 3
-        td3 = benchmarks()["Pendulum", "TD3"][0].by_seed("last_mean", "return").values()
-        assert sum(total < -300 for total in td3) == 1
+        assert td3.failures(benchmarks()["Pendulum", "TD3"][0]) == 2
 
     def test_rivals_over_four_tasks(self):
         """How probable a smoother run is, and one that returns more."""
@@ -718,33 +717,45 @@ class TestProse:
         learned = runs[runs["return"] >= -200].groupby(["algorithm", "method"])["return"].mean()
         assert learned.round().to_list() == [-126, -127] * 2
 
-    def test_td3s_second_choice(self):
-        """By its rule, from the records, and the sentence on L2C2."""
-        runs = records("td3_ten_seeds").query("seed >= 100")
-        strength = runs["differences"].str.extract(r"regularizer\.strength=([\d.]+)")[0].fillna("1")
-        scores = ["late_mean_return", "late_mean_action_variation"]
-        means = runs.groupby([runs["method"], strength])[scores].mean()
-        baseline = means.loc[("none", "1")]
-        kept = means[means[scores[0]] >= 1.05 * baseline[scores[0]]].drop(index="none")
-        chosen = kept.groupby("method")[scores[1]].idxmin()
-        assert dict(chosen.values) == {"l2c2": "1", "cats": "0.3"}
-        lower = 1 - means.loc[("l2c2", "1")] / baseline
-        sentence = f"falls by {lower.iloc[1]:.0%}, and the return by {-lower.iloc[0]:.0%}"
-        assert sentence in " ".join((ROOT / "results" / "td3.md").read_text().split())
-        assert runs[runs["method"] == "l2c2"][scores[0]].min() > -300
+    def test_td3s_strength(self):
+        """The rule on the last policies, its consequence on seeds 0 to 9, and the sentences."""
+        page = " ".join((ROOT / "results" / "td3.md").read_text().split())
+        groups = td3.by_setting(records("td3").query("seed >= 110"))
+        assert td3.chosen(groups)["L2C2"] == 0.3 == td3.PRESETS["L2C2"]
+        chosen, baseline = groups["L2C2", 0.3], groups[td3.BASELINE]
+        assert len(chosen.seeds) == len(baseline.seeds) == 20
+        assert td3.failures(chosen) == td3.failures(baseline) == 0
+        assert td3.failures(groups["L2C2", 1.0]) == 3
+        means = {
+            setting: {
+                quantity: group.scores("last_mean", quantity).mean()
+                for quantity in ("return", "action_variation")
+            }
+            for setting, group in groups.items()
+        }
+        ours, plain = means["L2C2", 0.3], means[td3.BASELINE]
+        assert abs(ours["return"] - plain["return"]) < 0.01 * abs(plain["return"])
+        lower = 1 - ours["action_variation"] / plain["action_variation"]
+        assert f"the mean action variation is {lower:.0%} lower" in page
+        shown = td3.by_setting(records("td3").query("seed < 10"))
+        kept, before = (shown["L2C2", each].scores("last_mean", "return") for each in (0.3, 1.0))
+        assert kept.mean() >= before.mean()
+        assert f"({kept.mean():.1f} and {before.mean():.1f})" in page
+        assert [td3.failures(shown["L2C2", each]) for each in (0.3, 1.0)] == [2, 1]
+        smooth, rough = (
+            shown[each].scores("last_mean", "action_variation").mean()
+            for each in (("L2C2", 0.3), td3.BASELINE)
+        )
+        assert f"by {1 - smooth / rough:.0%}, from {rough:.3f} to {smooth:.3f}" in page
+        assert td3.failures(shown["CATS", 1.0]) == td3.failures(shown["CAPS", 1.0]) == 0
 
-    def test_td3s_second_choice_on_the_shown_seeds(self):
-        """The chosen strengths return less than the presets, so the presets stay."""
-        score, page = "late_mean_return", (ROOT / "results" / "td3.md").read_text()
-        known = {"cats": (3.0, None), "caps": (1.0, 5.0)}
-        for method, (temporal, spatial) in known.items():
-            weaker = records("td3_ten_seeds").query("seed < 10 and method == @method")[score]
-            present = records("td3").query("seed < 10 and method == @method")[score]
-            assert len(weaker) == len(present) == 10 and weaker.mean() < present.mean()
-            assert f"{weaker.min():.0f}" in page.split("One of ten runs of each")[1]
-            settings = preset(method, "td3").settings
-            assert settings["lambda_temporal"] == temporal
-            assert settings.get("lambda_spatial") == spatial
+    def test_td3s_presets_are_those_of_the_table(self):
+        """Strengths times the gains."""
+        for method, gains in td3.GAINS.items():
+            settings = preset(method.lower(), "td3").settings
+            names = ("lambda_min",) if method == "L2C2" else ("lambda_temporal", "lambda_spatial")
+            for name, gain in zip(names, gains, strict=False):
+                assert settings[name] == pytest.approx(td3.PRESETS[method] * gain)
 
     def test_walkings_gains(self):
         """Every run of the seeds that its gains are chosen on is a cell."""

@@ -118,8 +118,8 @@ PRESETS: dict[str, dict[str, Preset]] = {
             {
                 "policy_distance": "mean",
                 "neighbors": "line",
-                "lambda_min": 10.0,
-                "lambda_max": 1000.0,
+                "lambda_min": 3.0,
+                "lambda_max": 300.0,
                 "beta": 0.0,
             },
             ramp=1.0,

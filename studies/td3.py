@@ -1,0 +1,145 @@
+"""The tables of TD3's presets in ``results/td3.md``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import pandas as pd
+
+from studies.cells import seeds_table
+from studies.field import TEST
+from studies.files import records
+from torchrl_l2c2.experiment.analysis.reports.groups import Group, group_records
+from torchrl_l2c2.experiment.analysis.reports.statistics import mean
+from torchrl_l2c2.experiment.analysis.reports.table import Estimate, improvement_cell
+
+FAILED = -300.0
+"""Return below which a policy has failed."""
+
+STRENGTHS = (1.0, 0.3, 0.1)
+METHODS = {"l2c2": "L2C2", "cats": "CATS", "caps": "CAPS"}
+SETTINGS = {
+    "L2C2": "`lambda_min={:g}`, ramp",
+    "CATS": "`lambda_temporal={:g}`, ramp",
+    "CAPS": "`lambda_temporal={:g}`, `lambda_spatial={:g}`",
+}
+GAINS = {"L2C2": (10.0,), "CATS": (3.0,), "CAPS": (1.0, 5.0)}
+"""Gains at strength 1."""
+
+PRESETS = {"L2C2": 0.3, "CATS": 1.0, "CAPS": 1.0}
+"""Strengths of the presets, relative to these gains."""
+
+Setting = tuple[str, float]
+"""A method and its strength; ``("baseline", 0.0)`` for the baseline."""
+
+BASELINE: Setting = ("baseline", 0.0)
+
+
+def name(setting: Setting) -> str:
+    """The name of a setting in tables.
+
+    Examples:
+        >>> name(("CAPS", 0.1)), name(("baseline", 0.0))
+        ('CAPS, `lambda_temporal=0.1`, `lambda_spatial=0.5`', 'baseline')
+    """
+    method, strength = setting
+    if setting == BASELINE:
+        return method
+    return f"{method}, {SETTINGS[method].format(*(strength * gain for gain in GAINS[method]))}"
+
+
+def by_setting(runs: pd.DataFrame) -> dict[Setting, Group]:
+    """The runs of the candidates by setting, without those of the first choice."""
+    found: dict[Setting, Group] = {}
+    for group in group_records(runs):
+        method = group.first.method
+        if method == "none":
+            found[BASELINE] = group
+        elif method == "l2c2_ramp":  # As the preset, under the name of that time.
+            found["L2C2", 1.0] = group
+        else:
+            strength = float(group.settings.get("regularizer.strength", 1.0))
+            found[METHODS[method], strength] = group
+    return found
+
+
+def test_table() -> str:
+    """Every strength that was run on seeds 0 to 9, by the last policy, next to the baseline."""
+    groups = by_setting(records("td3").query("seed < 10"))
+    columns = ["setting", "return", "failed", "action variation", "P(returns more)", "P(smoother)"]
+    rows = [columns, ["---"] * len(columns)]
+    order = [BASELINE, *((m, s) for m in GAINS for s in STRENGTHS if (m, s) in groups)]
+    for setting in order:
+        group = groups[setting]
+        total, variation = (
+            Estimate.of(mean, group.scores(TEST, quantity))
+            for quantity in ("return", "action_variation")
+        )
+        assert total is not None and variation is not None
+        better = [""] * 2
+        if setting != BASELINE:
+            better = [
+                improvement_cell([group], [groups[BASELINE]], TEST, quantity)
+                for quantity in ("return", "action_variation")
+            ]
+        shown = name(setting)
+        if setting[0] in PRESETS and setting[1] == PRESETS[setting[0]]:
+            shown = f"**{shown}** (the preset)"
+        cells = [total.text("{:.1f}".format), f"{failures(group)} of {len(group.seeds)}"]
+        rows.append([shown, *cells, variation.text("{:.3f}".format), *better])
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def failures(group: Group) -> int:
+    """The number of runs whose last policy has failed."""
+    return int((group.scores(TEST, "return") < FAILED).sum())
+
+
+def chosen(groups: Mapping[Setting, Group]) -> dict[str, float]:
+    """The strength of each method by the rule of the page."""
+    found = {}
+    for method in GAINS:
+        tried = [strength for strength in STRENGTHS if (method, strength) in groups]
+        kept = [strength for strength in tried if qualifies(groups, (method, strength))]
+        found[method] = min(
+            kept or [min(tried)],
+            key=lambda strength: _mean(groups[method, strength], "action_variation"),
+        )
+    return found
+
+
+def qualifies(groups: Mapping[Setting, Group], setting: Setting) -> bool:
+    """Checks the return and the failures of a setting."""
+    group, baseline = groups[setting], groups[BASELINE]
+    least = _mean(baseline, "return") - 0.05 * abs(_mean(baseline, "return"))
+    return _mean(group, "return") >= least and failures(group) <= failures(baseline)
+
+
+def last_policy_table() -> str:
+    """The strengths on seeds 110 to 129, by the last policy."""
+    groups = by_setting(records("td3").query("seed >= 110"))
+    columns = ["setting", "seeds", "mean return", "failed", "mean action variation", "qualifies"]
+    rows = [columns, ["---"] * len(columns)]
+    for setting in (BASELINE, *((m, s) for m in GAINS for s in STRENGTHS)):
+        group = groups[setting]
+        cells = [str(len(group.seeds)), f"{_mean(group, 'return'):.1f}", str(failures(group))]
+        cells.append(f"{_mean(group, 'action_variation'):.3f}")
+        cells.append("" if setting == BASELINE else "yes" if qualifies(groups, setting) else "no")
+        rows.append([name(setting), *cells])
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def first_choice_table() -> str:
+    """The candidates of the first choice by seed, of the policies of the last 10% of training."""
+    found = {}
+    for group in group_records(records("td3").query("100 <= seed < 110")):
+        returns, variations = (
+            group.scores("late_mean", quantity).ravel().tolist()
+            for quantity in ("return", "action_variation")
+        )
+        found[group.name] = returns, variations
+    return seeds_table(found)
+
+
+def _mean(group: Group, quantity: str) -> float:
+    return float(group.scores(TEST, quantity).mean())
