@@ -49,7 +49,7 @@ def name(setting: Setting) -> str:
 
 
 def by_setting(runs: pd.DataFrame) -> dict[Setting, Group]:
-    """The runs of the candidates by setting, without those of the first choice."""
+    """The runs of the candidates by setting, without the runs of the first choice."""
     found: dict[Setting, Group] = {}
     for group in group_records(runs):
         method = group.first.method
