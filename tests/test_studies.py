@@ -748,6 +748,13 @@ class TestProse:
         )
         assert f"by {1 - smooth / rough:.0%}, from {rough:.3f} to {smooth:.3f}" in page
         assert td3.failures(shown["CATS", 1.0]) == td3.failures(shown["CAPS", 1.0]) == 0
+        assert td3.chosen(groups) == {"L2C2": 0.3, "CATS": 0.1, "CAPS": 0.1}
+        cats = [groups["CATS", each] for each in td3.STRENGTHS]
+        assert sum(len(each.seeds) for each in cats) == 60
+        assert not any(td3.failures(each) for each in cats)
+        kept, before = (shown["CAPS", each].scores("last_mean", "return") for each in (0.1, 1.0))
+        assert f"({kept.mean():.1f} and {before.mean():.1f})" in page
+        assert kept.mean() < before.mean()
 
     def test_td3s_presets_are_those_of_the_table(self):
         """Strengths times the gains."""
