@@ -752,9 +752,10 @@ class TestProse:
         cats = [groups["CATS", each] for each in td3.STRENGTHS]
         assert sum(len(each.seeds) for each in cats) == 60
         assert not any(td3.failures(each) for each in cats)
-        kept, before = (shown["CAPS", each].scores("last_mean", "return") for each in (0.1, 1.0))
-        assert f"({kept.mean():.1f} and {before.mean():.1f})" in page
-        assert kept.mean() < before.mean()
+        for method in ("CATS", "CAPS"):
+            kept, before = (shown[method, s].scores("last_mean", "return") for s in (0.1, 1.0))
+            assert f"({kept.mean():.1f} and {before.mean():.1f})" in page
+            assert kept.mean() < before.mean()
 
     def test_td3s_presets_are_those_of_the_table(self):
         """Strengths times the gains."""
