@@ -17,7 +17,8 @@ FAILED = -300.0
 """Return below which a policy has failed."""
 
 STRENGTHS = (1.0, 0.3, 0.1)
-METHODS = {"l2c2": "L2C2", "cats": "CATS", "caps": "CAPS"}
+METHODS = {"l2c2": "L2C2", "l2c2_ramp": "L2C2", "cats": "CATS", "caps": "CAPS"}
+FIRST_GAIN = {"L2C2": "lambda_min", "CATS": "lambda_temporal", "CAPS": "lambda_temporal"}
 SETTINGS = {
     "L2C2": "`lambda_min={:g}`, ramp",
     "CATS": "`lambda_temporal={:g}`, ramp",
@@ -52,14 +53,16 @@ def by_setting(runs: pd.DataFrame) -> dict[Setting, Group]:
     """The runs of the candidates by setting, without the runs of the first choice."""
     found: dict[Setting, Group] = {}
     for group in group_records(runs):
-        method = group.first.method
-        if method == "none":
-            found[BASELINE] = group
-        elif method == "l2c2_ramp":  # As the preset, under the name of that time.
-            found["L2C2", 1.0] = group
-        else:
-            strength = float(group.settings.get("regularizer.strength", 1.0))
-            found[METHODS[method], strength] = group
+        setting = BASELINE
+        if group.first.method != "none":
+            method = METHODS[group.first.method]
+            gain = float(group.settings[f"regularizer.{FIRST_GAIN[method]}"])
+            gain *= float(group.settings.get("regularizer.strength", 1.0))
+            # Relative to a constant: the preset, whose strength is 1, has changed.
+            setting = method, round(gain / GAINS[method][0], 6)
+        if setting in found:
+            raise ValueError(f"Expected one setting of {name(setting)}, got two.")
+        found[setting] = group
     return found
 
 

@@ -757,6 +757,19 @@ class TestProse:
             assert f"({kept.mean():.1f} and {before.mean():.1f})" in page
             assert kept.mean() < before.mean()
 
+    def test_td3s_strengths_are_relative_to_fixed_gains(self):
+        """A run with the present preset has the strength of the same run before it changed."""
+        runs = records("td3").query("seed < 10 and method == 'l2c2'").copy()
+        before = runs["differences"]
+        assert before.str.contains("regularizer.strength=0.3").all()
+        runs["differences"] = before.str.replace("lambda_min=10 ", "lambda_min=3 ").str.replace(
+            "regularizer.strength=0.3 ", ""
+        )
+        assert list(td3.by_setting(runs)) == [("L2C2", 0.3)]
+        runs["settings"] = "another"
+        with pytest.raises(ValueError, match="Expected one setting of L2C2, `lambda_min=3`"):
+            td3.by_setting(pd.concat([records("td3").query("seed < 10"), runs]))
+
     def test_td3s_presets_are_those_of_the_table(self):
         """Strengths times the gains."""
         for method, gains in td3.GAINS.items():
