@@ -1,4 +1,4 @@
-"""How much of an episode policies of HalfCheetah-v5 spend on their backs (results/new_tasks.md).
+"""Share of an episode that policies of HalfCheetah-v5 spend on their backs.
 
 ``python -m studies.half_cheetah FOLDER FILE.csv`` plays the runs below a folder, and writes a line
 for each of them.

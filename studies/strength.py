@@ -57,7 +57,7 @@ def shown() -> pd.DataFrame:
 
 
 def candidates() -> pd.DataFrame:
-    """The records that choose a preset, with those of other tables with the same settings."""
+    """The records that choose a preset, also from other tables with the same settings."""
     own, others = records("strength"), records("one_gain", "hopper_targets")
     preset = others["differences"].str.contains("lambda_min=1 .*=mse")
     same = (others["method"] == "none") | ((others["method"] == "l2c2_ramp") & preset)

@@ -24,7 +24,7 @@ Pair = tuple[Group, Group]
 
 
 class Benchmark(NamedTuple):
-    """Where the runs of a row are recorded.
+    """Task, algorithm and records of a row.
 
     Attributes:
         task (str): Name of the task in tables.
