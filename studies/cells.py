@@ -13,7 +13,7 @@ import pandas as pd
 from torchrl_l2c2.experiment.analysis.reports.groups import Group, baseline_of
 from torchrl_l2c2.experiment.analysis.reports.records import to_csv
 from torchrl_l2c2.experiment.analysis.reports.statistics import mean_and_deviation
-from torchrl_l2c2.experiment.analysis.reports.table import improvement_cell, number
+from torchrl_l2c2.experiment.analysis.reports.table import improvement_cell, number, pipe_table
 
 
 def number_range(values: Sequence[int]) -> str:
@@ -113,9 +113,9 @@ def seeds_table(settings: Mapping[str, tuple[Sequence[float], Sequence[float]]])
     """
     columns = ["setting", "return by seed", "action variation by seed"]
     columns += ["mean return", "mean action variation"]
-    rows = [columns, ["---"] * len(columns)]
+    rows = [columns]
     for name, (returns, variations) in settings.items():
         each = [", ".join(f"{score:.0f}" for score in returns)]
         each.append(", ".join(f"{score:.3f}" for score in variations))
         rows.append([name, *each, f"{np.mean(returns):.1f}", f"{np.mean(variations):.3f}"])
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    return pipe_table(rows)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from studies.files import fill
+from torchrl_l2c2.experiment.analysis.reports.table import pipe_table
 from torchrl_l2c2.experiment.run.files import write_atomically
 
 ROOT = Path(__file__).parents[1]
@@ -35,7 +36,7 @@ def cost_table(measured: Mapping[str, Any]) -> str:
     methods = list(dict.fromkeys(row["method"] for row in rows))
     head = ["method", "`fraction`"]
     head += [f"{what}, {size:,} states" for what in ("time", "memory") for size in sizes]
-    table = [head, ["---"] * len(head)]
+    table = [head]
     for method in methods:
         for fraction in fractions:
             lines = [found.get((method, fraction, size)) for size in sizes]
@@ -53,7 +54,7 @@ def cost_table(measured: Mapping[str, Any]) -> str:
         [
             f"`{measured['command']}`, commit {where['commit']}, {device}{load}, {versions}:",
             "",
-            *(f"| {' | '.join(row)} |" for row in table),
+            pipe_table(table),
             "",
             "Each number is a multiple of the baseline's; the baseline's own numbers are in ms and "
             f"MiB. Time: {_TIMES[measured['device']]} for the loss and its gradients, median of "

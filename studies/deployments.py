@@ -16,7 +16,7 @@ from studies.files import ROOT, fill
 from studies.filters import CONDITIONS
 from torchrl_l2c2.experiment.analysis.reports.figures import finish, save, subplots
 from torchrl_l2c2.experiment.analysis.reports.statistics import mean, probability_of_improvement
-from torchrl_l2c2.experiment.analysis.reports.table import Estimate
+from torchrl_l2c2.experiment.analysis.reports.table import Estimate, pipe_table
 from torchrl_l2c2.experiment.run.files import write_atomically
 
 PAGE = ROOT / "results" / "filters.md"
@@ -81,7 +81,7 @@ def table(found: pd.DataFrame) -> str:
     columns = ["", "seeds"]
     for name, sign, _ in MEASURES.values():
         columns += [name, "P(larger)" if sign > 0 else "P(smaller)"]
-    lines = [columns, ["---"] * len(columns)]
+    lines = [columns]
     baseline = found[found["deployment"] == "baseline"]
     for deployment in NAMES.values():
         rows = found[found["deployment"] == deployment]
@@ -96,7 +96,7 @@ def table(found: pd.DataFrame) -> str:
             better = Estimate.of(probability_of_improvement, sign * scores, sign * theirs)
             cells.append("" if better is None or deployment == "baseline" else better.text())
         lines.append(cells)
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+    return pipe_table(lines)
 
 
 def tables(found: pd.DataFrame) -> str:

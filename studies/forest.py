@@ -15,7 +15,7 @@ from studies.files import ROOT
 from studies.summary import benchmarks
 from torchrl_l2c2.experiment.analysis.reports.figures import save, subplots
 from torchrl_l2c2.experiment.analysis.reports.groups import Group
-from torchrl_l2c2.experiment.analysis.reports.table import Estimate, improvement
+from torchrl_l2c2.experiment.analysis.reports.table import Estimate, improvement, pipe_table
 
 PICTURE = ROOT / "results" / "forest.svg"
 # Quantities, and the titles of their panels and columns.
@@ -45,9 +45,9 @@ def rows(pairs: Mapping[tuple[str, str], tuple[Group, Group]]) -> list[Row]:
 
 def table(shown: Sequence[Row]) -> str:
     """The numbers of the plot as a table."""
-    lines = [["", *(f"P({name})" for name in PANELS.values())], ["---"] * (1 + len(PANELS))]
+    lines = [["", *(f"P({name})" for name in PANELS.values())]]
     lines += [[row.label, *(each.text("{:.2f}".format) for each in row.better)] for row in shown]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+    return pipe_table(lines)
 
 
 def draw(shown: Sequence[Row], path: Path) -> None:

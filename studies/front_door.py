@@ -35,7 +35,7 @@ from torchrl.objectives.value import GAE
 from studies.cells import seeds_table
 from torchrl_l2c2 import action_variation, make_actor, make_critic, smooth
 from torchrl_l2c2.experiment.analysis.reports.statistics import mean, probability_of_improvement
-from torchrl_l2c2.experiment.analysis.reports.table import Estimate
+from torchrl_l2c2.experiment.analysis.reports.table import Estimate, pipe_table
 
 SEEDS = range(10)
 TEST_EPISODES = 10
@@ -185,7 +185,7 @@ def table(path: Path, algorithms: Iterable[str] = ALGORITHMS) -> str:
         found = {(r["algorithm"], r["method"], r["seed"]): r for r in csv.DictReader(file)}
     columns = ["trained (seeds)", "action variation: baseline", "with L2C2", "P(smoother)"]
     columns += ["return: baseline", "with L2C2", "P(returns more)"]
-    rows = [columns, ["---"] * len(columns)]
+    rows = [columns]
     for algorithm in algorithms:
         both = [
             seed
@@ -206,7 +206,7 @@ def table(path: Path, algorithms: Iterable[str] = ALGORITHMS) -> str:
             cells += ["" if each is None else each.text(write) for each in means]
             cells.append("" if better is None else better.text("{:.2f}".format))
         rows.append(cells)
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    return pipe_table(rows)
 
 
 def strengths_table(path: Path) -> str:

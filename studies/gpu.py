@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from studies.cost import cost_table
+from torchrl_l2c2.experiment.analysis.reports.table import pipe_table
 from torchrl_l2c2.experiment.run.files import write_atomically
 
 PAGE = Path(__file__).parents[1] / "results" / "gpu.md"
@@ -70,7 +71,7 @@ def speed_table(measured: Mapping[str, Any]) -> str:
         value = row["note"] if row["value"] is None else f"{row['value']:.2f}"
         parts = ", ".join(f"{name} {part:.4g}" for name, part in row["parts"].items())
         rows.append([row["name"], value, parts])
-    return _table(rows)
+    return pipe_table(rows)
 
 
 def brax_table(measured: Mapping[str, Any]) -> str:
@@ -92,7 +93,7 @@ def brax_table(measured: Mapping[str, Any]) -> str:
     return (
         f"`{measured['command']}`, and with `--baseline`; one seed, at most "
         f"{measured['limit']:g} s each. The first iteration includes the compilation."
-        f"\n\n{_table(rows)}"
+        f"\n\n{pipe_table(rows)}"
     )
 
 
@@ -101,12 +102,7 @@ def tests_table(measured: Mapping[str, Any]) -> str:
     rows = [["test", "outcome", "s"]]
     for test in measured["tests"]:
         rows.append([f"`{test['test']}`", test["outcome"], f"{test['seconds']:.1f}"])
-    return _table(rows)
-
-
-def _table(rows: list[list[str]]) -> str:
-    rows = [rows[0], ["---"] * len(rows[0]), *rows[1:]]
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    return pipe_table(rows)
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -19,6 +19,7 @@ from studies.cells import number_range
 from studies.filters import EPISODES, SEED, act, make_task, play
 from torchrl_l2c2.experiment import ExperimentConfig
 from torchrl_l2c2.experiment.analysis.reports import find_runs
+from torchrl_l2c2.experiment.analysis.reports.table import pipe_table
 
 COLUMNS = ["method", "seed", "return", "on_back", "commit"]
 METHODS = {"none": "baseline", "l2c2": "L2C2", "cats": "CATS"}
@@ -62,13 +63,13 @@ def table(path: Path) -> str:
     """The returns by seed and the shares of steps on the back, as Markdown."""
     runs = pd.read_csv(path).sort_values("seed")
     seeds = number_range(runs["seed"].unique().tolist())
-    rows = [["method", f"return, seeds {seeds}", "steps on the back"], ["---"] * 3]
+    rows = [["method", f"return, seeds {seeds}", "steps on the back"]]
     for method, name in METHODS.items():
         own = runs[runs["method"] == method]
         shares = [f"{math.floor(100 * share + 0.5)}%" for share in own["on_back"]]
         returns = [f"{total:.0f}" for total in own["return"]]
         rows.append([name, ", ".join(returns), ", ".join(shares)])
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    return pipe_table(rows)
 
 
 if __name__ == "__main__":

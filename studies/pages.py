@@ -45,6 +45,7 @@ from torchrl_l2c2.experiment.analysis.reports.records import merge
 from torchrl_l2c2.experiment.analysis.reports.table import (
     COMPARED,
     comparison_table,
+    pipe_table,
 )
 from torchrl_l2c2.experiment.run.files import write_atomically
 
@@ -162,25 +163,25 @@ def parts() -> str:
     found = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
     shown = {(row["task"], row["method"]): row for row in found if row["seeds"]}
     columns = ["task", "setting", *kept]
-    rows = [columns, ["---"] * len(columns)]
+    rows = [columns]
     for task in ("lunarlander", "pendulum"):
         for method, setting in PARTS.items():
             if row := shown.get((task, method)):
                 rows.append([task, setting, *(row[column] for column in kept)])
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    return pipe_table(rows)
 
 
 def reacher_by_seed(runs: pd.DataFrame) -> str:
     """Return and action variation of Reacher's late policies with sampled actions."""
     groups = shown_groups(runs[runs["task"] == "reacher"])
     groups = [group for group in groups if group.first.method != "caps"]
-    rows = [["seed", *(group.name for group in groups)], ["---"] * (1 + len(groups))]
+    rows = [["seed", *(group.name for group in groups)]]
     for together in zip(*(group.runs.itertuples() for group in groups), strict=True):
         cells = (
             f"{r.late_sampled_return:.1f} / {r.late_sampled_action_variation:.3f}" for r in together
         )
         rows.append([str(together[0].seed), *cells])
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    return pipe_table(rows)
 
 
 def draw_published(

@@ -20,7 +20,7 @@ from studies.methods import choice_table
 from torchrl_l2c2.experiment.analysis.reports.figures import save, subplots
 from torchrl_l2c2.experiment.analysis.reports.groups import Group, group_records
 from torchrl_l2c2.experiment.analysis.reports.records import merge
-from torchrl_l2c2.experiment.analysis.reports.table import COMPARED, number
+from torchrl_l2c2.experiment.analysis.reports.table import COMPARED, number, pipe_table
 from torchrl_l2c2.experiment.run.files import write_atomically
 
 PAGE = ROOT / "results" / "strength.md"
@@ -48,21 +48,26 @@ class Curve(NamedTuple):
 
 
 def shown() -> pd.DataFrame:
-    """The records of the strengths, and of the baselines of other tables with the same settings."""
-    own, others = records("strength"), records("field", "hopper", "sac_pendulum")
-    settings = ["task", "algorithm", "length"]
+    """The records of the strengths, the baselines of other tables, and the preset on Hopper."""
+    own, others = records("strength"), records("field", "sac_pendulum")
     own = own[own["seed"] < SEEDS]
+    others = merge(others[others["method"] == "none"], _references("hopper"))
+    settings = ["task", "algorithm", "length"]
     same = pd.MultiIndex.from_frame(others[settings]).isin(pd.MultiIndex.from_frame(own[settings]))
-    return merge(own, others[same & (others["method"] == "none") & (others["seed"] < SEEDS)])
+    return merge(own, others[same & (others["seed"] < SEEDS)])
 
 
 def candidates() -> pd.DataFrame:
     """The records that choose a preset, also from other tables with the same settings."""
-    own, others = records("strength"), records("one_gain", "hopper_targets")
-    preset = others["differences"].str.contains("lambda_min=1 .*=mse")
-    same = (others["method"] == "none") | ((others["method"] == "l2c2_ramp") & preset)
-    found = merge(own, others[same])
+    found = merge(records("strength"), _references("one_gain", "hopper_targets"))
     return found[found["seed"].isin(CANDIDATES)]
+
+
+def _references(*names: str) -> pd.DataFrame:
+    """The baselines in these files, and the runs with PPO's preset under its former name."""
+    found = records(*names)
+    preset = found["differences"].str.contains("lambda_min=1 .*=mse")
+    return found[(found["method"] == "none") | ((found["method"] == "l2c2_ramp") & preset)]
 
 
 def curves(found: pd.DataFrame) -> list[Curve]:
@@ -81,7 +86,7 @@ def curves(found: pd.DataFrame) -> list[Curve]:
 def table(drawn: Sequence[Curve]) -> str:
     """A row for each task and strength: the means over seeds."""
     columns = ["task", "strength", "seeds", *(COMPARED[name][0] for name in COMPARED)]
-    lines = [columns, ["---"] * len(columns)]
+    lines = [columns]
     for curve in drawn:
         for strength, group in curve.groups.items():
             cells = [curve.label, f"{strength:g}" if strength else "0 (baseline)"]
@@ -89,7 +94,7 @@ def table(drawn: Sequence[Curve]) -> str:
             for name in COMPARED:
                 cells.append(number(float(group.scores(TEST, name).mean()), name))
             lines.append(cells)
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+    return pipe_table(lines)
 
 
 def draw(drawn: Sequence[Curve], path: Path) -> None:

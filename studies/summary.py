@@ -12,7 +12,7 @@ from studies import rsl_rl, td3
 from studies.field import TEST
 from studies.files import ROOT, records
 from torchrl_l2c2.experiment.analysis.reports.groups import Group, group_records
-from torchrl_l2c2.experiment.analysis.reports.table import improvement, improvement_cell
+from torchrl_l2c2.experiment.analysis.reports.table import improvement, improvement_cell, pipe_table
 
 OURS = "L2C2, mse 1, ramp"
 """PPO's preset, in tables."""
@@ -143,11 +143,11 @@ def _table(
     pairs: Mapping[tuple[str, str], Pair] | None = None,
 ) -> str:
     names = ["task", "algorithm (seeds)", *(name.strip() for name in columns)]
-    rows = [names, ["---"] * len(names)]
+    rows = [names]
     for (task, algorithm), pair in (benchmarks() if pairs is None else pairs).items():
         cells = [cell(*pair) for cell in columns.values()]
         rows.append([task, f"{algorithm} ({len(pair[0].seeds)})", *cells])
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    return pipe_table(rows)
 
 
 def _mean(group: Group, quantity: str) -> str:

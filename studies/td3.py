@@ -11,7 +11,7 @@ from studies.field import TEST
 from studies.files import records
 from torchrl_l2c2.experiment.analysis.reports.groups import Group, group_records
 from torchrl_l2c2.experiment.analysis.reports.statistics import mean
-from torchrl_l2c2.experiment.analysis.reports.table import Estimate, improvement_cell
+from torchrl_l2c2.experiment.analysis.reports.table import Estimate, improvement_cell, pipe_table
 
 FAILED = -300.0
 """Return below which a policy has failed."""
@@ -70,7 +70,7 @@ def test_table() -> str:
     """Every strength that was run on seeds 0 to 9, by the last policy, next to the baseline."""
     groups = by_setting(records("td3").query("seed < 10"))
     columns = ["setting", "return", "failed", "action variation", "P(returns more)", "P(smoother)"]
-    rows = [columns, ["---"] * len(columns)]
+    rows = [columns]
     order = [BASELINE, *((m, s) for m in GAINS for s in STRENGTHS if (m, s) in groups)]
     for setting in order:
         group = groups[setting]
@@ -90,7 +90,7 @@ def test_table() -> str:
             shown = f"**{shown}** (the preset)"
         cells = [total.text("{:.1f}".format), f"{failures(group)} of {len(group.seeds)}"]
         rows.append([shown, *cells, variation.text("{:.3f}".format), *better])
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    return pipe_table(rows)
 
 
 def failures(group: Group) -> int:
@@ -122,14 +122,14 @@ def last_policy_table() -> str:
     """The strengths on seeds 110 to 129, by the last policy."""
     groups = by_setting(records("td3").query("seed >= 110"))
     columns = ["setting", "seeds", "mean return", "failed", "mean action variation", "qualifies"]
-    rows = [columns, ["---"] * len(columns)]
+    rows = [columns]
     for setting in (BASELINE, *((m, s) for m in GAINS for s in STRENGTHS)):
         group = groups[setting]
         cells = [str(len(group.seeds)), f"{_mean(group, 'return'):.1f}", str(failures(group))]
         cells.append(f"{_mean(group, 'action_variation'):.3f}")
         cells.append("" if setting == BASELINE else "yes" if qualifies(groups, setting) else "no")
         rows.append([name(setting), *cells])
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    return pipe_table(rows)
 
 
 def first_choice_table() -> str:

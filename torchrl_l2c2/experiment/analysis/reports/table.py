@@ -62,10 +62,22 @@ class Table:
 
     def markdown(self) -> str:
         """Returns the title, a pipe table, and the notes."""
-        lines = [self.columns, ["---"] * len(self.columns), *self.rows]
-        escaped = ([cell.replace("|", "\\|") for cell in line] for line in lines)
-        table = "\n".join(f"| {' | '.join(line)} |" for line in escaped)
+        table = pipe_table([self.columns, *self.rows])
         return "\n\n".join([f"**{self.title}**", table, *self.notes])
+
+
+def pipe_table(lines: Sequence[Sequence[str]]) -> str:
+    """Returns cells as a Markdown table; the first line has the columns' names.
+
+    Examples:
+        >>> print(pipe_table([["n", "n²"], ["2", "4"]]))
+        | n | n² |
+        | --- | --- |
+        | 2 | 4 |
+    """
+    columns, *rows = ([cell.replace("|", "\\|") for cell in line] for line in lines)
+    ruled = [columns, ["---"] * len(columns), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in ruled)
 
 
 @dataclass(frozen=True)
