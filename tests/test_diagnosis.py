@@ -137,9 +137,18 @@ class TestWords:
     )
     def test_a_first_episode_that_is_unlike_the_mean_is_said_to_be(self, ratio, differs):
         """First of all, because the other findings describe that episode."""
-        known = made_up().measures
+        fast = torch.sin(6 * torch.pi * STEPS / 100).unsqueeze(-1)
+        known = made_up(fast).measures
         mean = {**known, "action_variation": ratio * known["action_variation"]}
-        assert kinds(made_up(measures=mean)) == ["unlike"] * differs + ["smooth"]
+        assert kinds(made_up(fast, measures=mean)) == ["unlike"] * differs + ["moves"]
+
+    @pytest.mark.parametrize(("ratio", "said"), [(0.1, False), (3.9, False), (4.1, True)])
+    def test_smooth_episodes_may_differ(self, ratio, said):
+        """A change of 0.5% of the range is smooth, and up to four times as much is too."""
+        ramp = torch.linspace(0.0, 0.99, 100).unsqueeze(-1)
+        known = made_up(ramp).measures
+        mean = {**known, "action_variation": ratio * known["action_variation"]}
+        assert kinds(made_up(ramp, measures=mean)) == ["unlike"] * said + ["smooth"]
 
     def test_a_first_episode_at_rest_does_not_hide_the_others(self):
         """A policy that shakes only after some starts."""

@@ -113,9 +113,11 @@ def _compared(first: Diagnosis, other: Diagnosis) -> str:
 
 
 def _unlike(diagnosis: Diagnosis) -> Iterator[Finding]:
-    """Finding about a first episode that is unlike the others."""
+    """Finding about a first episode that is unlike the others, unless all of them are smooth."""
     first, mean = action_variation(diagnosis.actions).item(), diagnosis.measures["action_variation"]
-    if min(first, mean) * threshold("UNLIKE") <= max(first, mean) > 0.0:
+    larger = max(first, mean)
+    smooth = larger * _change(diagnosis.relative) <= threshold("SMOOTH") * first
+    if min(first, mean) * threshold("UNLIKE") <= larger > 0.0 and (first == 0.0 or not smooth):
         text = (
             f"The episodes differ: the first one, which all further findings describe, has an "
             f"action variation of {first:.3g}, and the mean of the episodes is {mean:.3g}. Choose "
