@@ -341,7 +341,7 @@ def main(arguments: list[str] | None = None) -> None:
     if kind == "cpu":
         torch.set_num_threads(1)
     # A host's name says nothing about its speed.
-    where = {name: value for name, value in machine().items() if name != "name"}
+    where = machine()
     sizes, rounds = ([64], 1) if options.quick else (options.states, options.rounds)
     calls = options.calls or (20 if kind == "cuda" and not options.quick else 1)
     rows = []

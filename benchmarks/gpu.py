@@ -121,7 +121,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--json", type=Path, required=True, help="file to write to")
     parser.add_argument("--seconds", type=float, default=80.0, help="limit of a training on Ant")
     options, given = parser.parse_known_args(arguments)
-    where = {name: value for name, value in machine().items() if name != "name"}
+    where = machine()
     if options.part == "tests":
         test(options.json, where)
     else:

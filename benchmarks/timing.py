@@ -115,7 +115,6 @@ def take_turns(
 def machine() -> dict[str, Any]:
     """The machine and the versions of a measurement."""
     return {
-        "name": platform.node(),
         "cpu": _cpu_model(),
         "cores": len(os.sched_getaffinity(0))
         if hasattr(os, "sched_getaffinity")

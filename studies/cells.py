@@ -12,7 +12,6 @@ import pandas as pd
 
 from torchrl_l2c2.experiment.analysis.reports.groups import Group, baseline_of
 from torchrl_l2c2.experiment.analysis.reports.records import to_csv
-from torchrl_l2c2.experiment.analysis.reports.statistics import mean_and_deviation
 from torchrl_l2c2.experiment.analysis.reports.table import improvement_cell, number, pipe_table
 
 
@@ -44,10 +43,10 @@ def pooled(group: Group, test: str, quantity: str) -> str:
     scores = group.scores(test, quantity)
     if not len(scores):
         return "-"
-    center, deviation = mean_and_deviation(scores)
-    cell = number(center.item(), quantity)
+    center = float(scores.mean())
+    cell = number(center, quantity)
     if len(scores) > 1:
-        cell += f" ({number(deviation.item(), quantity, center.item())})"
+        cell += f" ({number(float(scores.std(ddof=1)), quantity, center)})"
     return cell + of_runs(len(scores), len(group.runs))
 
 

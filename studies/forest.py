@@ -46,7 +46,7 @@ def rows(pairs: Mapping[tuple[str, str], tuple[Group, Group]]) -> list[Row]:
 def table(shown: Sequence[Row]) -> str:
     """The numbers of the plot as a table."""
     lines = [["", *(f"P({name})" for name in PANELS.values())]]
-    lines += [[row.label, *(each.text("{:.2f}".format) for each in row.better)] for row in shown]
+    lines += [[row.label, *(each.text() for each in row.better)] for row in shown]
     return pipe_table(lines)
 
 
@@ -107,7 +107,7 @@ def _draw_row(axis: Any, height: float, better: Estimate, *, overall: bool) -> N
     # Hollow: the interval contains 0.5.
     face = "white" if kind == "noise" else color
     axis.plot([better.value], [height], color=color, mfc=face, mew=1.8, clip_on=False, **marker)
-    text = better.text("{:.2f}".format)
+    text = better.text()
     axis.text(1.06, height, text, va="center", fontsize=9, weight="bold" if overall else None)
 
 

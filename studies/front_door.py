@@ -204,7 +204,7 @@ def table(path: Path, algorithms: Iterable[str] = ALGORITHMS) -> str:
             )
             write = f"{{:.{digits}f}}".format
             cells += ["" if each is None else each.text(write) for each in means]
-            cells.append("" if better is None else better.text("{:.2f}".format))
+            cells.append("" if better is None else better.text())
         rows.append(cells)
     return pipe_table(rows)
 

@@ -33,7 +33,7 @@ def test_the_experiment_has_eight_rooms():
     rooms = {"settings", "envs", "agents", "learn", "collect", "run", "analysis", "cli"}
     assert folders == rooms
     modules = {path.name for path in (PACKAGE / "experiment").glob("*.py")}
-    assert modules == {"__init__.py", "__main__.py", "errors.py"}
+    assert modules == {"__init__.py", "errors.py"}
 
 
 def test_only_the_experiment_needs_its_extra():

@@ -41,7 +41,6 @@ from torchrl_l2c2.experiment.analysis.reports.statistics import (
     curve_band,
     interquartile_mean,
     mean,
-    mean_and_deviation,
     probability_of_improvement,
 )
 from torchrl_l2c2.experiment.analysis.reports.table import known_tests
@@ -411,12 +410,6 @@ class TestSettings:
 
 
 class TestStatistics:
-    def test_mean_and_deviation_by_hand(self):
-        """Of 1, 2, 6: 3, and the root of (4 + 1 + 9) / 2; a single run has no deviation."""
-        center, deviation = mean_and_deviation(np.array([[1.0], [2.0], [6.0]]))
-        assert (center.item(), deviation.item()) == (3.0, pytest.approx(math.sqrt(7.0)))
-        assert math.isnan(mean_and_deviation(np.ones((1, 1)))[1].item())
-
     def test_the_interquartile_mean_leaves_out_a_quarter_on_either_side(self):
         """Over runs and tasks together: of 0 to 7 it is the mean of 2 to 5; like SciPy's."""
         assert interquartile_mean(np.arange(8.0).reshape(2, 4)).item() == 3.5

@@ -179,7 +179,7 @@ def _measured(measured: Any) -> float:
 
 
 # CQL minimizes its cloning term instead of the actor's term, never both.
-ALTERNATIVE = ("loss_actor_bc",)
+ALTERNATIVE_LOSSES = ("loss_actor_bc",)
 
 
 def is_loss(key: str) -> bool:
@@ -263,7 +263,7 @@ def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]
             return (None,) * len(parameters)
         return torch.autograd.grad(value, parameters, allow_unused=True, retain_graph=True)
 
-    others = (*added, *ALTERNATIVE)
+    others = (*added, *ALTERNATIVE_LOSSES)
     losses = (terms[key] for key in terms.keys() if is_loss(key) and key not in others)
     own = gradients(sum(losses, torch.zeros(())))  # A loss may have no own terms, as in rsl_rl.
     shares = {}

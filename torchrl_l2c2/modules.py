@@ -92,19 +92,6 @@ class SigmoidNormal(TanhNormal):
 DISTRIBUTIONS = {"tanh": TanhNormal, "sigmoid": SigmoidNormal, "none": IndependentNormal}
 
 
-class EncodedNetwork(nn.Module):
-    """A network that reads the encoded first input and the other inputs unchanged."""
-
-    def __init__(self, encoder: nn.Module, network: nn.Module) -> None:
-        super().__init__()
-        self.encoder = encoder
-        self.network = network
-
-    def forward(self, observation: Tensor, *others: Tensor) -> Tensor:
-        """An observation that the encoder takes, and others ``[*B, F_i]``, to ``[*B, F]``."""
-        return self.network(self.encoder(observation), *others)
-
-
 class NormalNetwork(nn.Module):
     """Maps observations to the location and the positive scale of a diagonal normal."""
 
@@ -140,7 +127,6 @@ def make_actor(
     scale_mapping: str = "biased_softplus_1.0",
     squish_b: float = 4.0,
     in_keys: str | Sequence[NestedKey] = ("observation",),
-    encoder: nn.Module | None = None,
 ) -> ProbabilisticActor:
     r"""Builds the paper's policy: a diagonal normal from layers of ``Linear, LayerNorm, Squish``.
 
@@ -165,9 +151,6 @@ def make_actor(
         squish_b (float): bend of :class:`Squish`. Default 4.0.
         in_keys (str or sequence of NestedKey): observations to read; several are concatenated.
             Default ``("observation",)``.
-        encoder (nn.Module, optional): maps the first observation to ``[*B, F]``, such as a
-            :class:`~torchrl.modules.ConvNet` for an image; ``observation_size`` then counts ``F``
-            for it. Default ``None``: the observation unchanged.
 
     Returns:
         ProbabilisticActor: the policy, for any leading batch dimensions.
@@ -203,7 +186,7 @@ def make_actor(
             f"make_actor: scale_mapping={scale_mapping!r} is unknown to NormalParamExtractor: it "
             "has 'exp', 'expln', 'softplus', 'relu' and 'biased_softplus_1.0', of any number."
         ) from error
-    network = NormalNetwork(_body(observation_size, hidden, 2 * size, squish_b, encoder), extractor)
+    network = NormalNetwork(_body(observation_size, hidden, 2 * size, squish_b), extractor)
     return ProbabilisticActor(
         TensorDictModule(network, in_keys=_read(in_keys), out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
@@ -223,7 +206,6 @@ def make_critic(
     hidden: Sequence[int] = (100, 100),
     squish_b: float = 4.0,
     in_keys: str | Sequence[NestedKey] = ("observation",),
-    encoder: nn.Module | None = None,
 ) -> TensorDictModule:
     """Builds the paper's critic: an ensemble of values that share all layers but the last.
 
@@ -241,9 +223,6 @@ def make_critic(
         squish_b (float): bend of :class:`Squish`. Default 4.0.
         in_keys (str or sequence of NestedKey): observations to read; several are concatenated.
             Default ``("observation",)``.
-        encoder (nn.Module, optional): maps the first observation to ``[*B, F]``, such as a
-            :class:`~torchrl.modules.ConvNet` for an image; ``observation_size`` then counts ``F``
-            for it. Default ``None``: the observation unchanged.
 
     Returns:
         TensorDictModule: the critic, for any leading batch dimensions.
@@ -263,7 +242,7 @@ def make_critic(
     """
     check_positive_int("make_critic: num_heads", num_heads)
     return TensorDictModule(
-        EnsembleNetwork(_body(observation_size, hidden, num_heads, squish_b, encoder)),
+        EnsembleNetwork(_body(observation_size, hidden, num_heads, squish_b)),
         in_keys=_read(in_keys),
         out_keys=["state_value", "state_value_heads"],
     )
@@ -274,7 +253,6 @@ def _body(
     hidden: Sequence[int],
     out_features: int,
     squish_b: float,
-    encoder: nn.Module | None,
 ) -> nn.Module:
     check_positive_int("observation_size", in_features)
     if not isinstance(hidden, Sequence) or isinstance(hidden, str):
@@ -283,7 +261,7 @@ def _body(
         )
     for cells in hidden:
         check_positive_int("every entry of hidden", cells)
-    layers = MLP(
+    return MLP(
         in_features=in_features,
         out_features=out_features,
         num_cells=list(hidden),
@@ -292,7 +270,6 @@ def _body(
         activation_class=Squish,
         activation_kwargs={"b": squish_b},
     )
-    return layers if encoder is None else EncodedNetwork(encoder, layers)
 
 
 def _read(in_keys: str | Sequence[NestedKey]) -> list[NestedKey]:

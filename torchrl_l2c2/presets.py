@@ -68,16 +68,6 @@ KINDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 }
 """Kinds of losses that share presets: the classes used for tuning, and similar classes."""
 
-NEAREST = {
-    "ReinforceLoss": "ppo",
-    "BCLoss": "ppo",
-    "TD3BCLoss": "td3",
-    "IQLLoss": "sac",
-    "DiscreteIQLLoss": "sac",
-    "DiscreteSACLoss": "sac",
-}
-"""Losses without a preset, with the kind that is most like them."""
-
 _PPO_TASKS = "Pendulum, LunarLander, Walker2d and Hopper"
 
 _SR2L = {"coeff": 0.1, "epsilon": 0.05, "steps": 10}
@@ -224,8 +214,6 @@ def kind_of(loss_class: type) -> tuple[str | None, bool]:
                 return kind, True
             if part.__name__ in similar:
                 return kind, False
-        if part.__name__ in NEAREST:
-            return None, False
     return None, False
 
 

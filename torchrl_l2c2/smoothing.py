@@ -9,7 +9,7 @@ from difflib import get_close_matches
 from typing import Any
 
 from torch import nn
-from torchrl.objectives import LossModule
+from torchrl.objectives import LossModule, TD3BCLoss
 
 from torchrl_l2c2 import objectives
 from torchrl_l2c2._checks import as_number, check_real
@@ -21,7 +21,6 @@ from torchrl_l2c2.presets import (
     GAIN_SETTING,
     KINDS,
     METHODS,
-    NEAREST,
     NEIGHBORHOOD_FIELDS,
     Preset,
     kind_of,
@@ -172,9 +171,9 @@ def _of_nearest(loss: LossModule, method: str, overrides: Mapping[str, Any]) -> 
 def _nearest_kind(loss: LossModule) -> str:
     if getattr(loss, POLICY_NETWORK, None) is None:
         return "ppo_rpe"  # The only preset that smooths values.
-    names = [part.__name__ for part in type(loss).__mro__]
-    others = "sac" if getattr(loss, "qvalue_network", None) is not None else "ppo"
-    return next((NEAREST[each] for each in names if each in NEAREST), others)
+    if isinstance(loss, TD3BCLoss):
+        return "td3"
+    return "sac" if getattr(loss, "qvalue_network", None) is not None else "ppo"
 
 
 def _what(loss: object) -> str:

@@ -109,11 +109,11 @@ def find_transitions(
         KeyError: no state that a network reads has a successor.
     """
     keys = dict.fromkeys(key for read in states.values() for key in read)
-    following = tensordict.select(*map(next_key, keys), strict=False).detach()
+    next_states = tensordict.select(*map(next_key, keys), strict=False).detach()
     pairs: dict[NestedKey, tuple[Tensor, Tensor]] = {}
     for network, read in states.items():
         floating = find_states(tensordict, read, network)
-        successors = {key: following.get(next_key(key), None) for key in floating}
+        successors = {key: next_states.get(next_key(key), None) for key in floating}
         present = {key: (floating[key], s) for key, s in successors.items() if s is not None}
         if not present:
             raise KeyError(
@@ -122,7 +122,7 @@ def find_transitions(
             )
         pairs.update(present)
         for key in read if labels else ():
-            state, successor = tensordict.get(key, None), following.get(next_key(key), None)
+            state, successor = tensordict.get(key, None), next_states.get(next_key(key), None)
             if isinstance(state, Tensor) and isinstance(successor, Tensor):
                 pairs.setdefault(key, (state, successor))
     for key, (state, successor) in pairs.items():

@@ -12,13 +12,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.compiler import is_compiling
 
+from torchrl_l2c2.gains import ALTERNATIVE_LOSSES
 from torchrl_l2c2.objectives._batch import next_key
 
 POLICY_LOSSES = ("loss_actor", "loss_objective", "loss_bc")
 """Keys of the term that trains the policy."""
-
-ALTERNATIVE_LOSSES = ("loss_actor_bc",)
-"""Keys of terms that loops use instead of the policy's term, such as CQL's cloning phase."""
 
 # The loss of a value function, by the name of its network; longer names first.
 VALUE_LOSSES = {
@@ -234,8 +232,10 @@ class TermWatch:
                 stacklevel=4,
             )
 
-    def see_counts(self, name: str, counts: Tensor, max_step: float | None) -> None:
+    def see_counts(self, loss: Any, counts: Tensor, max_step: float | None = None) -> None:
         """Warns of observations that are not finite, or of a ``max_step`` that is too small."""
+        if is_compiling():
+            return
         self._counted += 1
         if "counts" in self._warned or (counts.is_cuda and self._counted % 100 != 1):
             return
@@ -244,9 +244,9 @@ class TermWatch:
                 self._warned.add("counts")
                 warnings.warn(
                     f"all transitions of the batch are longer than max_step={max_step:g} or not "
-                    f"finite, so the penalty of {name} is 0: raise max_step, or choose "
-                    "max_step=None.",
-                    stacklevel=5,
+                    f"finite, so the penalty of {type(loss).__name__} is 0: raise max_step, or "
+                    "choose max_step=None.",
+                    stacklevel=4,
                 )
         elif not bool(counts.all()):
             self._warned.add("counts")
@@ -254,35 +254,39 @@ class TermWatch:
             warnings.warn(
                 f"{share:.2%} of the transitions in the batch have an observation or a next "
                 "observation that is not finite, as some environments give at resets: "
-                f"{name} leaves these transitions out. If all are left out, the regularizer has no "
-                "effect: keep the true next observations.",
+                f"{type(loss).__name__} leaves these transitions out. If all are left out, the "
+                "regularizer has no effect: keep the true next observations.",
                 stacklevel=5,
             )
 
     def see_neighbors(
-        self, name: str, neighbors: TensorDictBase, batch: TensorDictBase, radius: float
+        self, loss: Any, neighbors: TensorDictBase, batch: TensorDictBase, radius: float
     ) -> None:
         """Warns of neighbors that were drawn before a transform changed the observations.
 
         Observations with neighbors are floating point.
         """
-        if "neighbors" in self._warned or not isinstance(neighbors, TensorDictBase):
+        if (
+            is_compiling()
+            or "neighbors" in self._warned
+            or not isinstance(neighbors, TensorDictBase)
+        ):
             return
         self._warned.add("neighbors")
         for key, there in neighbors.items(include_nested=True, leaves_only=True):
-            here, following = batch.get(key, None), batch.get(next_key(key), None)
-            if here is None or following is None or here.shape != following.shape:
+            here, successor = batch.get(key, None), batch.get(next_key(key), None)
+            if here is None or successor is None or here.shape != successor.shape:
                 continue
             # [*B, K, *F] and [*B, *F]
             there = there.movedim(neighbors.batch_dims, 0)
-            span = radius * (following - here).abs()
-            rounding = 16 * torch.finfo(here.dtype).eps * (here.abs() + following.abs())
+            span = radius * (successor - here).abs()
+            rounding = 16 * torch.finfo(here.dtype).eps * (here.abs() + successor.abs())
             if bool(((there - here).abs() > 1.01 * span + rounding).any()):
                 warnings.warn(
                     f"the neighbors in the batch are not near its {key!r}, so the penalty of "
-                    f"{name} is wrong: append neighbor_transform() after all transforms that "
-                    "change observations, such as ObservationNorm.",
-                    stacklevel=6,
+                    f"{type(loss).__name__} is wrong: append neighbor_transform() after all "
+                    "transforms that change observations, such as ObservationNorm.",
+                    stacklevel=5,
                 )
 
 

@@ -380,11 +380,11 @@ class L2C2Loss(RegularizedLoss):
         if neighbor is None:
             neighbor = self._draw(tensordict, rows)
         else:
-            self.warn_misplaced(neighbor, tensordict, self.l2c2_neighborhood.radius)
+            self._watch.see_neighbors(self, neighbor, tensordict, self.l2c2_neighborhood.radius)
             neighbor = neighbor if rows is None else at_rows(neighbor, rows)
         states, distance = _read_neighbors(neighbor, self.l2c2_neighbor_key)
         counts = distance[0].isfinite()
-        self.warn_uncounted(counts, self.l2c2_neighborhood.max_step)
+        self._watch.see_counts(self, counts, self.l2c2_neighborhood.max_step)
         if (ends := self._ends(tensordict)) is not None:
             counts = counts & ~(ends if rows is None else ends.flatten()[rows])
         return Neighbors(states, distance, counts, rows)

@@ -791,7 +791,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
                 finite = successor.isfinite().flatten(ndim).any(-1)
                 counts = finite if counts is None else counts & finite
         assert counts is not None
-        self.warn_uncounted(counts)
+        self._watch.see_counts(self, counts)
         done = self._ends(tensordict)
         return counts if done is None else counts & ~done
 
@@ -804,27 +804,6 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         if done is None:
             raise KeyError(f"skip_ends=True needs {key!r}, and the batch has none: keep it.")
         return done.reshape(*tensordict.batch_size, -1).any(-1)
-
-    def warn_uncounted(self, counts: Tensor, max_step: float | None = None) -> None:
-        """Warns once if transitions do not count, with ``max_step`` only if none does; eager only.
-
-        On a GPU only some batches are checked, because the check synchronizes.
-        """
-        if not is_compiling():
-            self._watch.see_counts(type(self).__name__, counts, max_step)
-
-    def warn_misplaced(
-        self, neighbors: TensorDictBase, batch: TensorDictBase, radius: float
-    ) -> None:
-        """Warns if the first neighbors of a batch are not near its observations; eager only.
-
-        Args:
-            neighbors: the batch's entry of :class:`~torchrl_l2c2.NeighborTransform`, ``[*B]``.
-            batch: the batch, ``[*B]``.
-            radius: half the width of the neighborhood, in units of the step to the next state.
-        """
-        if not is_compiling():
-            self._watch.see_neighbors(type(self).__name__, neighbors, batch, radius)
 
     def reduce_term(
         self,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 import warnings
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -171,7 +172,7 @@ class Experiment:
             prepare_folder(self.folder, settings, resumed=True, ended=ended)
         with (
             self._process,
-            bar,
+            closing(bar),
             stop_on_signals() as signals,
             add_checkpoint_to_errors(self.folder),
         ):

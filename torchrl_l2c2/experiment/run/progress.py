@@ -7,7 +7,6 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
 
 from tqdm import tqdm
 
@@ -77,15 +76,8 @@ class Progress:
         if self._waiting:
             self._report("compiling at the first updates, up to two minutes")
 
-    def __enter__(self) -> Progress:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
+        """Closes the bar."""
         self._bar.close()
 
     def frames_per_second(self, frames: int) -> float:

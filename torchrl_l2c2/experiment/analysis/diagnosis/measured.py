@@ -213,7 +213,7 @@ def diagnose(
 
     near = Neighborhood() if neighborhood is None else neighborhood
     steepness = _steepness(first, key, env.action_key, act, value, near, num_neighbors, generator)
-    states, following = first[key], first["next", key]
+    states, successors = first[key], first["next", key]
     sensitivity = noise_sensitivity(act, states, noise_scale, generator=generator).item()
     change = actions.diff(dim=0).square().sum(-1).mean().item()
     return Diagnosis(
@@ -226,7 +226,7 @@ def diagnose(
         observations=_flat(states),
         **steepness,
         neighborhood=near,
-        unmoved=(_flat(states) == _flat(following)).float().mean(0),
+        unmoved=(_flat(states) == _flat(successors)).float().mean(0),
         noise_scale=noise_scale,
         noise_action=math.sqrt(2 * sensitivity),
         # Two independent draws differ by twice the variance of one.

@@ -18,24 +18,6 @@ Interval = tuple[float, float]
 RESAMPLES_AT_ONCE = 50
 
 
-def mean_and_deviation(scores: Scores) -> tuple[Scores, Scores]:
-    """Mean and sample standard deviation over runs, as in the paper's Table III.
-
-    Args:
-        scores (array): ``[runs, ...]``.
-
-    Returns:
-        Two arrays of shape ``[...]``; the deviation of a single run is NaN.
-
-    Examples:
-        >>> mean, deviation = mean_and_deviation(np.array([[1.0], [2.0], [6.0]]))
-        >>> mean.item(), round(deviation.item(), 4)
-        (3.0, 2.6458)
-    """
-    single = np.full(scores.shape[1:], np.nan)
-    return scores.mean(0), scores.std(0, ddof=1) if len(scores) > 1 else single
-
-
 def mean(scores: Scores) -> Scores:
     """Mean over runs and tasks: ``[..., runs, tasks]`` to ``[...]``."""
     return np.asarray(scores.mean((-2, -1)))
