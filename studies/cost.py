@@ -8,14 +8,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
-from studies.files import fill
+from studies.files import ROOT, write_parts
 from torchrl_l2c2.experiment.analysis.reports.table import pipe_table
-from torchrl_l2c2.experiment.run.files import write_atomically
 
-ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "isaac_lab.md"
 MEASURED = ROOT / "results" / "cost.json"
 
@@ -84,11 +81,7 @@ def _milliseconds(row: Mapping[str, Any]) -> str:
 
 def main() -> None:
     """Writes the page if it is not as the file has it, and names it."""
-    before = PAGE.read_text()
-    text = fill(before, "cost", cost_table(json.loads(MEASURED.read_text())))
-    if text != before:
-        write_atomically(PAGE, text.encode())
-        print(f"written: {PAGE.relative_to(ROOT)}")
+    write_parts(PAGE, {"cost": cost_table(json.loads(MEASURED.read_text()))})
 
 
 if __name__ == "__main__":

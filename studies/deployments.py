@@ -12,12 +12,11 @@ from typing import Any
 import pandas as pd
 
 from studies.cells import number_range
-from studies.files import ROOT, fill
+from studies.files import ROOT, write_parts
 from studies.filters import CONDITIONS
 from torchrl_l2c2.experiment.analysis.reports.figures import finish, save, subplots
 from torchrl_l2c2.experiment.analysis.reports.statistics import mean, probability_of_improvement
 from torchrl_l2c2.experiment.analysis.reports.table import Estimate, pipe_table
-from torchrl_l2c2.experiment.run.files import write_atomically
 
 PAGE = ROOT / "results" / "filters.md"
 # Names of the deployments by method, weight of the action-rate reward, and cut-off.
@@ -143,7 +142,7 @@ def _draw_panel(axis: Any, found: pd.DataFrame) -> None:
 def main() -> None:
     """Writes the tables and the picture."""
     found = read(PAGE.with_suffix(".csv"))
-    write_atomically(PAGE, fill(PAGE.read_text(), "tables", tables(found)).encode())
+    write_parts(PAGE, {"tables": tables(found)})
     draw(found, PAGE.with_suffix(".svg"))
 
 

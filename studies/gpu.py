@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import Any
 
 from studies.cost import cost_table
+from studies.files import ROOT
 from torchrl_l2c2.experiment.analysis.reports.table import pipe_table
 from torchrl_l2c2.experiment.run.files import write_atomically
 
-PAGE = Path(__file__).parents[1] / "results" / "gpu.md"
+PAGE = ROOT / "results" / "gpu.md"
 NOT_MEASURED = "Not measured."
 
 

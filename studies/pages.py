@@ -22,7 +22,7 @@ from studies.cells import (
     regrouped,
 )
 from studies.field import BETTER, TEST, field_groups, field_table
-from studies.files import ROOT, fill, records
+from studies.files import ROOT, records, write_parts
 from studies.methods import against_table, choice_table, pairwise_tables
 from studies.paper import (
     TAU,
@@ -47,7 +47,6 @@ from torchrl_l2c2.experiment.analysis.reports.table import (
     comparison_table,
     pipe_table,
 )
-from torchrl_l2c2.experiment.run.files import write_atomically
 
 FRONT_DOOR = ROOT / "results" / "front_door.csv"
 FIELD_PAGES = ("field", "hopper", "sac_lunarlander", "sac_pendulum", "walker2d")
@@ -273,12 +272,7 @@ def main() -> None:
     """Writes the pages and pictures that are not as their records have them, and names them."""
     for name, page in pages().items():
         path = ROOT / name
-        before = text = path.read_text()
-        for mark, part in page.parts.items():
-            text = fill(text, mark, part)
-        if text != before:
-            write_atomically(path, text.encode())
-            print(f"written: {name}")
+        write_parts(path, page.parts)
         picture = path.with_suffix(".svg")
         if page.draw is not None and not is_drawn(picture, page.shown):
             page.draw(picture)

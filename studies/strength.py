@@ -15,13 +15,12 @@ import pandas as pd
 
 from studies.cells import number_range
 from studies.field import TEST
-from studies.files import ROOT, fill, records
+from studies.files import ROOT, records, write_parts
 from studies.methods import choice_table
 from torchrl_l2c2.experiment.analysis.reports.figures import save, subplots
 from torchrl_l2c2.experiment.analysis.reports.groups import Group, group_records
 from torchrl_l2c2.experiment.analysis.reports.records import merge
 from torchrl_l2c2.experiment.analysis.reports.table import COMPARED, number, pipe_table
-from torchrl_l2c2.experiment.run.files import write_atomically
 
 PAGE = ROOT / "results" / "strength.md"
 PICTURE = ROOT / "results" / "strength.svg"
@@ -132,11 +131,8 @@ def _draw_panel(axis: Any, curve: Curve, measure: str) -> None:
 def main() -> None:
     """Writes the picture and the tables."""
     found = curves(shown())
-    parts = {"strength": table(found), "choice": choice_table(candidates()).markdown()}
-    text = PAGE.read_text()
-    for name, part in parts.items():
-        text = fill(text, name, part)
-    write_atomically(PAGE, text.encode())
+    choice = choice_table(candidates()).markdown()
+    write_parts(PAGE, {"strength": table(found), "choice": choice})
     draw(found, PICTURE)
 
 

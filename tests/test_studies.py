@@ -18,14 +18,9 @@ import pytest
 from studies import forest, half_cheetah, pages, strength, td3, trace
 from studies.cells import improvements_over_tasks, over_tasks
 from studies.field import BETTER, field_groups, field_table
+from studies.files import ROOT, fill
 from studies.methods import against_table, choice_table, pairwise_tables
-from studies.pages import (
-    OURS,
-    ROOT,
-    fill,
-    is_drawn,
-    one_setting,
-)
+from studies.pages import OURS, is_drawn, one_setting
 from studies.paper import (
     deployed_table,
     faster_targets_table,
@@ -521,7 +516,8 @@ class TestPages:
 
     def test_the_command_writes_what_is_not_as_it_should_be(self, tmp_path, monkeypatch, capsys):
         """Text around the marks stays; a picture of the same records does, too."""
-        monkeypatch.setattr(pages, "ROOT", tmp_path)
+        for module in ("files", "pages"):
+            monkeypatch.setattr(f"studies.{module}.ROOT", tmp_path)
         page, picture = tmp_path / "page.md", tmp_path / "page.svg"
         page.write_text("before\n  <!-- a: start -->\n  old\n  <!-- a: end -->\nafter\n")
         shown = field_groups(records("sac_pendulum"))
