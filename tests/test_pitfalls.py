@@ -11,6 +11,7 @@ from functools import partial
 import pytest
 import torch
 from losses import (
+    ACTION,
     BOUNDS,
     OBSERVATION,
     batch_norm_qvalue,
@@ -404,6 +405,59 @@ class TestRandomNumbers:
         batch = batch.exclude("neighbor")
         batch["next", "observation"] = batch["observation"].clone()
         assert dropped.policy_regularizer(batch)[terms[0]] == 0
+
+
+@pytest.mark.parametrize("per_action", [False, True])
+def test_padding_of_cloned_trajectories_is_not_regularized(per_action):
+    """BCLoss's pad_mask, of states or of the actions of each state."""
+    loss = CATSLoss(BCLoss(seeded(gaussian_actor)))
+    loss.set_keys(pad_mask="pad")
+    batch, pad = batch_of(6), torch.tensor([False, False, True, True, False, False])
+    expected = loss.policy_regularizer(batch[~pad])["loss_cats"]
+    batch["pad"] = pad.unsqueeze(-1).expand(-1, 3) if per_action else pad
+    torch.testing.assert_close(loss.policy_regularizer(batch)["loss_cats"], expected)
+
+
+class Timed(nn.Module):
+    """Reads an observation and the time, which has no dimension of features."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.net = nn.Linear(OBSERVATION + 1, ACTION)
+
+    def forward(self, observation, time):
+        return self.net(torch.cat((observation, time.unsqueeze(-1)), -1))
+
+
+@pytest.mark.parametrize("make", [CATSLoss, CAPSLoss, partial(LCPLoss, of="mean")])
+def test_entries_without_a_dimension_of_features(make):
+    """The same as with a dimension of size 1."""
+    flat = Actor(seeded(Timed), in_keys=["observation", "time"])
+    deep = copy.deepcopy(flat)
+    deep.module.forward = lambda o, t: flat.module(o, t.squeeze(-1))
+    batch = batch_of(6)
+    batch["time"], batch["next", "time"] = torch.rand(2, 6)
+    found = seeded(make(BCLoss(flat)).policy_regularizer, batch)
+    for key in ("time", ("next", "time")):
+        batch[key] = batch[key].unsqueeze(-1)
+    expected = seeded(make(BCLoss(deep)).policy_regularizer, batch)
+    for key in found.keys():
+        torch.testing.assert_close(found[key], expected[key])
+
+
+@pytest.mark.parametrize("kind", ["l2c2", "cats"])
+@pytest.mark.parametrize("weight", [0.0, 1.0])
+def test_where_no_transition_counts_the_gradient_is_zero(kind, weight):
+    """All end an episode, but one whose priority weight may be 0."""
+    make, term, _ = TEMPORAL[kind]
+    loss, batch = make(base_loss(), skip_ends=True), batch_of(6)
+    batch["next", "done"] = torch.ones(6, 1, dtype=torch.bool)
+    batch["next", "done"][0] = weight != 0.0
+    batch["priority_weight"] = torch.tensor([weight, *[1.0] * 5])
+    with torch.autograd.detect_anomaly(check_nan=True):
+        seeded(loss.policy_regularizer, batch)[term].backward()
+    gradients = [p.grad for p in loss.parameters() if p.grad is not None]
+    assert gradients and all((each == 0).all() for each in gradients)
 
 
 def cloning():

@@ -999,6 +999,23 @@ class TestEvaluationsThatAreSpared:
             loss(batch.exclude("neighbor", ("next", "observation")))
         torch.testing.assert_close(loss.value_regularizer(other)["loss_l2c2_value"], expected)
 
+    def test_a_hidden_output_of_an_older_policy_is_not_compared(self):
+        """Both values are of the present trunk: 0 where s' = s, whatever the batch has stored."""
+        torch.manual_seed(0)
+        trunk = TensorDictModule(mlp(OBSERVATION, 8), ["observation"], ["hidden"])
+        head = nn.Sequential(mlp(8, 2 * ACTION), NormalParamExtractor())
+        actor = ProbabilisticActor(
+            TensorDictSequential(trunk, TensorDictModule(head, ["hidden"], ["loc", "scale"])),
+            in_keys=["loc", "scale"],
+            distribution_class=TanhNormal,
+            return_log_prob=True,
+        )
+        value = ValueOperator(mlp(8, 1), in_keys=["hidden"])
+        batch = on_policy(6)
+        batch["next", "observation"] = batch["observation"].clone()
+        batch["hidden"], batch["next", "hidden"] = torch.randn(2, 6, 8)
+        assert L2C2Loss(PPORPELoss(actor, value), NEAR)(batch)["loss_l2c2_critic"] == 0
+
     @pytest.mark.parametrize("layer", [nn.BatchNorm1d, BatchRenorm1d])
     def test_both_sides_of_a_comparison_are_normalized_alike(self, layer):
         """Normalized separately, all states would be the same as all next states."""

@@ -510,6 +510,22 @@ class TestFolding:
         assert folded.out_keys == keys
         assert set(keys) <= set(self.run(folded, case).keys())
 
+    def test_a_selection_of_the_plain_losses_out_keys_stays(self, case):
+        """On both losses; with the regularizer's own, until it is reset on each."""
+        if not (case.declares_keys and case.selects):
+            pytest.skip("the baseline does not do so either")
+        base, keys = seeded(case.make), list(self.folded(case).out_keys)
+        own = list(base.out_keys)
+        wanted = [next(iter(FOLDED[case.name]))]
+        base.select_out_keys(*wanted)
+        folded = smooth(base, **WIDE)
+        added = [key for key in keys if key not in own]
+        for loss, expected in ((folded, [*wanted, *added]), (base, wanted)):
+            assert loss.out_keys == expected
+            assert set(self.run(loss, case).keys()) & {*keys} == {*expected}
+        assert folded.reset_out_keys().out_keys == keys and base.out_keys == wanted
+        assert base.reset_out_keys().out_keys == own
+
     def test_keys_can_be_renamed(self, case):
         if not case.values:
             pytest.skip("behavior cloning reads no rewards")

@@ -325,6 +325,8 @@ class EvaluatedNetworks:
         """Evaluates a network as the loss does, and caches the result for the forward pass.
 
         Results are not cached if the inputs have a gradient: a regularizer does not train encoders.
+        Nor are they if the network reads hidden outputs of the policy: those in the batch may be of
+        an older policy, and those at other states are of the present one.
         Nor are they if the network normalizes by its batch, or keeps running statistics: only the
         states of one evaluation are normalized alike.
         Compiled losses evaluate small batches together with the other states, if these are known.
@@ -335,7 +337,7 @@ class EvaluatedNetworks:
             return evaluate(network, tensordict)
         # Dropout is not rowwise: the loss evaluates with it, a regularizer without. A loss that is
         # not functional is rsl_rl's, whose statistics do not change in a forward pass.
-        if not spec.rowwise or (spec.has_buffers and loss.functional):
+        if not spec.rowwise or spec.trunk or (spec.has_buffers and loss.functional):
             return evaluate(network, tensordict)
         states = None
         alone = not is_compiling() or autocast_at(tensordict)

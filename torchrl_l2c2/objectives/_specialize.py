@@ -12,6 +12,7 @@ from weakref import WeakKeyDictionary
 
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
+from tensordict.nn.common import _OutKeysSelect
 from torch import nn
 from torchrl.objectives import LossModule
 
@@ -205,6 +206,10 @@ def _adopt(self: SpecializedLoss, base_loss: LossModule) -> None:
     state["_tensor_keys"] = copy.copy(base_loss.tensor_keys)
     if "_value_estimator" in self._modules:
         self._modules["_value_estimator"] = copy.copy(base_loss._value_estimator)
+    # A selection of out_keys belongs to the module that it was made on: the base.
+    for key, selection in find_selections(base_loss).items():
+        self._forward_hooks[key] = copy.copy(selection)
+        self._forward_hooks[key].module = self
     # These hooks hold a weak reference to the module that they were registered on: the base.
     for key, hook in self._load_state_dict_pre_hooks.items():
         if hook.with_module:
@@ -215,6 +220,12 @@ def _adopt(self: SpecializedLoss, base_loss: LossModule) -> None:
     _ORIGINALS[self] = [original, *inner]
     self.in_keys = getattr(base_loss, "in_keys", [])
     self.out_keys = getattr(base_loss, "out_keys", [])
+
+
+def find_selections(module: nn.Module) -> dict[int, Any]:
+    """The forward hooks of ``select_out_keys``, by their numbers."""
+    hooks = module._forward_hooks.items()
+    return {key: hook for key, hook in hooks if isinstance(hook, _OutKeysSelect)}
 
 
 def _describe(estimator: Any) -> tuple[Any, ...]:

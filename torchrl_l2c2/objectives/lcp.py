@@ -162,5 +162,7 @@ def lcp_term(
     agents = log_prob.ndim
     if all(s.ndim > agents and s.shape[:agents] == log_prob.shape for s in states):
         batch_dims = agents
-    squares = [gradient.square().flatten(batch_dims).sum(-1) for gradient in gradients]
+    # Not flatten, which refuses states [*B].
+    shapes = [(*state.shape[:batch_dims], state.shape[batch_dims:].numel()) for state in states]
+    squares = [g.square().reshape(s).sum(-1) for g, s in zip(gradients, shapes, strict=True)]
     return torch.stack(squares).sum(0)

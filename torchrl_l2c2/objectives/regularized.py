@@ -46,7 +46,7 @@ from torchrl_l2c2.objectives._networks import (
     SharedEvaluation,
     is_ensemble,
 )
-from torchrl_l2c2.objectives._specialize import SpecializedLoss
+from torchrl_l2c2.objectives._specialize import SpecializedLoss, find_selections
 from torchrl_l2c2.presets import NEIGHBORHOOD_FIELDS
 
 Made = TypeVar("Made")
@@ -566,7 +566,12 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
                 if key.startswith("loss_") != trains:
                     kind = "a term must start" if trains else "a diagnostic must not start"
                     raise ValueError(f"{kind} with 'loss_', got {key!r}: rename it.")
-        self.out_keys = [*self.out_keys, *policy, *others, *diagnostics]
+        added, selected = [*policy, *others, *diagnostics], list(self.out_keys)
+        is_selection = bool(find_selections(self))
+        self.reset_out_keys()
+        self.out_keys = [*self.out_keys, *added]
+        if is_selection:
+            self.select_out_keys(*selected, *added)
         self._diagnostics = (*self._diagnostics, *diagnostics)
         self.policy_terms = self.policy_terms.union(policy)
         self.auxiliary_terms = self.auxiliary_terms.union(auxiliary)
@@ -788,7 +793,9 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         ndim, counts = tensordict.batch_dims, None
         for _, successor in transitions.values():
             if successor.is_floating_point():
-                finite = successor.isfinite().flatten(ndim).any(-1)
+                # Not flatten, which refuses entries [*B].
+                size = successor.shape[ndim:].numel()
+                finite = successor.isfinite().reshape(*tensordict.batch_size, size).any(-1)
                 counts = finite if counts is None else counts & finite
         assert counts is not None
         self._watch.see_counts(self, counts)
@@ -873,7 +880,10 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             if weights is not None and weights.shape != each.shape:  # [*B, 1], or several agents
                 more = (1,) * (each.ndim - len(shape))
                 each_weight = weights.reshape(*shape, *more).expand_as(each)
-            return self._reduce_loss(each, tensordict, weights=each_weight, reduction=reduction)
+            mask = self._not_padded(tensordict, each.ndim)
+            return self._reduce_loss(
+                each, tensordict, mask=mask, weights=each_weight, reduction=reduction
+            )
 
         if counts is None:
             return reduce(value)
@@ -883,8 +893,16 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         if reduction != "mean":
             return total
         share = reduce(counted.expand_as(value).to(value.dtype))
-        # No division if all count: rounding would change the term.
-        return torch.where(counts.all() | (share == 0), total, total / share)
+        # If all count, division would change the term by rounding; by 0, its gradient is NaN.
+        return total / torch.where(counts.all() | (share == 0), 1.0, share)
+
+    def _not_padded(self, tensordict: TensorDictBase, ndim: int) -> Tensor | None:
+        """``BCLoss``'s mask of actions that are no padding, or of states with such an action."""
+        key = getattr(self.tensor_keys, "pad_mask", None)
+        pad = None if key is None else tensordict.get(key, None)
+        if pad is None:
+            return None
+        return ~(pad if pad.ndim <= ndim else pad.flatten(ndim).all(-1))
 
     def evaluate_at_batch(self, network: str, tensordict: TensorDictBase) -> TensorDictBase:
         """Evaluates a network as the loss does, and caches the result for the forward pass."""
