@@ -887,6 +887,25 @@ class TestStrength:
         assert table in strength.PAGE.read_text() and table in strength.PICTURE.read_text()
         assert choice_table(strength.candidates()).markdown() in strength.PAGE.read_text()
 
+    def test_the_page_has_the_ratios_of_the_table(self):
+        """Of the means over three seeds, for each task."""
+        found = {curve.label: curve for curve in strength.curves(strength.shown())}
+        ratios = {}
+        for task in ("hopper_v5", "lunarlander"):
+            curve = found[f"{task}, ppo"]
+            assert all(len(group.runs) == 3 for group in curve.groups.values())
+            sm = dict(zip(curve.groups, curve.means("sm_asap"), strict=True))
+            ratios[task] = {at: value / sm[0.0] for at, value in sm.items()}
+        page = " ".join(strength.PAGE.read_text().split())
+        said = "Sm falls to {:.2f} of the baseline at a strength of 0.1, to {:.2f} at the preset's"
+        assert said.format(*(ratios["hopper_v5"][at] for at in (0.1, 1.0))) in page
+        assert f"strength of 1, and to {ratios['hopper_v5'][10.0]:.2f} at 10" in page
+        assert f"where Sm is {ratios['lunarlander'][1.0]:.2f} of the baseline" in page
+        assert f"with 0.66 and {ratios['hopper_v5'][0.3]:.2f} of its Sm" in page
+        guide = " ".join((ROOT / "docs" / "strength.md").read_text().split())
+        assert "10 has half of the preset's Sm" in guide
+        assert ratios["hopper_v5"][10.0] / ratios["hopper_v5"][1.0] == pytest.approx(0.5, abs=0.05)
+
     def test_no_weaker_preset_by_the_rule(self):
         """On Pendulum every strength returns more than 5% less than the baseline."""
         found = strength.candidates()
