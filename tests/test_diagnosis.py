@@ -676,3 +676,9 @@ class TestCommand:
         assert "--names must have 2 names, one per run" in capsys.readouterr().err
         with pytest.raises(SystemExit, match=r"^error: Expected each run once"):
             main([str(run), str(run)])
+
+
+def test_a_policy_that_is_no_actor_is_refused():
+    """Before anything is played."""
+    with pytest.raises(TypeError, match=r"policy must be an actor of TorchRL, got None"):
+        diagnose(None, GymEnv("Pendulum-v1"))

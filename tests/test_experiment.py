@@ -595,3 +595,9 @@ def test_an_unwritable_folder_is_named(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(OSError, match="cannot be written to"):
         Experiment(small(), folder=tmp_path / "file")
+
+
+def test_a_config_of_another_type_is_refused(tmp_path):
+    """With one that would do."""
+    with pytest.raises(TypeError, match=r"config must be an ExperimentConfig, got a dict: Exper"):
+        Experiment({"seed": 1}, tmp_path)

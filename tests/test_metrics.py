@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from torchrl.data import Bounded
 
 from torchrl_l2c2 import Neighborhood, action_variation, local_lipschitz
 from torchrl_l2c2.metrics import (
@@ -229,6 +230,18 @@ def test_saturation_of_actions_that_are_nan_is_nan():
     found = saturation(actions, -1.0, 1.0)
     assert found.isnan().tolist() == action_variation(actions).isnan().tolist() == [True, False]
     assert found[1].item() == 0.5
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "error", "told"),
+    [
+        (1.0, -1.0, ValueError, "low must be at most high, got 1.0 and -1.0"),
+        (Bounded(-1.0, 1.0, (1,)), 1.0, TypeError, "pass spec.space.low, spec.space.high"),
+    ],
+)
+def test_saturation_refuses_what_are_no_bounds(low, high, error, told):
+    with pytest.raises(error, match=told):
+        saturation(torch.zeros(5, 1), low, high)
 
 
 def test_of_a_range_that_is_open_only_the_bound_counts():

@@ -663,6 +663,21 @@ def test_print_starts_with_the_settings(kind):
 
 
 @pytest.mark.parametrize(
+    ("name", "hint"),
+    [
+        ("strenght", "the strength is 'strength'"),
+        ("Strength", "the strength is 'strength'"),
+        ("progress", r"set_progress\(\.\.\.\)"),
+    ],
+)
+def test_a_typo_in_the_name_of_a_knob_is_told(name, hint):
+    loss = L2C2Loss(base_loss(), NEAR)
+    with pytest.warns(UserWarning, match=f"'{name}' has no effect on a L2C2.*{hint}") as told:
+        setattr(loss, name, 0.5)
+    assert told[0].filename == __file__
+
+
+@pytest.mark.parametrize(
     ("name", "gain"),
     [
         ("l2c2_coef", "l2c2_coeff"),

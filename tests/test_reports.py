@@ -281,6 +281,16 @@ class TestGroups:
             assert sum(n.startswith(start) and str(tmp_path / name) in n for n in found.notes) == 1
         summary = sweep_summary([tmp_path])
         assert "| baseline | 1 |" in summary and all(note in summary for note in found.notes)
+        with pytest.raises(FileNotFoundError) as error:
+            find_runs([tmp_path / "going"], required=True)
+        assert str(error.value).endswith(
+            f"{tmp_path / 'going'}. The command that began a run continues it."
+        )
+        (tmp_path / "empty").mkdir()
+        with pytest.raises(
+            FileNotFoundError, match=r"got none\. Name an output folder of train\.py"
+        ):
+            find_runs([tmp_path / "empty"], required=True)
 
     @pytest.mark.parametrize(
         ("name", "content"),

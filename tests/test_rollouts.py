@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 from functools import partial
 
@@ -354,3 +355,20 @@ def test_the_learning_rate_falls_in_a_line():
     run.train()
     # 40 frames a rollout, known after the one that follows.
     assert rates == pytest.approx([0.1 * (1 - 0.1 * i) for i in range(10)], abs=1e-6)
+
+
+@pytest.mark.parametrize("saved", [True, False])
+def test_a_signal_in_the_last_episode_ends_the_run_too(saved, tmp_path, monkeypatch):
+    """Before its tests and the next runs of a sweep; the training is complete."""
+    task = TaskConfig("pendulum", "Pendulum-v1", episodes=2, max_steps=60)
+    folder = tmp_path if saved else None
+    run = experiment(task, folder)
+    record, end = run._record, partial(os.kill, os.getpid(), signal.SIGINT)
+    monkeypatch.setattr(run, "_record", lambda *of: (record(*of), len(run.metrics) == 2 and end()))
+    then = f"the same command continues it from {folder}." if saved else "nothing was saved, bec"
+    with pytest.raises(Interrupted, match=re.escape(f"after episode 2; {then}")):
+        run.train()
+    run.close()
+    if saved:
+        again = Experiment(run.config, folder)
+        assert len(again.train()) == 2 and again.player.frames == run.player.frames

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig, PPORPEConfig, TaskConfig
-from torchrl_l2c2.experiment.analysis.video import play_pictures, record_video
+from torchrl_l2c2.experiment.analysis.video import play_pictures, record_video, write_video
 from torchrl_l2c2.experiment.cli.video import main
 from torchrl_l2c2.experiment.envs.pictures import Drawing, PictureRecorder
 from torchrl_l2c2.experiment.run.policies import load_policy
@@ -103,6 +103,19 @@ def test_the_pictures_are_those_of_the_test_episode(pendulum):
     first = load_policy(pendulum)[1].reset()["observation"]
     assert np.array_equal(first.numpy(), episode["observation"][0].numpy())
     assert dict(os.environ) == before
+
+
+def test_an_encoder_that_cannot_write_is_one_line(tmp_path, monkeypatch):
+    """As on a full disk: the encoder's own message is many lines."""
+
+    def full(*_, **__):
+        raise OSError("Broken pipe\n\nFFMPEG COMMAND:")
+        yield
+
+    monkeypatch.setattr("imageio_ffmpeg.write_frames", full)
+    pictures = [np.zeros((4, 4, 3), np.uint8)]
+    with pytest.raises(OSError, match=r"^the video could not be written: .*a\.mp4\. Is the disk"):
+        write_video(tmp_path / "a.mp4", pictures, 30.0)
 
 
 def test_a_task_that_draws_nothing_is_refused(tmp_path):

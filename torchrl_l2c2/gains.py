@@ -199,7 +199,7 @@ def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]
     terms. The loss does not change, and nothing is drawn from torch's global generators.
 
     Args:
-        loss (LossModule): the loss in training; a loss without a regularizer has no shares.
+        loss (LossModule): the loss in training, with a regularizer.
         batch (TensorDictBase): the loss's input; not written to.
 
     Returns:
@@ -211,6 +211,7 @@ def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]
             training loop does not add it, whatever its share is here.
 
     Raises:
+        TypeError: the loss has no regularizer.
         ValueError: a term is not a single number.
         RuntimeError: in inference mode, which keeps no gradients.
 
@@ -232,7 +233,12 @@ def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]
         >>> round(gradient_shares(loss, batch)["loss_cats"] / share, 3)
         2.0
     """
-    names = getattr(loss, "added_terms", ())
+    if not hasattr(loss, "added_terms"):
+        raise TypeError(
+            f"gradient_shares takes a loss with a regularizer, and this {type(loss).__name__} has "
+            "none: assign the result of smooth, loss = smooth(loss)."
+        )
+    names = loss.added_terms
     if not names:
         return {}
     check_takes_gradients("gradient_shares")

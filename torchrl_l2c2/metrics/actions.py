@@ -199,8 +199,9 @@ def saturation(
         where an action is NaN.
 
     Raises:
-        TypeError: the actions are no floating-point tensor, or the margin is no number.
-        ValueError: the shape is wrong, or the margin is negative.
+        TypeError: the actions are no floating-point tensor, the margin is no number, or a bound is
+            a spec.
+        ValueError: the shape is wrong, the margin is negative, or a lower bound is above the upper.
 
     Examples:
         >>> import torch
@@ -210,7 +211,11 @@ def saturation(
     """
     check_episodes("saturation", actions, 1)
     check_real("saturation: margin", margin, at_least=0)
+    if any(hasattr(bound, "space") for bound in (low, high)):
+        raise TypeError("saturation: low and high are bounds: pass spec.space.low, spec.space.high")
     low, high = torch.as_tensor(low), torch.as_tensor(high)
+    if bool((low > high).any()):
+        raise ValueError(f"saturation: low must be at most high, got {low} and {high}.")
     width = margin * (high - low)
     width = width.where(width.isfinite(), 0.0)
     ends = ((actions <= low + width) | (actions >= high - width)).float()

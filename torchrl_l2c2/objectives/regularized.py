@@ -61,6 +61,13 @@ PROGRESS = "regularizer_progress"
 """Name of the buffer with the completed share of training, for a ramp."""
 
 
+KNOBS = {
+    "strength": "the strength is 'strength'",
+    "progress": "the progress of training is set by set_progress(...)",
+}
+"""What loops set during training; these names, misspelled, are warned of."""
+
+
 class RegularizedLoss(SpecializedLoss, SharedEvaluation):
     r"""A TorchRL loss with additional terms: the base class of all regularizers.
 
@@ -449,6 +456,12 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
     def _warn_of_typo(self, name: str, value: Any) -> None:
         """Warns of a new attribute with the name of a setting, or nearly the name of a gain."""
         if name.startswith("_") or hasattr(self, name):
+            return
+        if knobs := get_close_matches(name.lower(), KNOBS, 1, cutoff=0.85):
+            warnings.warn(
+                f"{name!r} has no effect on a {type(self).__name__}: {KNOBS[knobs[0]]}.",
+                stacklevel=3,
+            )
             return
         gains = [gain for gain in self._coefficients if gain.endswith(f"_{name}")]
         gains = gains or get_close_matches(name, self._coefficients, 1, cutoff=0.85)

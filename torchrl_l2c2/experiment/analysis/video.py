@@ -158,7 +158,7 @@ def write_video(path: Path, pictures: Sequence[Picture], rate: float) -> None:
         (width, height),
         fps=rate,
         macro_block_size=2,  # an odd side is stretched by a pixel, which the encoder needs
-        ffmpeg_log_level="error",
+        ffmpeg_log_level="quiet",
     )
     try:
         writer.send(None)
@@ -166,6 +166,9 @@ def write_video(path: Path, pictures: Sequence[Picture], rate: float) -> None:
             writer.send(np.ascontiguousarray(picture))
         writer.close()
         os.replace(partial, path)
+    except OSError:
+        # The encoder's own message is many lines.
+        raise OSError(f"the video could not be written: {path}. Is the disk full?") from None
     finally:
         partial.unlink(missing_ok=True)
 

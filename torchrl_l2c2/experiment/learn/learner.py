@@ -176,6 +176,8 @@ class Learner:
         Args:
             batch (TensorDictBase): Batch of the loss.
         """
+        if not hasattr(self.agent.loss, "added_terms"):
+            return {}
         shares = gradient_shares(self.agent.loss, batch)
         return {key: share for key, share in shares.items() if math.isfinite(share)}
 

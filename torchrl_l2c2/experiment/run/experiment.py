@@ -89,6 +89,11 @@ class Experiment:
         *,
         allow_other_versions: bool = False,
     ) -> None:
+        if not isinstance(config, ExperimentConfig | None):
+            raise TypeError(
+                f"config must be an ExperimentConfig, got a {type(config).__name__}: "
+                "ExperimentConfig(seed=1) is one."
+            )
         self.config = config = config or ExperimentConfig()
         self.folder = None if folder is None else Path(folder)
         check_installed(config.logger.name)
@@ -144,7 +149,7 @@ class Experiment:
                 the last good checkpoint.
             OtherRunError: If the run already has more episodes, or another Experiment has written
                 to the folder.
-            Interrupted: If a signal ended the training.
+            Interrupted: If a signal arrived during the training, which ends after the episode.
 
         Warns:
             UserWarning: If no update was made or all actions were random, or the regularizer's
@@ -173,7 +178,7 @@ class Experiment:
         with (
             self._process,
             closing(bar),
-            stop_on_signals() as signals,
+            stop_on_signals(saves=self.folder is not None) as signals,
             add_checkpoint_to_errors(self.folder),
         ):
             # If the length has changed, the learning rate differs from its last value.
@@ -193,8 +198,10 @@ class Experiment:
                 if ended or signals or overdue:
                     self.save()
                     saved = time.monotonic()
-                if signals and not ended:
-                    raise Interrupted(signals[0], len(self.metrics), self.folder)
+                if signals:
+                    break
+            if signals:  # Also in the last episode: its tests, and the next runs of a sweep, wait.
+                raise Interrupted(signals[0], len(self.metrics), self.folder)
         if problem := self._untrained():
             warnings.warn(problem, stacklevel=2)
         return self.metrics

@@ -21,14 +21,14 @@ FINISHING = "finishing the episode, then saving"
 
 
 class Interrupted(Exception):
-    """A signal ended the training after a checkpoint."""
+    """A signal ended the training after an episode, with a checkpoint if there is a folder."""
 
     def __init__(self, signal_number: int, episode: int, folder: Path | None) -> None:
         name = signal.Signals(signal_number).name
-        super().__init__(
-            f"{name} ended the training after episode {episode}; the same command continues it "
-            f"from {folder}."
-        )
+        then = f"the same command continues it from {folder}."
+        if folder is None:
+            then = "nothing was saved, because the experiment has no folder. train() continues it."
+        super().__init__(f"{name} ended the training after episode {episode}; {then}")
         self.signal_number = signal_number
 
 
@@ -43,11 +43,14 @@ def terminate(number: int, frame: Any) -> NoReturn:
 
 
 @contextlib.contextmanager
-def stop_on_signals() -> Iterator[list[int]]:
+def stop_on_signals(*, saves: bool = True) -> Iterator[list[int]]:
     """Collects SIGTERM and SIGINT in a list; a second signal has its usual effect.
 
     A signal to all processes of a job also ends compilers. Their failures after a signal count as
     an interruption.
+
+    Keyword Args:
+        saves (bool): Whether the message promises a checkpoint. Default ``True``.
 
     Yields:
         list: Numbers of the received signals.
@@ -66,7 +69,8 @@ def stop_on_signals() -> Iterator[list[int]]:
         if not received:
             first = time.monotonic()
             received.append(number)
-            print(f"\n{FINISHING}; a second signal ends at once", file=sys.stderr, flush=True)
+            told = FINISHING if saves else "finishing the episode"
+            print(f"\n{told}; a second signal ends at once", file=sys.stderr, flush=True)
         elif time.monotonic() - first > SAME_SIGNAL_SECONDS:
             restore()
             signal.raise_signal(number)

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase, ExplorationType, GymWrapper, set_exploration_type
@@ -238,6 +238,11 @@ def diagnose(
 
 
 def _observed(policy: TensorDictModule, env: EnvBase) -> NestedKey:
+    if not isinstance(policy, TensorDictModuleBase):
+        raise TypeError(
+            f"policy must be an actor of TorchRL, got {policy!r}: torchrl.modules.Actor(network) "
+            "makes one of a network."
+        )
     if not isinstance(env, EnvBase):
         raise TypeError(
             f"env must be an environment of TorchRL, got {env!r}: torchrl.envs.GymEnv(id) makes "

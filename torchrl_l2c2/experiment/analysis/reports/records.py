@@ -88,7 +88,10 @@ def find_runs(folders: Iterable[str | Path], *, required: bool = False) -> Found
     if required and not runs:
         places = ", ".join(repr(str(folder)) for folder in searched)
         text = f"Expected finished runs (evaluation.json) below {places}, got none."
-        raise FileNotFoundError(" ".join([text, *notes, "Name an output folder of train.py."]))
+        reasons = [f"{note}." for note in notes] or ["Name an output folder of train.py."]
+        if unfinished:
+            reasons.append("The command that began a run continues it.")
+        raise FileNotFoundError(" ".join([text, *reasons]))
     return Found(runs, notes)
 
 
