@@ -65,7 +65,7 @@ KNOBS = {
     "strength": "the strength is 'strength'",
     "progress": "the progress of training is set by set_progress(...)",
 }
-"""What loops set during training; these names, misspelled, are warned of."""
+"""Attributes that training loops set, with a hint for names that are nearly the same."""
 
 
 class RegularizedLoss(SpecializedLoss, SharedEvaluation):
