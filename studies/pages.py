@@ -122,7 +122,7 @@ def pages() -> dict[str, Page]:
                 "strengths": front_door.strengths_table(ROOT / "results" / "td3_strength.csv"),
             }
         ),
-        "results/rsl_rl.md": Page({"results": front_door.table(RSL_RL, [rsl_rl.TASK])}),
+        "results/rsl_rl.md": Page({"results": front_door.table(RSL_RL, rsl_rl.ITERATIONS)}),
         "results/td3.md": Page(
             {
                 "test": td3.test_table(),

@@ -1,4 +1,4 @@
-"""Trains rsl_rl's PPO on a MuJoCo task, with and without L2C2.
+"""Trains rsl_rl's PPO on a toy task and on a MuJoCo task, with and without L2C2.
 
 ``python -m studies.rsl_rl FILE.csv`` adds a line to the file after each run; runs that the file has
 are skipped.
@@ -19,16 +19,17 @@ from studies.field import TEST
 from studies.front_door import METHODS, add_runs
 from torchrl_l2c2.experiment.analysis.reports.groups import Group
 
-TASK = "HalfCheetah-v5"
+# Iterations of each task: 64,000 and 1,001,472 frames.
+ITERATIONS = {"points": 40, "HalfCheetah-v5": 489}
 SEEDS = range(5)
-ITERATIONS = 489  # 1,001,472 frames
 CLASSES = dict(zip(METHODS, ("PPO", "torchrl_l2c2.rsl_rl:L2C2PPO"), strict=True))
 
 
-def recorded(path: Path) -> tuple[Group, Group]:
-    """The runs with L2C2 and of the baseline, as groups for tables and pictures."""
+def recorded(path: Path, task: str) -> tuple[Group, Group]:
+    """The runs of a task with L2C2 and of the baseline, as groups for tables and pictures."""
     measures = ("return", "action_variation")
     runs = pd.read_csv(path).rename(columns={name: f"{TEST}_{name}" for name in measures})
+    runs = runs[runs["algorithm"] == task]
     baseline, smooth = (Group(runs[runs["method"] == method], method) for method in METHODS)
     return smooth, baseline
 
@@ -37,13 +38,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Makes the runs that the file lacks."""
     (file,) = sys.argv[1:] if arguments is None else arguments
     sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
-    from rsl_rl_gymnasium import train
+    import rsl_rl_gymnasium
+    import rsl_rl_l2c2
 
     def silent(seed: int, task: str, method: str) -> tuple[float, float]:
+        if task == "points":
+            return rsl_rl_l2c2.train(CLASSES[method], seed, ITERATIONS[task])
         with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
-            return train(CLASSES[method], task, seed, ITERATIONS)
+            return rsl_rl_gymnasium.train(CLASSES[method], task, seed, ITERATIONS[task])
 
-    add_runs(Path(file), product(SEEDS, [TASK], METHODS), silent)
+    add_runs(Path(file), product(SEEDS, ITERATIONS, METHODS), silent)
 
 
 if __name__ == "__main__":

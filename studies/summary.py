@@ -66,7 +66,8 @@ algorithm and settings on its noisy tasks. TD3 and rsl_rl are added to them, fro
 def benchmarks() -> dict[tuple[str, str], Pair]:
     """The runs of every benchmark by task and algorithm, the roughest baseline first."""
     found = {(each.task, each.algorithm): _groups(each) for each in BENCHMARKS}
-    found["HalfCheetah", "PPO of rsl_rl"] = rsl_rl.recorded(RSL_RL)
+    for name, task in (("HalfCheetah", "HalfCheetah-v5"), ("noisy points", "points")):
+        found[name, "PPO of rsl_rl"] = rsl_rl.recorded(RSL_RL, task)
     of_td3 = td3.by_setting(records("td3").query("seed < 10"))
     found["Pendulum", "TD3"] = of_td3["L2C2", td3.PRESETS["L2C2"]], of_td3[td3.BASELINE]
 
