@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
+import pandas as pd
+
 from studies import rsl_rl, td3
 from studies.field import TEST
 from studies.files import ROOT, records
@@ -78,6 +80,17 @@ def benchmarks() -> dict[tuple[str, str], Pair]:
     return {names: found[names] for names in sorted(found, key=roughness, reverse=True)}
 
 
+def with_cats() -> list[Pair]:
+    """The runs with CATS and with L2C2, of each benchmark that has both at their presets."""
+    found = []
+    for each in BENCHMARKS:
+        named = {group.name: group for group in group_records(_records(each))}
+        if "CATS" in named:
+            found.append((named["CATS"], named[each.method]))
+    of_td3 = td3.by_setting(records("td3").query("seed < 10"))
+    return [*found, tuple(of_td3[method, td3.PRESETS[method]] for method in ("CATS", "L2C2"))]
+
+
 def short_table() -> str:
     """The README's table."""
     return _table(
@@ -126,12 +139,16 @@ def sm_table() -> str:
     )
 
 
-def _groups(benchmark: Benchmark) -> Pair:
+def _records(benchmark: Benchmark) -> pd.DataFrame:
     found = records(benchmark.file)
     found = found[(found["task"] == benchmark.recorded) & (found["length"] == benchmark.length)]
     # Seeds of 100 and above chose the gains. Runs with another tau are another study.
     other = found["differences"].str.contains("algorithm.tau", regex=False)
-    found = found[(found["seed"] < 100) & ~other]
+    return found[(found["seed"] < 100) & ~other]
+
+
+def _groups(benchmark: Benchmark) -> Pair:
+    found = _records(benchmark)
     (ours,) = (group for group in group_records(found) if group.name == benchmark.method)
     same = found[(found["method"] == "none") & found["seed"].isin(ours.seeds)]
     (baseline,) = group_records(same)

@@ -71,26 +71,25 @@ def test_table() -> str:
     groups = by_setting(records("td3").query("seed < 10"))
     columns = ["setting", "return", "failed", "action variation", "P(returns more)", "P(smoother)"]
     rows = [columns]
-    order = [BASELINE, *((m, s) for m in GAINS for s in STRENGTHS if (m, s) in groups)]
-    for setting in order:
-        group = groups[setting]
-        total, variation = (
-            Estimate.of(mean, group.scores(TEST, quantity))
-            for quantity in ("return", "action_variation")
-        )
-        assert total is not None and variation is not None
-        better = [""] * 2
-        if setting != BASELINE:
-            better = [
-                improvement_cell([group], [groups[BASELINE]], TEST, quantity)
-                for quantity in ("return", "action_variation")
-            ]
+    for setting in (BASELINE, *((m, s) for m in GAINS for s in STRENGTHS if (m, s) in groups)):
         shown = name(setting)
         if setting[0] in PRESETS and setting[1] == PRESETS[setting[0]]:
             shown = f"**{shown}** (the preset)"
-        cells = [total.text("{:.1f}".format), f"{failures(group)} of {len(group.seeds)}"]
-        rows.append([shown, *cells, variation.text("{:.3f}".format), *better])
+        rows.append([shown, *_cells(groups[setting], groups[BASELINE])])
+    (again,) = group_records(records("td3_again"))
+    rows.append(["L2C2, the preset again, as `regularizer=l2c2`", *_cells(again, groups[BASELINE])])
     return pipe_table(rows)
+
+
+def _cells(group: Group, baseline: Group) -> list[str]:
+    quantities = ("return", "action_variation")
+    total, variation = (Estimate.of(mean, group.scores(TEST, each)) for each in quantities)
+    assert total is not None and variation is not None
+    better = [""] * 2
+    if group is not baseline:
+        better = [improvement_cell([group], [baseline], TEST, each) for each in quantities]
+    failed = f"{failures(group)} of {len(group.seeds)}"
+    return [total.text("{:.1f}".format), failed, variation.text("{:.3f}".format), *better]
 
 
 def failures(group: Group) -> int:

@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections import Counter
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pandas as pd
@@ -31,7 +32,7 @@ from studies.paper import (
 )
 from studies.protocol import main as score
 from studies.protocol import until, variants
-from studies.summary import benchmarks
+from studies.summary import benchmarks, with_cats
 from studies.targets import gain_targets_table
 from tests.test_reports import METHODS, cells, make_config, make_run, table_of
 from torchrl_l2c2.experiment import (
@@ -52,7 +53,8 @@ from torchrl_l2c2.experiment.analysis.reports import (
     records_of,
 )
 from torchrl_l2c2.experiment.analysis.reports.records import merge
-from torchrl_l2c2.experiment.analysis.reports.table import improvement
+from torchrl_l2c2.experiment.analysis.reports.statistics import probability_of_improvement
+from torchrl_l2c2.experiment.analysis.reports.table import Estimate, improvement
 from torchrl_l2c2.experiment.settings.optimizers import AdamConfig
 from torchrl_l2c2.experiment.settings.regularizers import REGULARIZERS
 from torchrl_l2c2.experiment.settings.tasks import TASKS
@@ -564,13 +566,16 @@ class TestProse:
         rough = [
             side.scores("last_mean", "action_variation").mean() for _, side in benchmarks().values()
         ]
-        assert rough == sorted(rough, reverse=True) and len(rough) == 16
+        assert rough == sorted(rough, reverse=True) and len(rough) == 17
 
     def test_the_readmes_sentences(self):
         """The changes of rough and of smooth baselines, the losses of return, and untuned tasks."""
         readme = " ".join((ROOT / "README.md").read_text().split())
-        rough, smooth, higher = [], [], []
+        rough, smooth, higher, beyond = [], [], [], Counter()
         for ours, baseline in benchmarks().values():
+            for quantity in ("action_variation", "return"):
+                better = improvement([ours], [baseline], "last_mean", quantity)
+                beyond[quantity, better.interval[0] > 0.5, better.interval[1] < 0.5] += 1
             after, before = (
                 group.scores("last_mean", "action_variation").mean() for group in (ours, baseline)
             )
@@ -579,15 +584,48 @@ class TestProse:
                 group.scores("last_mean", "return").mean() for group in (ours, baseline)
             )
             higher.append(total > other)
-        assert len(rough) == 11 and len(smooth) == 5 and sum(higher) == 7 and len(higher) == 16
-        said = f"fell by {-max(rough)} to {-min(rough)}%, and in the other five it changed by "
-        assert f"{said}{min(smooth)} to {max(smooth):+}%" in readme
-        assert "The mean return was higher in seven and lower in nine" in readme
+        assert len(rough) == 12 and len(smooth) == 5 and sum(higher) == 7 and len(higher) == 17
+        assert f"fell by {-max(rough)} to {-min(rough)}%, in ten of them beyond" in readme
+        assert f"the other five it changed by {min(smooth)} to {max(smooth):+}%" in readme
+        # Eleven with LunarLander, which is among the other five.
+        assert beyond["action_variation", True, False] == 11
+        assert beyond["action_variation", False, True] == 0
+        assert "was higher in seven and lower in ten, of these beyond seed noise in two" in readme
+        assert beyond["return", False, True] == 2
         cheetah, baseline = benchmarks()["HalfCheetah", "PPO"]
         returned = [group.scores("last_mean", "return").mean() for group in (cheetah, baseline)]
-        assert f"{returned[0] / returned[1] - 1:.0%}, with three seeds" in readme
+        assert f"by {1 - returned[0] / returned[1]:.0%} for PPO on HalfCheetah, with thr" in readme
         assert len(cheetah.seeds) == 3
+        points, baseline = benchmarks()["noisy points", "PPO of rsl_rl"]
+        returned = [group.scores("last_mean", "return").mean() for group in (points, baseline)]
+        assert f"by {1 - returned[0] / returned[1]:.1%} on rsl_rl's noisy points" in readme
         assert td3.failures(benchmarks()["Pendulum", "TD3"][0]) == 2
+
+    def test_cats_on_the_benchmarks_that_have_it(self):
+        """How many are smoother in the mean, and how probable a better run is."""
+        pairs = with_cats()
+        means = [[g.scores("last_mean", "action_variation").mean() for g in pair] for pair in pairs]
+        smoother = sum(cats < ours for cats, ours in means)
+        page = " ".join((ROOT / "docs" / "results.md").read_text().split())
+        assert (smoother, len(pairs)) == (8, 11)
+        for path in ("README.md", "docs/methods.md", "docs/limitations.md"):
+            assert "8 of 11 benchmarks" in " ".join((ROOT / path).read_text().split())
+        sides = [list(side) for side in zip(*pairs, strict=True)]
+        for quantity in ("action_variation", "return", "sm_asap"):
+            assert improvement(*sides, "last_mean", quantity).text() in page
+
+    def test_how_often_an_interval_excludes_chance(self):
+        """Over all orders of two sides' runs that do not differ: one in five, and one in ten."""
+        for seeds, share in ((3, 0.2), (5, 0.1)):
+            excluded = []
+            for places in combinations(range(2 * seeds), seeds):
+                one = np.array(places, float)[:, None]
+                other = np.setdiff1d(np.arange(2.0 * seeds), one)[:, None]
+                low, high = Estimate.of(probability_of_improvement, one, other).interval
+                excluded.append(low > 0.5 or high < 0.5)
+            assert np.mean(excluded) == pytest.approx(share, abs=0.01)
+        page = " ".join((ROOT / "docs" / "results.md").read_text().split())
+        assert "one in five excludes 0.5 with three seeds, one in ten with five" in page
 
     def test_rivals_over_four_tasks(self):
         """How probable a smoother run is, and one that returns more."""
@@ -678,7 +716,7 @@ class TestProse:
         assert set(gained[gained < -0.01].index) == {"HalfCheetah-v5"}
         assert set(gained[gained > 0.01].index) == {"Ant-v5", "BipedalWalker-v3", "Swimmer-v5"}
         assert f"on HalfCheetah ({gained['HalfCheetah-v5']:.0%}, less than the baseline" in page
-        lost = f"mean return is {-gained['HalfCheetah-v5']:.0%} lower"
+        lost = f"[HalfCheetah](../results/new_tasks.md) it is {-gained['HalfCheetah-v5']:.0%} lower"
         assert lost in (ROOT / "docs" / "limitations.md").read_text()
         by_seed = records("new_tasks").pivot_table("last_mean_return", ["task", "seed"], "method")
         cheetah = by_seed.loc["HalfCheetah-v5"]
@@ -743,6 +781,8 @@ class TestProse:
             for each in (("L2C2", 0.3), td3.BASELINE)
         )
         assert f"by {1 - smooth / rough:.0%}, from {rough:.3f} to {smooth:.3f}" in page
+        (again,) = group_records(records("td3_again"))
+        assert again.seeds == list(range(10)) and td3.failures(again) == 1
         assert td3.failures(shown["CATS", 1.0]) == td3.failures(shown["CAPS", 1.0]) == 0
         assert td3.chosen(groups) == {"L2C2": 0.3, "CATS": 0.1, "CAPS": 0.1}
         cats = [groups["CATS", each] for each in td3.STRENGTHS]
@@ -826,7 +866,7 @@ class TestForest:
         assert forest.table(shown) in text
 
     def test_picture_and_sentences_are_of_the_records(self):
-        """The mean over the rows, and the only loss of return beyond seed noise."""
+        """The mean over the rows, and the two losses of return beyond seed noise."""
         shown = forest.rows(benchmarks())
         assert forest.table(shown) in forest.PICTURE.read_text()
         *rows, overall = shown
@@ -840,7 +880,7 @@ class TestForest:
         low, high = overall.better[1].interval
         assert low < 0.5 < high
         lost = [row.label for row in rows if row.better[1].interval[1] < 0.5]
-        assert lost == ["HalfCheetah, PPO (3 seeds)"]
+        assert lost == ["HalfCheetah, PPO (3 seeds)", "noisy points, PPO of rsl_rl (5 seeds)"]
 
 
 class TestStrength:
