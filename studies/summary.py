@@ -88,7 +88,8 @@ def with_cats() -> list[Pair]:
         if "CATS" in named:
             found.append((named["CATS"], named[each.method]))
     of_td3 = td3.by_setting(records("td3").query("seed < 10"))
-    return [*found, tuple(of_td3[method, td3.PRESETS[method]] for method in ("CATS", "L2C2"))]
+    cats, ours = (of_td3[method, td3.PRESETS[method]] for method in ("CATS", "L2C2"))
+    return [*found, (cats, ours)]
 
 
 def short_table() -> str:

@@ -19,7 +19,7 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import GymEnv, TransformedEnv
-from torchrl.objectives import SACLoss
+from torchrl.objectives import SACLoss, TD3Loss
 from torchrl.trainers.algorithms import SACTrainer
 
 from torchrl_l2c2 import (
@@ -380,6 +380,33 @@ def test_trainer_composes():
     assert isinstance(trainer.target_net_updater, TSoftUpdate)
     trainer.train()
     assert len(trainer._log_dict["loss_l2c2_qvalue"]) == 2
+
+
+def test_td3s_trainer_gives_the_smoothed_loss_its_networks():
+    """It calls the loss's node, as the plain loss's: both have ``_partial_``."""
+    cfg = composed(
+        *("+env@training_env=gym", "training_env.env_name=Pendulum-v1", "+collector=sync"),
+        *("collector.create_env_fn=${training_env}", "collector._partial_=true"),
+        *("collector.policy=null", "collector.frames_per_batch=16", "collector.total_frames=16"),
+        *("+loss=smooth", "+loss@loss.base_loss=td3", "loss._partial_=true", "loss.strength=3"),
+        *("+optimizer=adam", "+target_net_updater=tsoft", "+trainer=td3"),
+        *("+replay_buffer=tensordict", "replay_buffer.batch_size=8"),
+        *("+storage@replay_buffer.storage=lazy_tensor", "replay_buffer.storage.max_size=100"),
+        *("trainer.collector=${collector}", "trainer.loss_module=${loss}"),
+        *("trainer.optimizer=${optimizer}", "trainer.replay_buffer=${replay_buffer}"),
+        *("trainer.target_net_updater=${target_net_updater}", "trainer.total_frames=16"),
+        *("trainer.logger=null", "trainer.save_trainer_file=null", "trainer.progress_bar=false"),
+        *("trainer.optim_steps_per_batch=1", "trainer.enable_logging=false"),
+        *("trainer.actor_network=${networks.actor}", "trainer.qvalue_network=${networks.qvalue}"),
+    )
+    OmegaConf.set_struct(cfg, False)
+    network = {"_target_": "torchrl.modules.MLP", "in_features": 3, "out_features": 1}
+    actor = {"_target_": "torchrl.modules.Actor", "module": network, "in_keys": ["observation"]}
+    cfg.networks = {**NETWORKS, "actor": actor}
+    cfg.loss.base_loss["_partial_"] = True
+    trainer = instantiate(cfg.trainer)
+    assert isinstance(trainer.loss_module, TD3Loss) and trainer.loss_module.strength == 3.0
+    trainer.train()
 
 
 def documented(number: int, folder: Path, *overrides: str) -> DictConfig:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import warnings
+from dataclasses import replace
 
 import pytest
 import torch
@@ -252,6 +253,28 @@ class TestThePenalty:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             other.policy_regularizer(scaled)
+
+    @pytest.mark.parametrize(
+        "other", [Neighborhood(), Neighborhood(lambda_min=0.2, neighbors="line")]
+    )
+    def test_neighbors_of_another_neighborhood_are_told(self, other):
+        """In a box instead of on the line, or at distances of another ratio of gains."""
+        torch.manual_seed(0)
+        near = Neighborhood(neighbors="line")
+        batch, odd = transitions(6), replace(near, lambda_max=near.lambda_min + 1e-7)
+        # A successor far away in one coordinate, and one that is the state itself.
+        batch["next", "observation"][0, 0] = 1e4
+        batch["next", "observation"][1] = batch["observation"][1]
+        batch = NeighborTransform(other, num_samples=2)(batch)
+        loss = L2C2Loss(DDPGLoss(deterministic_actor(), qvalue()), near)
+        with pytest.warns(UserWarning, match=r"another neighborhood than L2C2Loss\[DDPGLoss\]'s"):
+            loss.policy_regularizer(batch)
+        for neighborhood in (near, odd):  # At distances of a million, which are nearly the same.
+            loss = L2C2Loss(DDPGLoss(deterministic_actor(), qvalue()), neighborhood)
+            own = loss.neighbor_transform()(batch.exclude("neighbor"))
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")
+                loss.policy_regularizer(own)
 
     def test_a_nested_key_without_a_list_is_told_to_be_put_into_one(self):
         """A tuple is a sequence of names elsewhere."""

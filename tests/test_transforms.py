@@ -3,6 +3,7 @@ from __future__ import annotations
 import copy
 import functools
 import math
+import pickle
 from importlib.util import find_spec
 
 import pytest
@@ -603,3 +604,25 @@ def test_noise_is_refused_in_a_replay_buffer():
     buffer.extend(TensorDict({**state, "next": state}, [8]))
     with pytest.raises(ValueError, match="belongs to an environment, not to a replay buffer"):
         buffer.sample()
+
+
+@pytest.mark.parametrize(
+    "make", [functools.partial(NeighborTransform, NEAR), functools.partial(ObservationNoise, 0.1)]
+)
+def test_a_generator_is_sent_to_a_new_process(make):
+    """torch sends none by itself; the other process has a generator in the same state."""
+    transform = make(generator=torch.Generator().manual_seed(3))
+    expected = torch.rand(3, generator=torch.Generator().manual_seed(3))
+    context = torch.multiprocessing.get_context("spawn")
+    queue = context.Queue()
+    process = context.Process(target=_draw, args=(transform, queue))
+    process.start()
+    drawn = queue.get(timeout=100)
+    process.join()
+    assert drawn == expected.tolist()
+    for twin in (copy.deepcopy(transform), pickle.loads(pickle.dumps(transform)), transform):
+        assert torch.equal(torch.rand(3, generator=twin.generator), expected)
+
+
+def _draw(transform, queue):
+    queue.put(torch.rand(3, generator=transform.generator).tolist())

@@ -41,12 +41,19 @@ from torchrl_l2c2.updaters import TSoftUpdate
 
 
 def _make_smooth_loss(
-    base_loss: LossModule, method: str, strength: float, fold: bool, overrides: Mapping[str, Any]
+    base_loss: LossModule | Callable[..., LossModule],
+    method: str,
+    strength: float,
+    fold: bool,
+    overrides: Mapping[str, Any],
+    **networks: Any,
 ) -> RegularizedLoss:
+    """The wrapped loss; some trainers pass their networks to a loss with ``_partial_``."""
     normalized = {key: _normalize_hydra_key(value) for key, value in overrides.items()}
     if "moved_keys" in normalized:
         normalized["moved_keys"] = _listed(overrides["moved_keys"])
-    return smooth(base_loss, method, strength, fold, **normalized)
+    loss = base_loss(**networks) if networks else base_loss
+    return smooth(loss, method, strength, fold, **normalized)
 
 
 def _make_l2c2_loss(

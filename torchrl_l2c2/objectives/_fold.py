@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.compiler import is_compiling
 
 from torchrl_l2c2.gains import ALTERNATIVE_LOSSES
+from torchrl_l2c2.neighborhood import Neighborhood
 from torchrl_l2c2.objectives._batch import next_key
 
 POLICY_LOSSES = ("loss_actor", "loss_objective", "loss_bc")
@@ -260,11 +261,12 @@ class TermWatch:
             )
 
     def see_neighbors(
-        self, loss: Any, neighbors: TensorDictBase, batch: TensorDictBase, radius: float
+        self, loss: Any, neighbors: TensorDictBase, batch: TensorDictBase, near: Neighborhood
     ) -> None:
         """Warns of neighbors that were drawn before a transform changed the observations.
 
-        Observations with neighbors are floating point.
+        On a line, also of neighbors of another neighborhood. Observations with neighbors are
+        floating point.
         """
         if (
             is_compiling()
@@ -279,7 +281,7 @@ class TermWatch:
                 continue
             # [*B, K, *F] and [*B, *F]
             there = there.movedim(neighbors.batch_dims, 0)
-            span = radius * (successor - here).abs()
+            span = near.radius * (successor - here).abs()
             rounding = 16 * torch.finfo(here.dtype).eps * (here.abs() + successor.abs())
             if bool(((there - here).abs() > 1.01 * span + rounding).any()):
                 warnings.warn(
@@ -288,6 +290,46 @@ class TermWatch:
                     "transforms that change observations, such as ObservationNorm.",
                     stacklevel=5,
                 )
+                return
+            distance = neighbors["distance"].movedim(-1, 0)
+            if near.on_line and _is_elsewhere(here, successor, there, distance, near):
+                warnings.warn(
+                    "the neighbors in the batch are of another neighborhood than "
+                    f"{type(loss).__name__}'s, so its penalty is not what was set: append the "
+                    "transform that loss.neighbor_transform() returns.",
+                    stacklevel=5,
+                )
+                return
+
+
+def _is_elsewhere(
+    here: Tensor, successor: Tensor, there: Tensor, distance: Tensor, near: Neighborhood
+) -> bool:
+    """Checks if neighbors are off the line to the successor, or have distances of another one.
+
+    Args:
+        here: observations, ``[*B, *F]``.
+        successor: their successors.
+        there: their neighbors, ``[K, *B, *F]``.
+        distance: the neighbors' distances, ``[K, *B]``.
+        near: a neighborhood on a line.
+    """
+    shape = here.shape[: distance.ndim - 1]
+    here, successor = (each.reshape(shape.numel(), -1) for each in (here, successor))
+    there, distance = there.reshape(len(there), *here.shape), distance.reshape(len(there), -1)
+    step = successor - here
+    # Coordinates that hardly move do not tell the place on the line.
+    moved = step.abs() > 0.1 * step.abs().amax(-1, keepdim=True)
+    rounding = 16 * torch.finfo(here.dtype).eps * (here.abs() + successor.abs()) / step.abs()
+    allowed = 0.02 * near.radius + torch.where(moved, rounding, 0.0).amax(-1)
+    place = ((there - here) / step).abs()
+    low, high = (torch.where(moved, place, end) for end in (torch.inf, -torch.inf))
+    low, high = low.amin(-1), high.amax(-1)
+    off_line = high - low > allowed
+    # A distance is rounded relative to its size.
+    allowed = allowed + 16 * torch.finfo(distance.dtype).eps * distance
+    wrong = off_line | ((distance - near.epsilon - high).abs() > allowed)
+    return bool((wrong & moved.any(-1) & distance.isfinite()).any())
 
 
 def _warn_of_several_steps(batch: TensorDictBase) -> None:

@@ -380,7 +380,7 @@ class L2C2Loss(RegularizedLoss):
         if neighbor is None:
             neighbor = self._draw(tensordict, rows)
         else:
-            self._watch.see_neighbors(self, neighbor, tensordict, self.l2c2_neighborhood.radius)
+            self._watch.see_neighbors(self, neighbor, tensordict, self.l2c2_neighborhood)
             neighbor = neighbor if rows is None else at_rows(neighbor, rows)
         states, distance = _read_neighbors(neighbor, self.l2c2_neighbor_key)
         counts = distance[0].isfinite()

@@ -23,6 +23,22 @@ class RandomTransform(Transform):
         super().__init__(in_keys=in_keys, out_keys=out_keys)
         self.generator = generator
 
+    def __getstate__(self) -> dict[str, Any]:
+        """The state with the generator as numbers: torch cannot send one to a new process."""
+        state = super().__getstate__()
+        if self.generator is not None:
+            numbers = self.generator.get_state().numpy()
+            state["generator"] = (str(self.generator.device), numbers)
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        if state["generator"] is not None:
+            device, numbers = state["generator"]
+            generator = torch.Generator(device)
+            generator.set_state(torch.from_numpy(numbers.copy()))
+            state = {**state, "generator": generator}
+        super().__setstate__(state)
+
     def set_container(self, container: Any) -> None:
         super().set_container(container)
         parent = self.parent
