@@ -389,7 +389,7 @@ def test_td3s_trainer_gives_the_smoothed_loss_its_networks():
         *("collector.create_env_fn=${training_env}", "collector._partial_=true"),
         *("collector.policy=null", "collector.frames_per_batch=16", "collector.total_frames=16"),
         *("+loss=smooth", "+loss@loss.base_loss=td3", "loss._partial_=true", "loss.strength=3"),
-        *("+optimizer=adam", "+target_net_updater=tsoft", "+trainer=td3"),
+        *("+optimizer=adaterm", "+target_net_updater=tsoft", "+trainer=td3"),
         *("+replay_buffer=tensordict", "replay_buffer.batch_size=8"),
         *("+storage@replay_buffer.storage=lazy_tensor", "replay_buffer.storage.max_size=100"),
         *("trainer.collector=${collector}", "trainer.loss_module=${loss}"),

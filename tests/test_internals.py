@@ -292,7 +292,10 @@ ALLOWED = {
     **dict.fromkeys(("_clear_weakrefs", "_default_device", "_value_estimator"), SUBCLASSES),
     **dict.fromkeys(("_forward_value_estimator_keys", "_call"), SUBCLASSES),
     **dict.fromkeys(("_buffers", "_modules", "_load_from_state_dict"), SUBCLASSES),
-    "_load_state_dict_pre_hooks": "a loss takes over what its base has registered",
+    **dict.fromkeys(
+        ("_load_state_dict_pre_hooks", "_forward_hooks", "_OutKeysSelect"),
+        "a loss takes over what its base has registered",
+    ),
     **dict.fromkeys(("_sources", "_targets"), "what a target network's updater steps between"),
     "_event_dims": "what a TanhNormal's subclass needs of its shape",
     **dict.fromkeys(("_BatchNorm", "_DropoutNd"), "all layers whose rows depend on each other"),
