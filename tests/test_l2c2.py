@@ -275,6 +275,8 @@ class TestThePenalty:
             with warnings.catch_warnings():
                 warnings.simplefilter("error")
                 loss.policy_regularizer(own)
+        loss = L2C2Loss(DDPGLoss(deterministic_actor(), qvalue()), near)
+        assert loss.policy_regularizer(own[:0])["loss_l2c2_actor"].isnan()
 
     def test_a_nested_key_without_a_list_is_told_to_be_put_into_one(self):
         """A tuple is a sequence of names elsewhere."""

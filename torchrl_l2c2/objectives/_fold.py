@@ -291,8 +291,10 @@ class TermWatch:
                     stacklevel=5,
                 )
                 return
-            distance = neighbors["distance"].movedim(-1, 0)
-            if near.on_line and _is_elsewhere(here, successor, there, distance, near):
+            distance = neighbors.get("distance", None)
+            if distance is None or not near.on_line:
+                continue
+            if _is_elsewhere(here, successor, there, distance.movedim(-1, 0), near):
                 warnings.warn(
                     "the neighbors in the batch are of another neighborhood than "
                     f"{type(loss).__name__}'s, so its penalty is not what was set: append the "
@@ -314,9 +316,10 @@ def _is_elsewhere(
         distance: the neighbors' distances, ``[K, *B]``.
         near: a neighborhood on a line.
     """
-    shape = here.shape[: distance.ndim - 1]
-    here, successor = (each.reshape(shape.numel(), -1) for each in (here, successor))
-    there, distance = there.reshape(len(there), *here.shape), distance.reshape(len(there), -1)
+    rows, size = distance[0].numel(), here.shape[distance.ndim - 1 :].numel()
+    here, successor = here.reshape(rows, size), successor.reshape(rows, size)
+    there = there.reshape(len(distance), rows, size)
+    distance = distance.reshape(len(distance), rows)
     step = successor - here
     # Coordinates that hardly move do not tell the place on the line.
     moved = step.abs() > 0.1 * step.abs().amax(-1, keepdim=True)
