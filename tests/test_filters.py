@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from studies import deployments
+from studies.files import ROOT
 from studies.filters import COLUMNS, CONDITIONS, main, play
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig, PPORPEConfig, TaskConfig
 from torchrl_l2c2.experiment.analysis.reports import FinishedRun
@@ -155,6 +156,7 @@ def test_page_and_picture_are_of_the_records():
     found = deployments.read(deployments.PAGE.with_suffix(".csv"))
     page = deployments.PAGE.read_text()
     assert deployments.tables(found) in page
+    page = " ".join(page.split())
     means = found.groupby(["task", "condition", "deployment"])[
         ["return", "action_variation"]
     ].mean()
@@ -173,6 +175,18 @@ def test_page_and_picture_are_of_the_records():
     assert f"lowers the return by {rewarded['return'] / plain['return'] - 1:.0%}" in page
     assert f"{noisy['return'] / plain['return'] - 1:.0%} below the baseline's" in page
     assert ours["action_variation"] < 0.5 * plain["action_variation"]
+    hopper, noisy = means.loc["hopper_v5", "as trained"], means.loc["hopper_v5", "noise"]
+    returns = [hopper.loc[name, "return"] for name in ("baseline", "baseline, filter 0.1")]
+    assert "most of its return ({:.0f} to {:.0f})".format(*returns) in page
+    less, noisy_less = (1 - each.loc["L2C2"] / each.loc["baseline"] for each in (hopper, noisy))
+    variation = "vary {:.0%} less than the baseline's, and with sensor noise {:.0%} less"
+    assert variation.format(less["action_variation"], noisy_less["action_variation"]) in page
+    assert f"at {less['return']:.0%} and {noisy_less['return']:.0%} lower returns" in page
+    rough = [noisy.loc[n, "action_variation"] for n in ("L2C2", "CATS", "action-rate reward 0.1")]
+    assert "(means {:.3f}, {:.3f} and {:.3f})".format(*rough) in page
+    weak = noisy.loc["baseline, filter 0.3", "action_variation"]
+    assert weak / rough[0] == pytest.approx(2.0, abs=0.1)
+    assert f"by {less['action_variation']:.0%} at a return" in (ROOT / "docs/robots.md").read_text()
     lander = means.loc["lunarlander", "as trained"]
     filtered, baseline = lander.loc["baseline, filter 0.1"], lander.loc["baseline"]
     assert 0.6 < filtered["action_variation"] / baseline["action_variation"] < 0.7
