@@ -606,23 +606,25 @@ def test_noise_is_refused_in_a_replay_buffer():
         buffer.sample()
 
 
-@pytest.mark.parametrize(
-    "make", [functools.partial(NeighborTransform, NEAR), functools.partial(ObservationNoise, 0.1)]
-)
-def test_a_generator_is_sent_to_a_new_process(make):
-    """torch sends none by itself; the other process has a generator in the same state."""
-    transform = make(generator=torch.Generator().manual_seed(3))
+def test_generators_are_sent_to_a_new_process():
+    """torch sends none by itself; the other process has generators in the same state."""
+    generator = torch.Generator().manual_seed(3)
+    transforms = [
+        NeighborTransform(NEAR, generator=generator),
+        ObservationNoise(0.1, generator=copy.deepcopy(generator)),
+    ]
     expected = torch.rand(3, generator=torch.Generator().manual_seed(3))
     context = torch.multiprocessing.get_context("spawn")
     queue = context.Queue()
-    process = context.Process(target=_draw, args=(transform, queue))
+    process = context.Process(target=_draw, args=(transforms, queue))
     process.start()
     drawn = queue.get(timeout=100)
     process.join()
-    assert drawn == expected.tolist()
-    for twin in (copy.deepcopy(transform), pickle.loads(pickle.dumps(transform)), transform):
-        assert torch.equal(torch.rand(3, generator=twin.generator), expected)
+    assert drawn == [expected.tolist()] * 2
+    for transform in transforms:
+        for twin in (copy.deepcopy(transform), pickle.loads(pickle.dumps(transform)), transform):
+            assert torch.equal(torch.rand(3, generator=twin.generator), expected)
 
 
-def _draw(transform, queue):
-    queue.put(torch.rand(3, generator=transform.generator).tolist())
+def _draw(transforms, queue):
+    queue.put([torch.rand(3, generator=each.generator).tolist() for each in transforms])
