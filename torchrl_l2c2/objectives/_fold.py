@@ -297,7 +297,7 @@ class TermWatch:
             if _is_elsewhere(here, successor, there, distance.movedim(-1, 0), near):
                 warnings.warn(
                     "the neighbors in the batch are of another neighborhood than "
-                    f"{type(loss).__name__}'s, so its penalty is not what was set: append the "
+                    f"{type(loss).__name__}'s, which changes its penalty: append the "
                     "transform that loss.neighbor_transform() returns.",
                     stacklevel=5,
                 )
