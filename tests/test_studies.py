@@ -625,7 +625,7 @@ class TestProse:
                 excluded.append(low > 0.5 or high < 0.5)
             assert np.mean(excluded) == pytest.approx(share, abs=0.01)
         page = " ".join((ROOT / "docs" / "results.md").read_text().split())
-        assert "one in five excludes 0.5 with three seeds, one in ten with five" in page
+        assert "one in five excludes 0.5 with three seeds, and one in ten with five" in page
 
     def test_rivals_over_four_tasks(self):
         """How probable a smoother run is, and one that returns more."""
