@@ -94,6 +94,19 @@ def ddpg(**kwargs) -> DDPGLoss:
     return DDPGLoss(deterministic_actor(), qvalue(), **kwargs)
 
 
+def sharing_a_trunk() -> tuple[TensorDictModule, ProbabilisticActor, ValueOperator]:
+    """A trunk, and a policy and a critic that read its hidden output."""
+    trunk = TensorDictModule(mlp(OBSERVATION, 8), ["observation"], ["hidden"])
+    head = nn.Sequential(mlp(8, 2 * ACTION), NormalParamExtractor())
+    actor = ProbabilisticActor(
+        TensorDictSequential(trunk, TensorDictModule(head, ["hidden"], ["loc", "scale"])),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+        return_log_prob=True,
+    )
+    return trunk, actor, ValueOperator(mlp(8, 1), in_keys=["hidden"])
+
+
 def with_neighbors(batch: TensorDict, **kwargs) -> TensorDict:
     return NeighborTransform(NEAR, **kwargs)(batch)
 
@@ -684,17 +697,7 @@ class TestNetworks:
     def test_a_critic_cut_off_a_shared_trunk_reads_the_policys_hidden_output(self, separate):
         """The value term trains the trunk as the plain loss does: not with separate_losses."""
         torch.manual_seed(0)
-        trunk = TensorDictModule(mlp(OBSERVATION, 8), ["observation"], ["hidden"])
-        head = TensorDictModule(
-            nn.Sequential(mlp(8, 2 * ACTION), NormalParamExtractor()), ["hidden"], ["loc", "scale"]
-        )
-        actor = ProbabilisticActor(
-            TensorDictSequential(trunk, head),
-            in_keys=["loc", "scale"],
-            distribution_class=TanhNormal,
-            return_log_prob=True,
-        )
-        value = ValueOperator(mlp(8, 1), in_keys=["hidden"])
+        trunk, actor, value = sharing_a_trunk()
         loss = L2C2Loss(PPOLoss(actor, value, separate_losses=separate), NEAR)
         batch = with_neighbors(on_policy(6))
         terms = loss.value_regularizer(batch)
@@ -724,15 +727,7 @@ class TestNetworks:
     def test_a_value_trains_a_trunk_where_the_plain_loss_does(self, make, network):
         """Those of SAC, A2C and others read the trunk's output from the batch, and train none."""
         torch.manual_seed(0)
-        trunk = TensorDictModule(mlp(OBSERVATION, 8), ["observation"], ["hidden"])
-        net = nn.Sequential(mlp(8, 2 * ACTION), NormalParamExtractor())
-        actor = ProbabilisticActor(
-            TensorDictSequential(trunk, TensorDictModule(net, ["hidden"], ["loc", "scale"])),
-            in_keys=["loc", "scale"],
-            distribution_class=TanhNormal,
-            return_log_prob=True,
-        )
-        value = ValueOperator(mlp(8, 1), in_keys=["hidden"])
+        trunk, actor, value = sharing_a_trunk()
         of_actions = ValueOperator(mlp(8 + ACTION, 1), in_keys=["hidden", "action"])
         batch = on_policy(6)
         batch["hidden"] = trunk.module(batch["observation"]).detach()
@@ -1002,15 +997,7 @@ class TestEvaluationsThatAreSpared:
     def test_a_hidden_output_of_an_older_policy_is_not_compared(self):
         """Both values are of the present trunk: 0 where s' = s, whatever the batch has stored."""
         torch.manual_seed(0)
-        trunk = TensorDictModule(mlp(OBSERVATION, 8), ["observation"], ["hidden"])
-        head = nn.Sequential(mlp(8, 2 * ACTION), NormalParamExtractor())
-        actor = ProbabilisticActor(
-            TensorDictSequential(trunk, TensorDictModule(head, ["hidden"], ["loc", "scale"])),
-            in_keys=["loc", "scale"],
-            distribution_class=TanhNormal,
-            return_log_prob=True,
-        )
-        value = ValueOperator(mlp(8, 1), in_keys=["hidden"])
+        _, actor, value = sharing_a_trunk()
         batch = on_policy(6)
         batch["next", "observation"] = batch["observation"].clone()
         batch["hidden"], batch["next", "hidden"] = torch.randn(2, 6, 8)

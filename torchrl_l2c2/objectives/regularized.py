@@ -580,6 +580,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
                     kind = "a term must start" if trains else "a diagnostic must not start"
                     raise ValueError(f"{kind} with 'loss_', got {key!r}: rename it.")
         added, selected = [*policy, *others, *diagnostics], list(self.out_keys)
+        # The base's selection of keys stays, with the added ones.
         is_selection = bool(find_selections(self))
         self.reset_out_keys()
         self.out_keys = [*self.out_keys, *added]

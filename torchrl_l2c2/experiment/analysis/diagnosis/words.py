@@ -116,8 +116,10 @@ def _unlike(diagnosis: Diagnosis) -> Iterator[Finding]:
     """Finding about a first episode that is unlike the others, unless all of them are smooth."""
     first, mean = action_variation(diagnosis.actions).item(), diagnosis.measures["action_variation"]
     larger = max(first, mean)
-    smooth = larger * _change(diagnosis.relative) <= threshold("SMOOTH") * first
-    if min(first, mean) * threshold("UNLIKE") <= larger > 0.0 and (first == 0.0 or not smooth):
+    # The mean change of the larger one, in proportion; unknown if the first episode is still.
+    change = _change(diagnosis.relative) * larger / first if first > 0.0 else math.inf
+    unlike = min(first, mean) * threshold("UNLIKE") <= larger > 0.0
+    if unlike and change > threshold("SMOOTH"):
         text = (
             f"The episodes differ: the first one, which all further findings describe, has an "
             f"action variation of {first:.3g}, and the mean of the episodes is {mean:.3g}. Choose "
