@@ -104,7 +104,13 @@ def pages() -> dict[str, Page]:
     targets[1:] = [text.split("\n\n")[1] for text in targets[1:]]
     return {
         "README.md": Page({"summary": summary.short_table()}),
-        "docs/results.md": Page({"summary": summary.long_table(), "sm": summary.sm_table()}),
+        "docs/results.md": Page(
+            {
+                "summary": summary.long_table(),
+                "cats": summary.cats_table(),
+                "sm": summary.sm_table(),
+            }
+        ),
         "results/paper.md": _paper_page(runs),
         **{f"results/{name}.md": _field_page(name, records(name)) for name in FIELD_PAGES},
         "results/one_setting.md": _field_page("one_setting", one_setting()),

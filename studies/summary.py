@@ -14,7 +14,12 @@ from studies import rsl_rl, td3
 from studies.field import TEST
 from studies.files import ROOT, records
 from torchrl_l2c2.experiment.analysis.reports.groups import Group, group_records
-from torchrl_l2c2.experiment.analysis.reports.table import improvement, improvement_cell, pipe_table
+from torchrl_l2c2.experiment.analysis.reports.table import (
+    COMPARED,
+    improvement,
+    improvement_cell,
+    pipe_table,
+)
 
 OURS = "L2C2, mse 1, ramp"
 """PPO's preset, in tables."""
@@ -138,6 +143,17 @@ def sm_table() -> str:
             if all(len(side.scores(TEST, "sm_asap")) for side in pair)
         },
     )
+
+
+def cats_table() -> str:
+    """CATS against L2C2, over the benchmarks that have both."""
+    pairs = with_cats()
+    rows = [["measure", "P(CATS is better)", "benchmarks with a better mean of CATS"]]
+    for quantity, (name, _) in COMPARED.items():
+        means = [[side.scores(TEST, quantity).mean() for side in pair] for pair in pairs]
+        better = sum(cats > ours if quantity == "return" else cats < ours for cats, ours in means)
+        rows.append([name, _better(pairs, quantity), f"{better} of {len(pairs)}"])
+    return pipe_table(rows)
 
 
 def _records(benchmark: Benchmark) -> pd.DataFrame:
