@@ -10,7 +10,7 @@ cd "$(dirname "$0")/.."
 # Tests that need no package of the extra "experiment".
 tests="
   adaterm caps checks distances l2c2 loss_contract metrics modules neighborhood policy_distances
-  ppo_rpe precision properties regularized relative_pearson rsl_rl several_devices transforms
+  ppo_rpe precision properties regularized rsl_rl several_devices transforms
   updaters
 "
 tools=(pytest pytest-xdist hypothesis scipy gymnasium)
