@@ -36,6 +36,8 @@ from torchrl_l2c2.experiment.analysis.diagnosis import (
     TermShare,
     comparison,
     diagnose,
+    diagnose_actions,
+    diagnose_recording,
     diagnose_run,
     findings,
     value_function,
@@ -46,7 +48,7 @@ from torchrl_l2c2.experiment.analysis.diagnosis.names import run_folders, run_na
 from torchrl_l2c2.experiment.analysis.diagnosis.page import page
 from torchrl_l2c2.experiment.analysis.diagnosis.run import _batch
 from torchrl_l2c2.experiment.cli.diagnose import main
-from torchrl_l2c2.experiment.errors import SimulatorError
+from torchrl_l2c2.experiment.errors import SimulatorError, UserError
 from torchrl_l2c2.experiment.learn.learner import Learner
 from torchrl_l2c2.experiment.learn.replay import make_replay
 from torchrl_l2c2.experiment.run.files import make_parent_folder, write_json
@@ -185,6 +187,16 @@ class TestWords:
         noise = torch.rand(100, 1, generator=torch.Generator().manual_seed(0)) - 0.5
         found = said(made_up(noise), "rough")
         assert abs(float(re.search(r"roughness is ([\d.]+)", found.text)[1]) - 0.25) < 0.03
+
+    def test_shaking_around_a_slow_movement_chatters(self):
+        """It turns back at every step, although successive actions are alike."""
+        actions = 0.5 * SINE + 0.05 * FLIPPING
+        found = said(made_up(actions, action_names=["knee"], rate=50.0), "chatters")
+        assert found.text.startswith("knee chatters") and found.fault
+        for words in ("about 25 Hz", "turns back in 100% of the steps", "5.0% of its range"):
+            assert words in found.text
+        # Below the largest change of a smooth policy.
+        assert "chatters" not in kinds(made_up(0.5 * SINE + 0.015 * FLIPPING))
 
     def test_fast_and_even_moves_are_neither_smooth_nor_a_fault(self):
         """Ten sines of half the range."""
@@ -527,6 +539,100 @@ class TestRun:
         assert diagnose_run(run, episodes=1).pictures == []
 
 
+def table_file(path, *lines):
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+class TestRecording:
+    """Of a robot, or of a policy elsewhere: only the actions are known."""
+
+    def test_it_is_measured_as_an_episode_is(self):
+        """By hand: two actions that change by 0.3 and 0.4, so by 0.5, and by the same back."""
+        actions = torch.tensor([[0.0, 0.0], [0.3, 0.4]]).repeat(5, 1)
+        found = diagnose_actions(actions, bounds=(-1.0, 0.4))
+        assert found.measures["action_variation"] == pytest.approx(0.5)
+        assert found.measures["length"] == 10 and "return" not in found.measures
+        assert found.bounded and found.low.tolist() == [-1.0] * 2
+        assert kinds(found) == ["flips", "pinned", "flips"]
+        spanned = diagnose_actions(actions)
+        assert not spanned.bounded and spanned.high.tolist() == pytest.approx([0.3, 0.4])
+
+    def test_a_file_has_names_and_seconds(self, tmp_path):
+        """Anywhere among the columns; Windows' marks and ends of lines do not matter."""
+        lines = ["\ufeffhip, time ,knee", *(f"{(-1) ** i},{0.02 * i},0.5" for i in range(9))]
+        path = tmp_path / "robot.csv"
+        path.write_bytes("\r\n".join([*lines, ""]).encode())
+        found = diagnose_recording(path)
+        assert found.actions.shape == (9, 2) and found.actions[1].tolist() == [-1.0, 0.5]
+        assert found.rate == pytest.approx(50.0) and found.name == str(path)
+        (only,) = findings(found)
+        assert only.text.startswith("hip flips from step to step, which is shaking at 25 Hz")
+
+    def test_gaps_are_told(self, tmp_path):
+        """The rate is that of the other steps."""
+        times = [0.0, 0.1, 0.2, 0.3, 0.9, 1.0]
+        path = table_file(tmp_path / "a.csv", "time,a", *(f"{t},{t}" for t in times))
+        with pytest.warns(UserWarning, match=r"has gaps \(1, the first after row 4\)"):
+            assert diagnose_recording(path).rate == pytest.approx(10.0)
+
+    @pytest.mark.parametrize(
+        ("lines", "message"),
+        [
+            ([], r"line 1: expected a different name for each action, got \[\]"),
+            (["0.1,0.2", "0.3,0.4"], r"line 1: expected a different name .*'0.1'"),
+            ([",a", "0,1"], r"line 1: expected a different name"),
+            (["a,a", "0,1"], r"line 1: expected a different name"),
+            (["a,b", "0,1", "0"], r"line 3: expected 2 numbers, got \['0'\]"),
+            (["a", "0", "x"], r"line 3: expected 1 numbers, got \['x'\]"),
+            (["a", "0", "1", "2"], r"at least 4 steps and one action, got \[3, 1\]"),
+            (["a"], r"at least 4 steps and one action, got \[0, 1\]"),
+            (["time", "0", "1", "2", "3"], r"at least 4 steps and one action, got \[4, 0\]"),
+            (["a,time", "0,0", "0,1", "0,1", "0,2"], r"the column 'time' must increase"),
+            (["a", "0", "nan", "0", "0"], r"actions must be finite, got \[nan\] at 1"),
+        ],
+    )
+    def test_what_is_no_table_of_actions_is_refused(self, tmp_path, lines, message):
+        """With the line."""
+        with pytest.raises(UserError, match=message):
+            diagnose_recording(table_file(tmp_path / "a.csv", *lines))
+
+    @pytest.mark.parametrize(
+        ("settings", "message"),
+        [
+            ({"bounds": (1.0, -1.0)}, "bounds must be two finite numbers, the lower one first"),
+            ({"bounds": (0.0, float("inf"))}, "bounds must be two finite numbers"),
+            ({"rate": 0.0}, "rate must be a number of steps per second above 0"),
+            ({"action_names": ["a", "b"]}, "1 actions need as many action_names, got 2"),
+        ],
+    )
+    def test_wrong_settings_are_refused(self, settings, message):
+        """Before anything is measured."""
+        with pytest.raises(UserError, match=message):
+            diagnose_actions(SINE, **settings)
+
+    def test_it_stands_beside_a_policy(self):
+        """Without what needs the policy; the comparison leaves the return out."""
+        recorded = diagnose_actions(0.5 * FLIPPING, name="robot", action_names=["<knee>"])
+        played = made_up(name="policy")
+        assert comparison([played, recorded]) == [
+            "robot changes its action 50 times as much from step to step as policy (1, 0.0199)."
+        ]
+        text = page([played, recorded])
+        for name, pictures in (("policy", 4), ("robot", 2)):
+            assert text.count(f"<figcaption>{name}</figcaption>") == pictures
+        assert "nan" not in text and "&lt;knee&gt; flips" in text and "<knee>" not in text
+        alone = page([recorded])
+        for heading in (
+            "Test episodes",
+            "Where policy",
+            "Neighbors",
+            "stand still",
+            "change by noise (",
+        ):
+            assert heading in text and heading not in alone
+
+
 class TestPage:
     """Needs nothing else."""
 
@@ -595,6 +701,22 @@ class TestCommand:
         """Without pictures if these are not wanted."""
         main([str(run), "--no-video", "--episodes", "1"])
         assert "<video" not in (run / "diagnosis.html").read_text()
+
+    def test_recordings_stand_beside_runs(self, run, tmp_path, capsys):
+        """The page lies next to the first of them."""
+        robot = table_file(tmp_path / "robot.csv", "knee", *("1", "-1") * 10)
+        chosen = ["--bounds", "-2", "2", "--no-video", "--episodes", "1"]
+        picture = tmp_path / "actions.svg"
+        main([str(robot), str(run), *chosen, "--actions", str(picture), "--names", "robot", "run"])
+        told = capsys.readouterr().out
+        assert told.startswith("robot: action variation 2\n  - knee flips from step to step")
+        assert "\n\nrun: return " in told and f"page: {robot.with_suffix('.html')}\n" in told
+        assert "<!-- robot: action variation 2 -->" in picture.read_text()
+        with pytest.raises(SystemExit):
+            main([str(run), "--bounds", "-2", "2"])
+        assert "--bounds are of recorded actions, and no CSV" in capsys.readouterr().err
+        with pytest.raises(SystemExit, match=r"^error: .*none.csv"):
+            main([str(tmp_path / "none.csv")])
 
     def test_actions_of_all_runs_are_one_picture(self, run, blank, tmp_path, capsys):
         """A row for each, by the names that were given, on the same axes."""

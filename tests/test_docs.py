@@ -18,6 +18,7 @@ from torchrl.objectives import SACLoss
 import torchrl_l2c2
 from torchrl_l2c2 import affinities
 from torchrl_l2c2.experiment.analysis.diagnosis.words import threshold
+from torchrl_l2c2.experiment.cli import diagnose as diagnose_command
 from torchrl_l2c2.experiment.learn.learner import MEASURE_AFTER, WARN_BELOW
 from torchrl_l2c2.presets import KINDS, PRESETS, presets_table
 
@@ -113,12 +114,26 @@ def test_the_quickstart_is_the_notebook() -> None:
     assert base64.b64decode(pictures[-1]) == (FOLDER / "quickstart.png").read_bytes()
 
 
+def test_the_page_shows_what_diagnose_says_of_a_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of the file that the page writes, by its own command."""
+    monkeypatch.chdir(tmp_path)
+    page = FOLDER / "shaking.md"
+    run_blocks(page)
+    capsys.readouterr()
+    command, shown = re.findall(r"^```(?:bash|text)\n(.*?)^```", page.read_text(), re.M | re.S)[1:3]
+    diagnose_command.main(command.split()[4:])
+    assert capsys.readouterr().out == shown
+
+
 def test_the_pages_have_the_thresholds_of_diagnose() -> None:
     """Each is in the row of its finding; the page about gradients has the threshold of a run."""
     page = (FOLDER / "shaking.md").read_text()
     rows = dict(re.findall(r"^\| ([^|]+) \| ([^|]+) \|", page, re.M))
     for finding, thresholds in {
         "flips from step to step": [threshold("FLIPS")],
+        "chatters": [threshold("CHATTERS"), threshold("SMOOTH")],
         "moves like noise": [threshold("ROUGH"), threshold("SMOOTH")],
         "bang-bang": [threshold("BANG_BANG"), threshold("EITHER_BOUND")],
         "pinned": [threshold("BANG_BANG")],

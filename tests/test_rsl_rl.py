@@ -669,6 +669,26 @@ def test_the_pages_configuration_builds(monkeypatch: pytest.MonkeyPatch) -> None
     assert chosen == {"beta": 0.0} and regularization.loss.added_terms == {"loss_l2c2_actor"}
 
 
+def test_the_pages_recording_is_one_episode_of_mean_actions(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """With a name for each action, up to the first reset."""
+    monkeypatch.syspath_prepend(EXAMPLE.parent)
+    from rsl_rl.runners import OnPolicyRunner
+    from rsl_rl_points import NoisyPoints
+
+    page = (EXAMPLE.parents[1] / "docs" / "rsl_rl.md").read_text()
+    told: dict[str, Any] = {}
+    exec(re.findall(r"^```python\n(.*?)^```", page, re.M | re.S)[2], told)
+    env, path = NoisyPoints(2), tmp_path / "sim.csv"
+    policy = OnPolicyRunner(env, runner_config()).get_inference_policy()
+    first = policy(env.get_observations())[0].tolist()
+    told["record"](policy, env, path, steps=1000)
+    header, *rows = path.read_text().splitlines()
+    assert header == "action0" and 4 < len(rows) < 1000
+    assert [float(cell) for cell in rows[0].split(",")] == pytest.approx(first)
+
+
 def test_the_runners_iterations_are_the_ramp(monkeypatch: pytest.MonkeyPatch) -> None:
     """Isaac Lab and mjlab have them in the runner's configuration, which stays as it was."""
     monkeypatch.syspath_prepend(EXAMPLE.parent)

@@ -1,4 +1,4 @@
-from .analysis.diagnosis import diagnose, findings, write_page
+from .analysis.diagnosis import diagnose, diagnose_actions, findings, write_page
 from .collect.episodes import EpisodeCollector
 from .envs.environments import make_env
 from .run.evaluation import Evaluation, evaluate_policy
@@ -48,6 +48,7 @@ __all__ = [
     "TaskConfig",
     "UniformReplayConfig",
     "diagnose",
+    "diagnose_actions",
     "evaluate_policy",
     "findings",
     "load_policy",

@@ -10,7 +10,7 @@ from torchrl_l2c2.experiment.errors import one_line_errors
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Measures runs, writes the page, and prints the findings."""
+    """Measures runs or recordings, writes the page, and prints the findings."""
     parser = _parser()
     chosen = parser.parse_args(arguments)
     if chosen.episodes < 1:
@@ -27,11 +27,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
         folders = diagnosis.run_folders(chosen.folders)
         if chosen.names and len(chosen.names) != len(folders):
             parser.error(f"--names must have {len(folders)} names, one per run, got {chosen.names}")
+        if chosen.bounds and not any(map(_is_recording, folders)):
+            parser.error("--bounds are of recorded actions, and no CSV file was given")
         # Before the episodes, whose results could otherwise be lost.
         for given in filter(None, (chosen.output, chosen.actions)):
             make_parent_folder(given)
+        names = chosen.names or diagnosis.run_names(folders)
         diagnoses = [
-            diagnosis.diagnose_run(
+            diagnosis.diagnose_recording(folder, name=name, bounds=chosen.bounds)
+            if _is_recording(folder)
+            else diagnosis.diagnose_run(
                 folder,
                 name=name,
                 episodes=chosen.episodes,
@@ -40,11 +45,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 best=chosen.best,
                 with_pictures=not chosen.no_video,
             )
-            for folder, name in zip(
-                folders, chosen.names or diagnosis.run_names(folders), strict=True
-            )
+            for folder, name in zip(folders, names, strict=True)
         ]
-        path = Path(chosen.output or Path(chosen.folders[0]) / "diagnosis.html")
+        first = Path(chosen.folders[0])
+        page = first.with_suffix(".html") if _is_recording(first) else first / "diagnosis.html"
+        path = Path(chosen.output or page)
         diagnosis.write_page(path, diagnoses)
         if chosen.actions:
             write_atomically(chosen.actions, diagnosis.draw_together(diagnoses))
@@ -53,15 +58,33 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print("\n\n".join(filter(None, parts)))
 
 
+def _is_recording(path: str | Path) -> bool:
+    return Path(path).suffix.lower() == ".csv"
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m torchrl_l2c2 diagnose",
         description="Writes a page that shows why policies shake.",
     )
     add = parser.add_argument
-    add("folders", nargs="+", metavar="FOLDER", help="run folders, or folders that contain runs")
+    add(
+        "folders",
+        nargs="+",
+        metavar="FOLDER",
+        help="run folders, folders that contain runs, or CSV files of recorded actions: a column "
+        "for each action, a row for each control step, and optionally a column named time, in "
+        "seconds",
+    )
     add("--names", nargs="+", help="names of the runs (default: the settings that differ)")
     add("--output", help="HTML file (default: diagnosis.html in the first folder)")
+    add(
+        "--bounds",
+        nargs=2,
+        type=float,
+        metavar=("LOW", "HIGH"),
+        help="bounds of recorded actions (default: the smallest and largest of each action)",
+    )
     add("--actions", help="SVG file for the actions of all runs, row by row (default: none)")
     add("--episodes", type=int, default=3, help="number of measured episodes (default: 3)")
     add("--seed", type=int, help="random seed, the same for all runs (default: 1000003)")

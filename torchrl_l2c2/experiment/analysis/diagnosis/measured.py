@@ -27,6 +27,7 @@ from torchrl_l2c2.neighborhood import Neighborhood
 Value = Callable[[Tensor, Tensor], Tensor]
 """Observations ``[N, *F]`` and actions ``[N, *A]`` to values, ``[N]`` or of several heads."""
 
+UNKNOWN = torch.empty(0)
 SAMPLES = 16  # actions drawn at a state to see how far they spread
 SAMPLED_STATES = 256
 SAME_PLACE = 0.25  # of the standard deviation of every coordinate within the episode
@@ -50,16 +51,20 @@ class TermShare:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Measurements of a policy, for findings and pictures.
+    """Measurements of a policy, or of recorded actions, for findings and pictures.
+
+    Of recorded actions, all from ``observations`` on is unknown: empty, NaN or the default.
 
     Attributes:
         name: name of the policy.
         measures: means over the episodes: return, length, action variation, and the other measures
-            of :func:`~torchrl_l2c2.experiment.evaluate_policy`.
+            of :func:`~torchrl_l2c2.experiment.evaluate_policy`. A recording has no return.
         actions: mean actions of the first episode, ``[T, A]``.
         low: lower bounds of the actions, ``[A]``; without bounds, the smallest actions.
         high: upper bounds of the actions, ``[A]``; without bounds, the largest actions.
         bounded: whether the task has these bounds.
+        action_names: names of the actions; empty for ``action[0]`` and so on.
+        rate: actions per second, or ``None``.
         observations: observations of the first episode, ``[T, F]``.
         policy_lipschitz: local Lipschitz constants of the mean action there, ``[T]``; NaN where
             the observation does not move.
@@ -73,7 +78,6 @@ class Diagnosis:
             the whole mean squared change.
         spread: standard deviation of the policy's samples, clipped into their bounds, relative to
             half the actions' range; 0 for a deterministic policy, NaN for discrete actions.
-        rate: actions per second, or ``None``.
         shares: shares of the loss's terms.
         entries: names of the observation's coordinates.
         pictures: pictures ``[H, W, 3]`` of the first episode, from the reset on; may be empty.
@@ -87,22 +91,32 @@ class Diagnosis:
     low: Tensor
     high: Tensor
     bounded: bool
-    observations: Tensor
-    policy_lipschitz: Tensor
-    value_lipschitz: Tensor | None
-    distance: Tensor
-    neighborhood: Neighborhood
-    unmoved: Tensor
-    noise_scale: float
-    noise_action: float
-    noise_share: float
-    spread: float
+    action_names: Sequence[str] = ()
     rate: float | None = None
+    observations: Tensor = UNKNOWN
+    policy_lipschitz: Tensor = UNKNOWN
+    value_lipschitz: Tensor | None = None
+    distance: Tensor = UNKNOWN
+    neighborhood: Neighborhood = field(default_factory=Neighborhood)
+    unmoved: Tensor = UNKNOWN
+    noise_scale: float = math.nan
+    noise_action: float = math.nan
+    noise_share: float = math.nan
+    spread: float = math.nan
     shares: Mapping[str, TermShare] = field(default_factory=dict)
     entries: Sequence[str] = ()
     pictures: Sequence[Any] = ()
     picture_every: int = 1
     task: str = ""
+
+    @property
+    def is_recording(self) -> bool:
+        """Checks whether only the actions are known."""
+        return not len(self.observations)
+
+    def action_name(self, number: int) -> str:
+        """The name of an action."""
+        return self.action_names[number] if self.action_names else f"action[{number}]"
 
     @property
     def range(self) -> Tensor:
@@ -127,6 +141,8 @@ class Diagnosis:
         left = self.policy_lipschitz.nan_to_num(-math.inf).clone()
         left[left <= 0.0] = -math.inf
         found: list[int] = []
+        if self.is_recording:
+            return found
         apart = max(1, len(left) // 50)
         while len(found) < number and left.max() > -math.inf:
             step = int(left.argmax())
@@ -205,7 +221,7 @@ def diagnose(
         check_finite(episode, 0, test=True, observation=key, action=env.action_key)
     first = played[0]
     actions = _flat(first[env.action_key])
-    low, high, bounded = _bounds(env.action_spec, actions)
+    low, high, bounded = bounds_of(env.action_spec, actions)
     generator = torch.Generator().manual_seed(seed)
 
     def act(observation: Tensor) -> Tensor:
@@ -321,7 +337,7 @@ def _means(played: Sequence[TensorDictBase], env: EnvBase) -> dict[str, float]:
     return {name: statistics.fmean(one[name] for one in each) for name in each[0]}
 
 
-def _bounds(spec: TensorSpec, actions: Tensor) -> tuple[Tensor, Tensor, bool]:
+def bounds_of(spec: TensorSpec, actions: Tensor) -> tuple[Tensor, Tensor, bool]:
     """Bounds of the task, or else of the played actions."""
     if isinstance(spec, Bounded) and spec.dtype.is_floating_point:
         low, high = (bound.flatten().float().cpu() for bound in (spec.space.low, spec.space.high))

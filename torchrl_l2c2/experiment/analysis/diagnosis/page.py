@@ -74,9 +74,13 @@ def page(diagnoses: Sequence[Diagnosis]) -> str:
         "neighborhoods": draw_neighborhoods,
         "shares": draw_shares,
     }
+    played = [one for one in diagnoses if not one.is_recording]
+    shares = [one for one in played if one.shares]
+    # Recorded actions have the first two.
+    of = {"steepness": played, "neighborhoods": played, "shares": shares}
     pictures = {}
     for kind, draw in drawings.items():
-        shown = [one for one in diagnoses if one.shares or kind != "shares"]
+        shown = of.get(kind, diagnoses)
         drawn = zip(shown, draw(shown), strict=True)
         pictures[kind] = {one.name: data_uri(content) for one, content in drawn}
     films = None
@@ -95,10 +99,11 @@ def page(diagnoses: Sequence[Diagnosis]) -> str:
         largest=max(one.measures["action_variation"] for one in diagnoses),
         pictures=pictures,
         films=films,
-        without_pictures=[one.name for one in diagnoses if films is not None and not one.pictures],
+        played=played,
+        without_pictures=[one.name for one in played if films is not None and not one.pictures],
         measures=_measures(diagnoses),
-        steepest_states=[_steepest(one) for one in diagnoses],
-        unmoved=_unmoved(diagnoses),
+        steepest_states=[_steepest(one) for one in played],
+        unmoved=_unmoved(played),
         rules=_rules(),
     )
 
@@ -109,19 +114,34 @@ def _measures(diagnoses: Sequence[Diagnosis]) -> Table:
         for measure, name in MEASURES.items()
         if any(measure in one.measures for one in diagnoses)
     ]
-    noise = [f"{_number(one.noise_action)} ({one.noise_scale:g})" for one in diagnoses]
-    rows.append(["change by noise (standard deviation)", *noise])
-    rows.append(["... part of the squared change", *(f"{d.noise_share:.1%}" for d in diagnoses)])
-    rows.append(["deviation of samples", *(_number(one.spread) for one in diagnoses)])
     note = (
-        "Means over the test episodes with mean actions; the last three rows: the first episode. "
-        "Change by noise: root mean square change of the action by noise on observations with "
-        "this standard deviation, and its square as a part of the mean squared change per step. "
-        "Deviation of samples: in units of half the action's range. Smaller is "
-        "smoother, except for the return and the gain on the action before, where 1 is smooth. "
-        "Definitions and units: torchrl_l2c2.metrics."
+        "Smaller is smoother, except for the return and the gain on the action before, where 1 is "
+        "smooth. Definitions and units: torchrl_l2c2.metrics."
     )
-    return Table("Return and smoothness", ["", *(one.name for one in diagnoses)], rows, [note])
+    if not all(one.is_recording for one in diagnoses):
+        of_policy = [
+            ("-", "-", "-")
+            if one.is_recording
+            else (
+                f"{_number(one.noise_action)} ({one.noise_scale:g})",
+                f"{one.noise_share:.1%}",
+                _number(one.spread),
+            )
+            for one in diagnoses
+        ]
+        names = (
+            "change by noise (standard deviation)",
+            "... part of the squared change",
+            "deviation of samples",
+        )
+        rows += [list(row) for row in zip(names, *of_policy, strict=True)]
+        note += (
+            " Means over the test episodes with mean actions. The last three rows: the first "
+            "episode. Change by noise: root mean square change of the action by noise on "
+            "observations with this standard deviation, and its square as a part of the mean "
+            "squared change per step. Deviation of samples: in units of half the action's range."
+        )
+    return Table("Measures", ["", *(one.name for one in diagnoses)], rows, [note])
 
 
 def _steepest(one: Diagnosis) -> Table:

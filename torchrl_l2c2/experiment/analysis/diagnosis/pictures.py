@@ -34,9 +34,9 @@ def draw_together(diagnoses: Sequence[Diagnosis]) -> bytes:
         axis.sharey(axes[0])
     for axis, one in zip(axes, diagnoses, strict=True):
         for place, number in enumerate(busiest(one)):
-            axis.plot(one.actions[:, number].numpy(), **_line(place, number))
-        total, variation = (one.measures[name] for name in ("return", "action_variation"))
-        title = f"{one.name}: return {total:.4g}, action variation {variation:.2g}"
+            axis.plot(one.actions[:, number].numpy(), **_line(place, number, one))
+        total = "" if one.is_recording else f"return {one.measures['return']:.4g}, "
+        title = f"{one.name}: {total}action variation {one.measures['action_variation']:.2g}"
         axis.set_title(title, fontsize=10, parse_math=False)
         axis.set_ylabel("action")
         axis.grid(alpha=0.25)
@@ -90,7 +90,9 @@ def _actions(axes: Sequence[Any], one: Diagnosis) -> None:
     for axis, marker in zip(axes, (None, "."), strict=True):
         for place, number in enumerate(busiest(one)):
             steps = range(len(one.actions))
-            axis.plot(steps, one.actions[:, number].numpy(), marker=marker, **_line(place, number))
+            axis.plot(
+                steps, one.actions[:, number].numpy(), marker=marker, **_line(place, number, one)
+            )
         if one.bounded:
             for bound in {*one.low.tolist(), *one.high.tolist()}:
                 axis.axhline(bound, color="black", linewidth=0.6, linestyle=":")
@@ -109,7 +111,7 @@ def _spectrum(
     (axis,) = axes
     for place, number in enumerate(busiest(one)):
         heights = amplitudes[1:, place].clamp_min(1e-9).numpy()
-        axis.plot(frequencies[1:].numpy(), heights, **_line(place, number))
+        axis.plot(frequencies[1:].numpy(), heights, **_line(place, number, one))
     axis.set_yscale("log")
     axis.set_ylim(top * 1e-4, top * 1.5)
     axis.set_xlabel("cycles per step" if one.rate is None else "hertz")
@@ -246,8 +248,9 @@ def _limits(constants: Iterable[Tensor]) -> tuple[float, float]:
     return low, max(high, low * 1.01)
 
 
-def _line(place: int, number: int) -> dict[str, Any]:
-    return {"color": COLORS[place], "linewidth": 0.9, "markersize": 3, "label": f"action[{number}]"}
+def _line(place: int, number: int, one: Diagnosis) -> dict[str, Any]:
+    label = one.action_name(number)
+    return {"color": COLORS[place], "linewidth": 0.9, "markersize": 3, "label": label}
 
 
 def _legend(axis: Any, one: Diagnosis) -> None:

@@ -18,6 +18,10 @@ THRESHOLDS = {
     "BANG_BANG": (0.5, "smallest share of steps at the bounds of a bang-bang or pinned action"),
     "EITHER_BOUND": (0.05, "smallest share of steps at each bound of a bang-bang action"),
     "ROUGH": (0.2, "smallest roughness of an action that moves like noise; white noise has 0.25"),
+    "CHATTERS": (
+        0.5,
+        "smallest share of steps in which an action that chatters turns back",
+    ),
     "SMOOTH": (0.02, "largest mean change per step of a smooth policy, of the action's range"),
     "NOISY": (
         0.5,
@@ -75,8 +79,9 @@ def findings(diagnosis: Diagnosis) -> list[Finding]:
 
 def summary(diagnosis: Diagnosis) -> str:
     """The return, the action variation and the findings of a policy, in lines."""
-    total, variation = (diagnosis.measures[name] for name in ("return", "action_variation"))
-    head = f"{diagnosis.name}: return {total:.4g}, action variation {variation:.3g}"
+    total = "" if diagnosis.is_recording else f"return {diagnosis.measures['return']:.4g}, "
+    variation = diagnosis.measures["action_variation"]
+    head = f"{diagnosis.name}: {total}action variation {variation:.3g}"
     return "\n".join([head, *(f"  - {found.text}" for found in findings(diagnosis))])
 
 
@@ -89,26 +94,27 @@ def comparison(diagnoses: Sequence[Diagnosis]) -> list[str]:
     first, *others = diagnoses
     return [
         _compared(first, other)
-        if other.task == first.task
+        if other.task == first.task or first.is_recording or other.is_recording
         else f"{other.name} is of another task than {first.name} ({other.task}, {first.task})."
         for other in others
     ]
 
 
 def _compared(first: Diagnosis, other: Diagnosis) -> str:
-    (before, old), (now, new) = (
-        (one.measures["action_variation"], one.measures["return"]) for one in (first, other)
-    )
+    before, now = (one.measures["action_variation"] for one in (first, other))
     ratio = now / before if before > 0.0 else math.inf if now > 0.0 else 1.0
     if ratio > 2.0:
         change = f"{ratio:.2g} times as much from step to step as"
     else:
         more = "less" if ratio < 1.0 else "more"
         change = f"{abs(ratio - 1):.0%} {more} from step to step than"
+    text = f"{other.name} changes its action {change} {first.name} ({now:.3g}, {before:.3g})"
+    if first.is_recording or other.is_recording:
+        return f"{text}."
+    old, new = (one.measures["return"] for one in (first, other))
     return (
-        f"{other.name} changes its action {change} {first.name} ({now:.3g}, {before:.3g}), and its "
-        f"return is {'higher' if new > old else 'lower' if new < old else 'the same'} "
-        f"({new:.4g}, {old:.4g})."
+        f"{text}, and its return is "
+        f"{'higher' if new > old else 'lower' if new < old else 'the same'} ({new:.4g}, {old:.4g})."
     )
 
 
@@ -133,11 +139,12 @@ def _actions(diagnosis: Diagnosis) -> Iterator[Finding]:
     for number, action in enumerate(diagnosis.relative.split(1, 1)):
         if action.std() <= threshold("STILL"):
             continue
-        name, change = f"action[{number}]", _change(action)
+        name, change = diagnosis.action_name(number), _change(action)
         at_bounds = saturation(action, 0.0, 1.0).item()
         if diagnosis.bounded and at_bounds >= threshold("BANG_BANG"):
             yield _at_bounds(name, action, at_bounds)
         gain, rough = previous_action_gain(action).item(), roughness(action).item()
+        turns = _turns(action).mean().item()
         if gain <= threshold("FLIPS"):
             yield _flips(name, action, gain, diagnosis.rate)
         elif rough >= threshold("ROUGH") and change > threshold("SMOOTH"):
@@ -147,6 +154,15 @@ def _actions(diagnosis: Diagnosis) -> Iterator[Finding]:
                 f"{_where(action.diff(dim=0).abs())}."
             )
             yield Finding("rough", text)
+        elif turns >= threshold("CHATTERS") and change > threshold("SMOOTH"):
+            rate = diagnosis.rate
+            speed = "" if rate is None else f", which is shaking at about {turns * rate / 2:.3g} Hz"
+            text = (
+                f"{name} chatters around a slower movement{speed}: it turns back in {turns:.0%} of "
+                f"the steps (white noise in 67%), and changes by {change:.1%} of its range per "
+                f"step, {_where(action.diff(dim=0).abs())}."
+            )
+            yield Finding("chatters", text)
 
 
 def _at_bounds(name: str, action: Tensor, share: float) -> Finding:
@@ -168,13 +184,12 @@ def _at_bounds(name: str, action: Tensor, share: float) -> Finding:
 
 
 def _flips(name: str, action: Tensor, gain: float, rate: float | None) -> Finding:
-    change = action.diff(dim=0)
-    back = (change[1:] * change[:-1] < 0).float()
+    back, change = _turns(action), action.diff(dim=0).abs()
     speed = "half the control rate" if rate is None else f"{rate / 2:.3g} Hz, half the control rate"
     text = (
         f"{name} flips from step to step, which is shaking at {speed}: its gain on the previous "
         f"action is {gain:.2f}, and it turns back in {back.mean():.0%} of the steps, by "
-        f"{_change(action):.1%} of its range on average; {_where(back * change[1:].abs())}."
+        f"{_change(action):.1%} of its range on average; {_where(back * change[1:])}."
     )
     return Finding("flips", text)
 
@@ -249,18 +264,25 @@ def _training(diagnosis: Diagnosis) -> Iterator[Finding]:
 def _movement(diagnosis: Diagnosis) -> Finding:
     """Finding about a policy whose actions have no fault."""
     change = _change(diagnosis.relative)
+    place = "" if diagnosis.is_recording else "in the first episode "
     numbers = (
-        f"in the first episode the action changes by {change:.1%} of its range per step, and its "
+        f"{place}the action changes by {change:.1%} of its range per step, and its "
         f"gain on the previous action is {diagnosis.measures['previous_action_gain']:.2f}"
     )
     if change <= threshold("SMOOTH"):
         return Finding("smooth", f"It is smooth: {numbers}.", fault=False)
     where = _where(diagnosis.relative.diff(dim=0).abs().mean(1, keepdim=True))
     text = (
-        f"It moves much, but it does not flip, jump between its bounds or move like noise: "
+        "It moves much, but it does not flip, chatter, jump between its bounds or move like noise: "
         f"{numbers}; the change is {where}."
     )
     return Finding("moves", text, fault=False)
+
+
+def _turns(action: Tensor) -> Tensor:
+    """1 where a change has the other sign than the one before, and 0 elsewhere, ``[T - 2, A]``."""
+    change = action.diff(dim=0)
+    return (change[1:] * change[:-1] < 0).float()
 
 
 def _change(relative: Tensor) -> float:
