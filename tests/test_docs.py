@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import re
+import runpy
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -17,6 +18,7 @@ from torchrl.objectives import SACLoss
 
 import torchrl_l2c2
 from torchrl_l2c2 import affinities
+from torchrl_l2c2.experiment.analysis.diagnosis import diagnose_actions, findings
 from torchrl_l2c2.experiment.analysis.diagnosis.words import threshold
 from torchrl_l2c2.experiment.cli import diagnose as diagnose_command
 from torchrl_l2c2.experiment.learn.learner import MEASURE_AFTER, WARN_BELOW
@@ -125,6 +127,17 @@ def test_the_page_shows_what_diagnose_says_of_a_recording(
     command, shown = re.findall(r"^```(?:bash|text)\n(.*?)^```", page.read_text(), re.M | re.S)[1:3]
     diagnose_command.main(command.split()[4:])
     assert capsys.readouterr().out == shown
+
+
+def test_the_pictured_actions_have_their_findings() -> None:
+    """Of each, the first finding is the one in its title; the red ones are faults."""
+    made = runpy.run_path(str(FOLDER / "make_findings.py"))
+    found = {
+        kind: findings(diagnose_actions(action, bounds=(-1.0, 1.0)))[0]
+        for kind, (_, action) in made["signals"]().items()
+    }
+    assert all(each.kind == kind for kind, each in found.items())
+    assert [kind for kind, each in found.items() if not each.fault] == ["smooth"]
 
 
 def test_the_pages_have_the_thresholds_of_diagnose() -> None:
