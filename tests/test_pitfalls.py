@@ -26,6 +26,7 @@ from losses import (
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
+from torchrl.collectors.utils import split_trajectories
 from torchrl.modules import (
     Actor,
     BatchRenorm1d,
@@ -45,6 +46,7 @@ from torchrl_l2c2 import (
     L2C2Loss,
     LCPLoss,
     Neighborhood,
+    NeighborTransform,
     SR2LLoss,
     smooth,
 )
@@ -416,6 +418,26 @@ def test_padding_of_cloned_trajectories_is_not_regularized(per_action):
     expected = loss.policy_regularizer(batch[~pad])["loss_cats"]
     batch["pad"] = pad.unsqueeze(-1).expand(-1, 3) if per_action else pad
     torch.testing.assert_close(loss.policy_regularizer(batch)["loss_cats"], expected)
+
+
+@pytest.mark.parametrize("policy_distance", ["mse", "hellinger"])
+def test_padding_has_no_part_in_gradients_with_neighbors_of_the_batch(policy_distance):
+    """Of trajectories of three and five steps, split and padded with zeros."""
+    loss = L2C2Loss(
+        PPOLoss(seeded(gaussian_actor), seeded(critic)), NEAR, policy_distance=policy_distance
+    )
+    batch = NeighborTransform(NEAR)(seeded(on_policy, 8))
+    batch["next", "done"][[2, 7]] = True
+    batch["collector"] = TensorDict({"traj_ids": (torch.arange(8) > 2).long()}, [8])
+    padded = split_trajectories(batch)
+    assert padded.shape == (2, 5) and (padded["neighbor", "distance"] == 0).any()
+
+    def gradients(rows):
+        terms = loss(rows)
+        total = sum(term for key, term in terms.items() if key.startswith("loss_l2c2"))
+        return torch.autograd.grad(total, list(loss.parameters()))
+
+    torch.testing.assert_close(gradients(padded), gradients(batch))
 
 
 class Timed(nn.Module):

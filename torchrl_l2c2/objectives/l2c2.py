@@ -442,6 +442,8 @@ def _read_neighbors(neighbor: TensorDictBase, key: NestedKey) -> tuple[TensorDic
             "or name another neighbor_key."
         )
     distance = entries.pop("distance")
+    # Only padding has none: the gain would be infinite, and the gradient under a mask NaN.
+    distance = distance.masked_fill(distance == 0.0, 1.0)
     return TensorDict(entries, batch_size=distance.shape), distance
 
 
