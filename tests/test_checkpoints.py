@@ -102,6 +102,7 @@ def test_a_missing_file_is_named(tmp_path):
 
 def test_old_ones_are_removed_by_count_newest_first(tmp_path):
     """`keep` of them stay."""
+    (tmp_path / "checkpoint_mine.pt").touch()  # A user's own is none of them.
     for episode in (5, 40, 300):
         save_checkpoint(tmp_path, episode, STATE, keep=2)
     assert [path.name for path in list_checkpoints(tmp_path)] == [

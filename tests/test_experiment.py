@@ -517,9 +517,9 @@ def test_an_error_of_the_users_own_task_is_shown_with_its_lines(tmp_path, monkey
 
 
 def test_a_sweep_gives_one_table(tmp_path):
-    """Methods and seeds in their order."""
+    """Methods and seeds in their order; -m may stand anywhere."""
     overrides = (*SHORTER, "regularizer=none,l2c2", "seed=0,1", "hydra/launcher=basic")
-    done = run_train("-m", *PENDULUM_OVERRIDES, *overrides, folder=tmp_path)
+    done = run_train(*PENDULUM_OVERRIDES, "-m", *overrides, folder=tmp_path)
     runs = read_runs(tmp_path)
     assert [(run.regularizer, run.seed) for run in runs] == [
         ("none", 0),

@@ -195,12 +195,23 @@ class TestFolders:
             result_lines(finished_run(tmp_path / "bad", config.to_dict()))
 
 
+def test_a_mark_that_excel_adds_is_no_part_of_the_header(field, tmp_path):
+    """Of a file that is saved as CSV UTF-8."""
+    path = tmp_path / "records.csv"
+    write_records(path, table_of(of(field, "pendulum", "none")))
+    before = read_records(path)
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert read_records(path).equals(before)
+
+
 @pytest.mark.parametrize(
     ("column", "cell", "told"),
     [
         ("length", "abc", "Expected '<N> episodes' or frames, got 'abc'"),
         ("length", "1e6 frames", "Expected '<N> episodes'"),
         ("length", "10 weeks", "Expected '<N> episodes'"),
+        ("seed", "9" * 20, "Expected a whole number from 0 to"),
+        ("seed", "-1", "Expected a whole number from 0 to"),
         ("last_mean_return", "inf", "Expected a finite number or an empty cell, got 'inf'"),
     ],
 )

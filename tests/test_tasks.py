@@ -142,6 +142,13 @@ def test_what_is_no_numbers_is_refused(monkeypatch, space, flatten):
     assert "\n" not in str(refused.value)
 
 
+def test_an_observation_without_entries_is_refused(monkeypatch):
+    """In one line, before anything is made of it."""
+    still(monkeypatch, space=spaces.Box(-1, 1, (0,)))
+    with pytest.raises(UserError, match="observation is a vector without entries"):
+        make_env(task(), 0)
+
+
 def test_an_image_is_refused_with_the_setting_that_flattens_it(monkeypatch):
     """The experiment has no convolutional networks."""
     still(monkeypatch, space=spaces.Box(0, 255, (8, 8, 3), np.uint8))

@@ -10,6 +10,7 @@ import pytest
 
 from torchrl_l2c2.experiment import Experiment, ExperimentConfig, PPORPEConfig, TaskConfig
 from torchrl_l2c2.experiment.analysis.video import play_pictures, record_video, write_video
+from torchrl_l2c2.experiment.cli import diagnose
 from torchrl_l2c2.experiment.cli.video import main
 from torchrl_l2c2.experiment.envs.pictures import Drawing, PictureRecorder
 from torchrl_l2c2.experiment.run.policies import load_policy
@@ -116,6 +117,25 @@ def test_an_encoder_that_cannot_write_is_one_line(tmp_path, monkeypatch):
     pictures = [np.zeros((4, 4, 3), np.uint8)]
     with pytest.raises(OSError, match=r"^the video could not be written: .*a\.mp4\. Is the disk"):
         write_video(tmp_path / "a.mp4", pictures, 30.0)
+
+
+def test_a_folder_that_cannot_be_written_to_is_told_before_anything_is_played(
+    pendulum, monkeypatch
+):
+    """Also that of the run itself, by ``video`` and by ``diagnose``."""
+
+    def full(**_):
+        raise OSError(30, "Read-only file system")
+
+    def played(*_, **__):
+        raise AssertionError
+
+    monkeypatch.setattr("tempfile.TemporaryFile", full)
+    monkeypatch.setattr("torchrl_l2c2.experiment.analysis.video.play_pictures", played)
+    monkeypatch.setattr("torchrl_l2c2.experiment.analysis.diagnosis.diagnose_run", played)
+    for command in (main, diagnose.main):
+        with pytest.raises(SystemExit, match=r"cannot be written to \(Read-only file system\)"):
+            command([str(pendulum)])
 
 
 def test_a_task_that_draws_nothing_is_refused(tmp_path):

@@ -19,6 +19,7 @@ from torchrl_l2c2.experiment.cli.composition import (
     CONF,
     check_outputs,
     composition_errors,
+    read,
     register,
 )
 from torchrl_l2c2.experiment.errors import UserError
@@ -111,6 +112,10 @@ def test_a_wrong_setting_gives_its_line(settings_of, line, message):
             "Config group override must be a string or a list. Got int. Each of task, algorithm,",
         ),
         ("~regularizer", "Error resolving interpolation '${regularizer}_${algorithm}'"),
+        (
+            "hydra/launcher=joblib hydra.launcher.n_jobs=two",
+            "hydra.launcher.n_jobs: Value 'two' of type 'str' could not be converted to Integer",
+        ),
         ("seed=${oder}", "Interpolation key 'oder' not found full_key: seed"),
         ("seed=[1", "cannot read 'seed=[1'. Put a value with special"),
     ],
@@ -161,6 +166,15 @@ def test_the_whole_error_is_shown_where_it_is_asked_for(settings_of, monkeypatch
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     with pytest.raises(HydraException, match="Could not override 'sed'"), composition_errors():
         settings_of("sed=1")
+
+
+@pytest.mark.parametrize("given", ["no", "perhaps", 5])
+def test_what_is_no_flag_is_refused(given):
+    """Any text would count as true."""
+    values = {**dataclasses.asdict(ExperimentConfig()), "outputs": "outputs"}
+    values["allow_other_versions"] = given
+    with pytest.raises(SettingError, match="allow_other_versions must be true or false, got "):
+        read(values, OmegaConf.create({"runtime": {"choices": {}}}))
 
 
 @pytest.mark.parametrize("given", [None, "", [1], False])

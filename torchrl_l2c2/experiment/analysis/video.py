@@ -30,29 +30,22 @@ Picture = NDArray[np.uint8]
 ENDINGS = (".avi", ".m4v", ".mkv", ".mov", ".mp4")
 
 
-def check_video(path: str | Path | None = None) -> None:
-    """Checks that a video can be written.
-
-    Args:
-        path (str or Path, optional): Path of the file; its folder is made.
+def check_video(path: Path) -> None:
+    """Checks that a video of this name can be written.
 
     Raises:
         ImportError: If the ``video`` extra is missing.
         ValueError: If the file has another ending.
-        OSError: If the folder cannot be written to.
     """
     if find_spec("imageio_ffmpeg") is None:
         raise MissingPackageError(
             "Expected the package imageio-ffmpeg, which is not installed. Run pip install "
             '"torchrl-l2c2[video]".'
         )
-    if path is None:
-        return
-    if Path(path).suffix.lower() not in ENDINGS:
+    if path.suffix.lower() not in ENDINGS:
         raise UserError(
             f"Expected a file that ends in {', '.join(ENDINGS)}, got {str(path)!r}. Rename it."
         )
-    make_parent_folder(path)
 
 
 def record_video(
@@ -88,10 +81,12 @@ def record_video(
         FileNotFoundError: If the folder has no run, or no policy yet.
         OSError: If the file cannot be written.
     """
+    wanted, path = path is not None, Path(path or Path(run) / "video.mp4")
     check_video(path)
     if episodes < 1:
         raise UserError(f"Expected at least 1 episode, got {episodes}. Give a larger --episodes.")
-    path = Path(path or Path(run) / "video.mp4")
+    if wanted or path.parent.is_dir():  # A run that is not there is told below.
+        make_parent_folder(path)
     played = play_pictures(run, episodes, seed=seed, noise_scale=noise_scale, best=best)
     seen = [picture for each in played for picture in each.pictures]
     write_video(path, seen, played[0].rate or USUAL_RATE)

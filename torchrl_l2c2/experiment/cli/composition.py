@@ -26,6 +26,7 @@ from hydra.errors import (
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import ValidationError as OmegaConfValidationError
 
 from torchrl_l2c2.experiment.settings.config import COMMAND_SETTINGS, GROUPS, ExperimentConfig
 from torchrl_l2c2.experiment.settings.fields import SettingError, describe
@@ -85,6 +86,8 @@ def read(values: dict[str, Any], chosen: Any) -> tuple[ExperimentConfig, Path]:
     """
     check_preset(values, chosen.runtime.choices.get("preset"))
     values["outputs"] = check_outputs(values["outputs"])
+    if not isinstance(allowed := values["allow_other_versions"], bool):
+        raise SettingError("allow_other_versions", f"must be true or false, got {allowed!r}.")
     config = ExperimentConfig.from_dict(values)
     check_budget(config, chosen.overrides.task)
     multirun = chosen.mode == RunMode.MULTIRUN
@@ -219,9 +222,12 @@ def one_line_message(error: Exception) -> str:
 
     It uses the attributes of the errors, not their messages.
     """
-    setting = getattr(error.__cause__, "full_key", None)
-    if isinstance(error, ConfigCompositionException) and setting:
-        return unknown_setting(setting)
+    cause = error.__cause__
+    if isinstance(error, ConfigCompositionException) and isinstance(cause, OmegaConfBaseException):
+        if isinstance(cause, OmegaConfValidationError):
+            return f"{cause.full_key}: {' '.join(str(cause.msg).split())}."
+        if cause.full_key:
+            return unknown_setting(cause.full_key)
     if isinstance(error, MissingConfigException) and error.options and error.missing_cfg_file:
         group, _, name = error.missing_cfg_file.rpartition("/")
         return _unknown_choice(group, name, error.options)

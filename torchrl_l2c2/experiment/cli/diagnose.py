@@ -29,9 +29,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
             parser.error(f"--names must have {len(folders)} names, one per run, got {chosen.names}")
         if chosen.bounds and not any(map(_is_recording, folders)):
             parser.error("--bounds are of recorded actions, and no CSV file was given")
+        first = Path(chosen.folders[0])
+        page = first.with_suffix(".html") if _is_recording(first) else first / "diagnosis.html"
+        path = Path(chosen.output or page)
         # Before the episodes, whose results could otherwise be lost.
-        for given in filter(None, (chosen.output, chosen.actions)):
-            make_parent_folder(given)
+        for each in filter(None, (chosen.output, chosen.actions)):
+            make_parent_folder(each)
+        if path == page and page.parent.is_dir():  # A run that is not there is told below.
+            make_parent_folder(page)
         names = chosen.names or diagnosis.run_names(folders)
         diagnoses = [
             diagnosis.diagnose_recording(folder, name=name, bounds=chosen.bounds)
@@ -47,9 +52,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
             )
             for folder, name in zip(folders, names, strict=True)
         ]
-        first = Path(chosen.folders[0])
-        page = first.with_suffix(".html") if _is_recording(first) else first / "diagnosis.html"
-        path = Path(chosen.output or page)
         diagnosis.write_page(path, diagnoses)
         if chosen.actions:
             write_atomically(chosen.actions, diagnosis.draw_together(diagnoses))

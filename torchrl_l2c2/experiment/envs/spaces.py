@@ -58,6 +58,8 @@ def with_vector_observation(env: Env, *, flatten: bool) -> Env:
     if not isinstance(space, spaces.Box) or len(space.shape) != 1:
         env = FlattenObservation(env)
     vector: Any = env.observation_space
+    if not vector.shape[0]:
+        raise UserError("the task's observation is a vector without entries: a policy needs one.")
     if vector.dtype == np.float32:
         return env
     # DtypeObservation does the same, but warns about every float64.

@@ -24,7 +24,7 @@ from torchrl_l2c2.experiment.run.files import write_atomically
 MAGIC = b"torchrl_l2c2\n"
 FORMAT_VERSION = 1
 HEADER = struct.Struct(f"<{len(MAGIC)}sI32s")
-PATTERN = "checkpoint_*.pt"
+PATTERN = "checkpoint_[0-9]*.pt"
 
 
 class CheckpointError(UserError):

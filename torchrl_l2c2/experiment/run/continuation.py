@@ -38,25 +38,22 @@ def check_same_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> Non
         )
 
 
-def check_same_versions(saved: Mapping[str, str], now: Mapping[str, str]) -> None:
-    """Checks that the versions of packages are the same: other versions may change the numbers.
+def differing_versions(saved: Mapping[str, str], now: Mapping[str, str]) -> str:
+    """Names the packages whose versions differ, which may change the numbers; empty if none do.
 
     Packages that were or are not installed are ignored. A run that needs them fails anyway.
 
     Args:
         saved (Mapping): Versions in the checkpoint.
         now (Mapping): Installed versions.
-
-    Raises:
-        OtherRunError: If versions differ; states all of them.
     """
     differing = [f"{n} {saved[n]}, now {now[n]}" for n in now if saved.get(n, now[n]) != now[n]]
-    if differing:
-        raise OtherRunError(
-            f"the checkpoint was made with {'; '.join(differing)}: the numbers may differ from an "
-            "uninterrupted run. Set allow_other_versions=True to continue anyway. Nothing was "
-            "changed."
-        )
+    if not differing:
+        return ""
+    return (
+        f"the checkpoint was made with {'; '.join(differing)}: the numbers may differ from an "
+        "uninterrupted run."
+    )
 
 
 def check_length(asked: Budget, before: Budget, played: int) -> None:
@@ -172,12 +169,13 @@ def check_continuable(
                 f"uninterrupted training of {asked.total} {asked.unit}s would give other numbers.",
                 stacklevel=5,
             )
-    try:
-        check_same_versions(json.loads(state["versions"]), versions())
-    except OtherRunError as error:
-        if not allow_other_versions:
-            raise
-        warnings.warn(str(error), stacklevel=5)
+    differing = differing_versions(json.loads(state["versions"]), versions())
+    if differing and not allow_other_versions:
+        raise OtherRunError(
+            f"{differing} Set allow_other_versions=true to continue anyway. Nothing was changed."
+        )
+    if differing:
+        warnings.warn(differing, stacklevel=5)
 
 
 @contextlib.contextmanager

@@ -205,7 +205,7 @@ def read_evaluation(run: str | Path) -> dict[str, Any]:
 
 def _read_text(path: str | Path) -> str:
     try:
-        return Path(path).read_text(encoding="utf-8")
+        return Path(path).read_text(encoding="utf-8-sig")  # Excel may add a mark.
     except FileNotFoundError:
         raise FileNotFoundError(f"{path} is missing from the run's folder: restore it.") from None
     except UnicodeDecodeError as error:

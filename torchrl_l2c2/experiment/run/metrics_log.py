@@ -88,8 +88,9 @@ class MetricsLog:
             )
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the columns and the size of the file."""
-        return {"columns": self.columns, "size": self._size}
+        """Returns the columns, and the size and the hash of the file."""
+        content = b"" if self.columns is None or self.path is None else self.path.read_bytes()
+        return {"columns": self.columns, "size": self._size, "sha256": _sha256(content)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restores a state and removes later lines from the file.
@@ -103,14 +104,17 @@ class MetricsLog:
         content = self.path.read_bytes() if self.path.exists() else b""
         written = content[: state["size"]]
         # Spreadsheet programs may change line ends or the format of numbers.
-        whole = written.startswith(_line(self.columns).encode()) and written.endswith(b"\n")
-        if len(written) < state["size"] or not whole:
+        if len(written) < state["size"] or _sha256(written) != state["sha256"]:
             raise UserError(
-                f"{self.path} was changed after the checkpoint, when it had {state['size']} bytes; "
-                f"it now has {len(content)} bytes. Restore it, or choose another folder."
+                f"the beginning of {self.path} ({state['size']} bytes) is not as it was at the "
+                "checkpoint. Restore it, or choose another folder."
             )
         os.truncate(self.path, state["size"])
         self._size = state["size"]
+
+
+def _sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
 
 
 def _line(cells: Iterable[object]) -> str:

@@ -57,8 +57,8 @@ GROUPS: dict[str, Mapping[str, Any]] = {
 # Settings of the command only, not of a run: default and description.
 COMMAND_SETTINGS = {
     "outputs": ("outputs", "parent folder of all run folders"),
-    "preset": ("null", "settings of a task and an algorithm: baselines, rl_zoo, field"),
-    "experiment": ("null", "a whole comparison from conf/experiment/, with -m"),
+    "preset": ("none", "settings of a task and an algorithm: baselines, rl_zoo, field"),
+    "experiment": ("none", "a whole comparison from conf/experiment/, with -m"),
     "allow_other_versions": (
         "false",
         "continue a checkpoint made with other versions of torch, TorchRL or a simulator",

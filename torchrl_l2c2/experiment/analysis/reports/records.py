@@ -137,7 +137,7 @@ def read_records(path: str | Path) -> pd.DataFrame:
             f"Expected the columns of records in {path}, got missing or unknown columns: {odd}. "
             "Write the file with report --csv."
         )
-    read: dict[str, Callable[[str], Any]] = {"int": int, "float": _number, "str": str}
+    read: dict[str, Callable[[str], Any]] = {"int": _whole, "float": _number, "str": str}
     rows = []
     for number, line in enumerate(lines, start=2):
         try:
@@ -148,6 +148,13 @@ def read_records(path: str | Path) -> pd.DataFrame:
         except ValueError as error:
             raise UserError(f"{path}, line {number}: {error}. Mend the line.") from None
     return merge(pd.DataFrame(rows, columns=list(TYPES)))
+
+
+def _whole(text: str) -> int:
+    value = int(text)
+    if not 0 <= value < 2**63:
+        raise ValueError(f"Expected a whole number from 0 to 2^63 - 1, got {text}")
+    return value
 
 
 def write_records(path: str | Path, records: pd.DataFrame) -> None:
