@@ -85,7 +85,7 @@ def record_video(
     check_video(path)
     if episodes < 1:
         raise UserError(f"Expected at least 1 episode, got {episodes}. Give a larger --episodes.")
-    if wanted or path.parent.is_dir():  # A run that is not there is told below.
+    if wanted or path.parent.is_dir():  # Otherwise the missing run is reported below.
         make_parent_folder(path)
     played = play_pictures(run, episodes, seed=seed, noise_scale=noise_scale, best=best)
     seen = [picture for each in played for picture in each.pictures]

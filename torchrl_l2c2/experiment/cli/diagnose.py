@@ -35,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         # Before the episodes, whose results could otherwise be lost.
         for each in filter(None, (chosen.output, chosen.actions)):
             make_parent_folder(each)
-        if path == page and page.parent.is_dir():  # A run that is not there is told below.
+        if path == page and page.parent.is_dir():  # Otherwise the missing run is reported below.
             make_parent_folder(page)
         names = chosen.names or diagnosis.run_names(folders)
         diagnoses = [

@@ -78,7 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             print(manual(), end="")
         return
     check_launcher(sys.argv)
-    # Hydra would read no settings behind it if there are some before it.
+    # With settings before and after -m, Hydra reads only the first of them.
     sys.argv[1:] = sorted(sys.argv[1:], key=lambda argument: not is_multirun(argument))
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # No telemetry by default.
     keep_ctrl_c_from_children()
