@@ -1,6 +1,7 @@
 """Why a policy shakes: what is measured, what is said of it, and the page."""
 
 import re
+from contextlib import nullcontext
 from dataclasses import replace
 
 import gymnasium
@@ -74,7 +75,7 @@ def made_up(actions=0.5 * SINE, **known):
             "low": -torch.ones(size),
             "high": torch.ones(size),
             "bounded": True,
-            "observations": torch.stack([STEPS[: len(actions)], STEPS[: len(actions)] ** 2], 1),
+            "observations": torch.arange(float(len(actions)))[:, None] ** torch.tensor([1, 2]),
             "policy_lipschitz": torch.ones(len(actions)),
             "value_lipschitz": None,
             "distance": torch.full((len(actions),), 0.5),
@@ -188,15 +189,52 @@ class TestWords:
         found = said(made_up(noise), "rough")
         assert abs(float(re.search(r"roughness is ([\d.]+)", found.text)[1]) - 0.25) < 0.03
 
-    def test_shaking_around_a_slow_movement_chatters(self):
-        """It turns back at every step, although successive actions are alike."""
-        actions = 0.5 * SINE + 0.05 * FLIPPING
-        found = said(made_up(actions, action_names=["knee"], rate=50.0), "chatters")
-        assert found.text.startswith("knee chatters") and found.fault
-        for words in ("about 25 Hz", "turns back in 100% of the steps", "5.0% of its range"):
-            assert words in found.text
-        # Below the largest change of a smooth policy.
-        assert "chatters" not in kinds(made_up(0.5 * SINE + 0.015 * FLIPPING))
+    @pytest.mark.parametrize(
+        ("rate", "cycles", "speed"),
+        [(50.0, 0.5, "about 25 Hz"), (50.0, 0.2, "about 10 Hz"), (None, 0.4, "about 0.4 of the")],
+    )
+    def test_shaking_around_a_slow_movement_chatters(self, rate, cycles, speed):
+        """With the frequency and the size of the fast part: that of a sine over root 2."""
+        steps = torch.arange(500.0).unsqueeze(-1)
+        slow = 0.5 * torch.sin(2 * torch.pi * steps / 250)
+        fast = 0.2 * torch.cos(2 * torch.pi * cycles * steps)
+        found = said(made_up(slow + fast, action_names=["knee"], rate=rate), "chatters")
+        assert found.text.startswith("knee chatters") and found.fault and speed in found.text
+        size = fast.square().mean().sqrt().item() / 2
+        assert f"by {size:.1%} of its range" in found.text and "throughout" in found.text
+        assert kinds(made_up(slow + 0.1 * fast, rate=rate)) == ["smooth"]
+
+    def test_a_tenth_of_an_episode_may_chatter(self):
+        """It stands still otherwise; the sentence has the steps."""
+        actions = torch.zeros(1000, 1)
+        actions[700:800] = 0.06 * (-1.0) ** torch.arange(100).unsqueeze(-1)
+        actions += 0.5 * torch.sin(2 * torch.pi * torch.arange(1000) / 500).unsqueeze(-1)
+        found = re.search(r"in steps (\d+) to (\d+)", said(made_up(actions), "chatters").text)
+        assert 700 <= int(found[1]) < int(found[2]) < 800
+
+    @pytest.mark.parametrize("rate", [None, 50.0, 500.0])
+    @pytest.mark.parametrize("shape", ["sine", "steps", "sawtooth", "clipped", "noisy"])
+    def test_slow_movement_does_not_chatter(self, shape, rate):
+        """Whose spectrum has a tail: jumps, corners, and a little noise."""
+        steps = torch.arange(2000.0).unsqueeze(-1)
+        sine = torch.sin(2 * torch.pi * steps / 400)
+        actions = {
+            "sine": 0.9 * sine,
+            "steps": 0.5 * sine.sign(),
+            "sawtooth": (steps / 400) % 1 - 0.5,
+            "clipped": (2 * sine).clamp(-0.5, 0.5),
+            "noisy": 0.5 * sine
+            + 0.01 * torch.randn(2000, 1, generator=torch.Generator().manual_seed(0)),
+        }[shape]
+        assert "chatters" not in kinds(made_up(actions, rate=rate))
+
+    def test_the_action_that_moves_most_is_named_first(self):
+        """Also if nothing is wrong; actions that stand still are no part of the number."""
+        still = torch.full((100, 3), 0.3)
+        found = said(made_up(torch.cat([still, 0.5 * SINE], 1)), "smooth")
+        assert "action[3] changes most, by 1.0% of its range" in found.text
+        both = torch.cat([0.2 * FLIPPING, 0.5 * FLIPPING], 1)
+        assert findings(made_up(both))[0].text.startswith("action[1] flips")
 
     def test_fast_and_even_moves_are_neither_smooth_nor_a_fault(self):
         """Ten sines of half the range."""
@@ -549,47 +587,90 @@ class TestRecording:
 
     def test_it_is_measured_as_an_episode_is(self):
         """By hand: two actions that change by 0.3 and 0.4, so by 0.5, and by the same back."""
-        actions = torch.tensor([[0.0, 0.0], [0.3, 0.4]]).repeat(5, 1)
+        actions = torch.tensor([[0.0, 0.0], [0.3, 0.4]]).repeat(10, 1)
         found = diagnose_actions(actions, bounds=(-1.0, 0.4))
         assert found.measures["action_variation"] == pytest.approx(0.5)
-        assert found.measures["length"] == 10 and "return" not in found.measures
+        assert found.measures["length"] == 20 and "return" not in found.measures
         assert found.bounded and found.low.tolist() == [-1.0] * 2
-        assert kinds(found) == ["flips", "pinned", "flips"]
+        assert kinds(found) == ["pinned", "flips", "flips"]
         spanned = diagnose_actions(actions)
         assert not spanned.bounded and spanned.high.tolist() == pytest.approx([0.3, 0.4])
 
-    def test_a_file_has_names_and_seconds(self, tmp_path):
+    def test_a_spike_does_not_hide_an_action(self):
+        """Nor does one that only rounding moves count; one in 200 samples is no span."""
+        steps = torch.arange(1000.0)
+        actions = torch.stack([0.5 * (-1.0) ** steps, 0.3 + 1e-6 * (-1.0) ** steps], 1)
+        actions[500, 0] = 50.0
+        (only,) = findings(diagnose_actions(actions))
+        assert only.text.startswith("action[0] flips")
+
+    @pytest.mark.parametrize("often", [1, 2, 10])
+    def test_a_faster_logger_does_not_hide_shaking(self, often):
+        """Every action is there several times, of many also once more or less."""
+        flips = torch.cat([0.5 * FLIPPING, 0.1 * SINE], 1)
+        counts = torch.full((100,), often)
+        if often == 10:
+            counts += torch.arange(100) % 3 - 1
+        logged = flips.repeat_interleave(counts, 0)
+        with nullcontext() if often == 1 else pytest.warns(UserWarning, match=f"{often} times"):
+            found = diagnose_actions(logged, rate=20.0 * often)
+        assert torch.equal(found.actions, flips) and found.rate == pytest.approx(20.0)
+
+    def test_held_and_rounded_actions_are_no_repetitions(self):
+        """A rest between movements, and a slow movement in few levels."""
+        rest = torch.cat([0.5 * SINE, torch.zeros(500, 1)])
+        levels = (torch.sin(2 * torch.pi * torch.arange(2000) / 500) * 4).round().unsqueeze(1)
+        for actions in (rest, levels, torch.zeros(50, 1)):
+            assert torch.equal(diagnose_actions(actions).actions, actions)
+
+    @pytest.mark.parametrize("separator", [",", ";", "\t"])
+    def test_a_file_has_names_and_seconds(self, tmp_path, separator):
         """Anywhere among the columns; Windows' marks and ends of lines do not matter."""
-        lines = ["\ufeffhip, time ,knee", *(f"{(-1) ** i},{0.02 * i},0.5" for i in range(9))]
+        rows = [["# hip", " time ", "knee"]]
+        rows += [[f"{(-1) ** i}", f"{i / 50}", "0"] for i in range(20)]
         path = tmp_path / "robot.csv"
-        path.write_bytes("\r\n".join([*lines, ""]).encode())
+        lines = "\r\n".join(separator.join(row) for row in [*rows, []])
+        path.write_bytes(f"\ufeff{lines}".encode())
         found = diagnose_recording(path)
-        assert found.actions.shape == (9, 2) and found.actions[1].tolist() == [-1.0, 0.5]
+        assert found.actions.shape == (20, 2) and found.actions[1].tolist() == [-1.0, 0.0]
         assert found.rate == pytest.approx(50.0) and found.name == str(path)
         (only,) = findings(found)
         assert only.text.startswith("hip flips from step to step, which is shaking at 25 Hz")
 
+    def test_columns_are_chosen_among_others(self, tmp_path):
+        """The others may hold anything."""
+        rows = [f"{i},walk,{(-1) ** i}" for i in range(20)]
+        path = table_file(tmp_path / "a.csv", "step,mode,knee", *rows)
+        assert diagnose_recording(path, columns=["knee"]).actions.shape == (20, 1)
+        with pytest.raises(UserError, match="no column 'hip': choose from step, mode, knee"):
+            diagnose_recording(path, columns=["hip"])
+        with pytest.raises(UserError, match=r"line 2: 'mode' must be a finite number, got 'walk'"):
+            diagnose_recording(path)
+
     def test_gaps_are_told(self, tmp_path):
         """The rate is that of the other steps."""
-        times = [0.0, 0.1, 0.2, 0.3, 0.9, 1.0]
-        path = table_file(tmp_path / "a.csv", "time,a", *(f"{t},{t}" for t in times))
-        with pytest.warns(UserWarning, match=r"has gaps \(1, the first after row 4\)"):
+        times = [i / 10 + (0.5 if i > 3 else 0.0) for i in range(20)]
+        rows = [f"{t},{(-1) ** i}" for i, t in enumerate(times)]
+        path = table_file(tmp_path / "a.csv", "time,a", *rows)
+        told = r"has gaps \(1, the first before line 6, the longest of 0.6 s\)"
+        with pytest.warns(UserWarning, match=told):
             assert diagnose_recording(path).rate == pytest.approx(10.0)
 
     @pytest.mark.parametrize(
         ("lines", "message"),
         [
-            ([], r"line 1: expected a different name for each action, got \[\]"),
-            (["0.1,0.2", "0.3,0.4"], r"line 1: expected a different name .*'0.1'"),
-            ([",a", "0,1"], r"line 1: expected a different name"),
-            (["a,a", "0,1"], r"line 1: expected a different name"),
-            (["a,b", "0,1", "0"], r"line 3: expected 2 numbers, got \['0'\]"),
-            (["a", "0", "x"], r"line 3: expected 1 numbers, got \['x'\]"),
-            (["a", "0", "1", "2"], r"at least 4 steps and one action, got \[3, 1\]"),
-            (["a"], r"at least 4 steps and one action, got \[0, 1\]"),
-            (["time", "0", "1", "2", "3"], r"at least 4 steps and one action, got \[4, 0\]"),
-            (["a,time", "0,0", "0,1", "0,1", "0,2"], r"the column 'time' must increase"),
-            (["a", "0", "nan", "0", "0"], r"actions must be finite, got \[nan\] at 1"),
+            ([], r"line 1: expected the names of the columns, got \['?'?\]"),
+            (["0.1,0.2", "0.3,0.4"], r"line 1: expected the names .*'0.1'"),
+            ([",a", "0,1"], r"line 1: column 1 has no name.*index=False"),
+            (["a,a", "0,1"], r"line 1: several columns are named 'a'"),
+            (["a,b", "0,1", "0"], r"line 3: expected 2 cells as in the first line, got 1"),
+            (["a", "0", "x"], r"line 3: 'a' must be a finite number, got 'x'"),
+            (["a", "0", "nan"], r"line 3: 'a' must be a finite number, got 'nan': leave"),
+            (["a", "0", "1", "0"], r"at least 20 steps and one action, got \[3, 1\]"),
+            (["time", *map(str, range(20))], r"at least 20 steps and one action, got \[20, 0\]"),
+            (["a,time", "0,0", "0,1", "0,1", "0,2"], r"line 4: the column 'time' must increase"),
+            (["a,step", *(f"{i % 2},{i}" for i in range(20))], "'step' increases in every row"),
+            (["a,time", *(f"{i % 2},{i}e7" for i in range(20))], "must be in seconds, got steps"),
         ],
     )
     def test_what_is_no_table_of_actions_is_refused(self, tmp_path, lines, message):
@@ -602,6 +683,7 @@ class TestRecording:
         [
             ({"bounds": (1.0, -1.0)}, "bounds must be two finite numbers, the lower one first"),
             ({"bounds": (0.0, float("inf"))}, "bounds must be two finite numbers"),
+            ({"bounds": (-0.5, 0.5)}, r"lies beyond the bounds -0.5 and 0.5, as 1: give bounds in"),
             ({"rate": 0.0}, "rate must be a number of steps per second above 0"),
             ({"action_names": ["a", "b"]}, "1 actions need as many action_names, got 2"),
         ],
@@ -610,6 +692,21 @@ class TestRecording:
         """Before anything is measured."""
         with pytest.raises(UserError, match=message):
             diagnose_actions(SINE, **settings)
+        broken = SINE.clone()
+        broken[7] = float("nan")
+        with pytest.raises(UserError, match=r"must be finite, got \[nan\] in row 7"):
+            diagnose_actions(broken)
+
+    def test_what_does_not_compare_is_not_compared(self):
+        """Other actions, or another rate."""
+        hip = diagnose_actions(SINE, name="a", action_names=["hip"], rate=50.0)
+        for other, why in (
+            (diagnose_actions(SINE, name="b", action_names=["knee"]), "actions have other names"),
+            (diagnose_actions(SINE, name="b", rate=100.0), "steps have 100 and 50 Hz"),
+            (diagnose_actions(SINE.repeat(1, 2), name="b"), "they have 2 and 1 actions"),
+        ):
+            (sentence,) = comparison([hip, other])
+            assert sentence.startswith("b and a do not compare: ") and why in sentence
 
     def test_it_stands_beside_a_policy(self):
         """Without what needs the policy; the comparison leaves the return out."""
@@ -621,6 +718,7 @@ class TestRecording:
         text = page([played, recorded])
         for name, pictures in (("policy", 4), ("robot", 2)):
             assert text.count(f"<figcaption>{name}</figcaption>") == pictures
+        assert "<td>1 (&lt;knee&gt;, step 1)</td>" in text
         assert "nan" not in text and "&lt;knee&gt; flips" in text and "<knee>" not in text
         alone = page([recorded])
         for heading in (
@@ -714,7 +812,7 @@ class TestCommand:
         assert "<!-- robot: action variation 2 -->" in picture.read_text()
         with pytest.raises(SystemExit):
             main([str(run), "--bounds", "-2", "2"])
-        assert "--bounds are of recorded actions, and no CSV" in capsys.readouterr().err
+        assert "--bounds and --columns are of recorded actions: no CSV" in capsys.readouterr().err
         with pytest.raises(SystemExit, match=r"^error: .*none.csv"):
             main([str(tmp_path / "none.csv")])
 

@@ -146,7 +146,7 @@ def test_the_pages_have_the_thresholds_of_diagnose() -> None:
     rows = dict(re.findall(r"^\| ([^|]+) \| ([^|]+) \|", page, re.M))
     for finding, thresholds in {
         "flips from step to step": [threshold("FLIPS")],
-        "chatters": [threshold("CHATTERS"), threshold("SMOOTH")],
+        "chatters": [threshold(name) for name in ("CHATTERS", "FAST", "FAST_HERTZ")],
         "moves like noise": [threshold("ROUGH"), threshold("SMOOTH")],
         "bang-bang": [threshold("BANG_BANG"), threshold("EITHER_BOUND")],
         "pinned": [threshold("BANG_BANG")],

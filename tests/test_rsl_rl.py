@@ -683,10 +683,11 @@ def test_the_pages_recording_is_one_episode_of_mean_actions(
     env, path = NoisyPoints(2), tmp_path / "sim.csv"
     policy = OnPolicyRunner(env, runner_config()).get_inference_policy()
     first = policy(env.get_observations())[0].tolist()
-    told["record"](policy, env, path, steps=1000)
+    told["record"](policy, env, path, dt=0.1, steps=1000)
     header, *rows = path.read_text().splitlines()
-    assert header == "action0" and 4 < len(rows) < 1000
-    assert [float(cell) for cell in rows[0].split(",")] == pytest.approx(first)
+    assert header == "time,action0" and 4 < len(rows) < 1000
+    assert [float(cell) for cell in rows[0].split(",")] == pytest.approx([0.0, *first])
+    assert float(rows[3].split(",")[0]) == pytest.approx(0.3)
 
 
 def test_the_runners_iterations_are_the_ramp(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -27,8 +27,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         folders = diagnosis.run_folders(chosen.folders)
         if chosen.names and len(chosen.names) != len(folders):
             parser.error(f"--names must have {len(folders)} names, one per run, got {chosen.names}")
-        if chosen.bounds and not any(map(_is_recording, folders)):
-            parser.error("--bounds are of recorded actions, and no CSV file was given")
+        if (chosen.bounds or chosen.columns) and not any(map(_is_recording, folders)):
+            parser.error("--bounds and --columns are of recorded actions: no CSV file was given")
         first = Path(chosen.folders[0])
         page = first.with_suffix(".html") if _is_recording(first) else first / "diagnosis.html"
         path = Path(chosen.output or page)
@@ -39,7 +39,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             make_parent_folder(page)
         names = chosen.names or diagnosis.run_names(folders)
         diagnoses = [
-            diagnosis.diagnose_recording(folder, name=name, bounds=chosen.bounds)
+            diagnosis.diagnose_recording(
+                folder, name=name, columns=chosen.columns, bounds=chosen.bounds
+            )
             if _is_recording(folder)
             else diagnosis.diagnose_run(
                 folder,
@@ -88,6 +90,7 @@ def _parser() -> argparse.ArgumentParser:
         help="bounds of recorded actions (default: the smallest and largest of each action)",
     )
     add("--actions", help="SVG file for the actions of all runs, row by row (default: none)")
+    add("--columns", nargs="+", help="columns that are actions (default: all but time)")
     add("--episodes", type=int, default=3, help="number of measured episodes (default: 3)")
     add("--seed", type=int, help="random seed, the same for all runs (default: 1000003)")
     add(

@@ -28,6 +28,7 @@ Value = Callable[[Tensor, Tensor], Tensor]
 """Observations ``[N, *F]`` and actions ``[N, *A]`` to values, ``[N]`` or of several heads."""
 
 UNKNOWN = torch.empty(0)
+LOCKED = 1e-3  # of the largest span: smallest span that an action's change is relative to
 SAMPLES = 16  # actions drawn at a state to see how far they spread
 SAMPLED_STATES = 256
 SAME_PLACE = 0.25  # of the standard deviation of every coordinate within the episode
@@ -60,8 +61,10 @@ class Diagnosis:
         measures: means over the episodes: return, length, action variation, and the other measures
             of :func:`~torchrl_l2c2.experiment.evaluate_policy`. A recording has no return.
         actions: mean actions of the first episode, ``[T, A]``.
-        low: lower bounds of the actions, ``[A]``; without bounds, the smallest actions.
-        high: upper bounds of the actions, ``[A]``; without bounds, the largest actions.
+        low: lower bounds of the actions, ``[A]``; without bounds, the smallest actions, but for
+            one in 200.
+        high: upper bounds of the actions, ``[A]``; without bounds, the largest actions, but for one
+            in 200.
         bounded: whether the task has these bounds.
         action_names: names of the actions; empty for ``action[0]`` and so on.
         rate: actions per second, or ``None``.
@@ -120,13 +123,18 @@ class Diagnosis:
 
     @property
     def range(self) -> Tensor:
-        """Width of the actions' range, ``[A]``; never 0."""
-        return (self.high - self.low).clamp_min(torch.finfo(self.low.dtype).eps)
+        """Width of the actions' range, ``[A]``; never 0, and without bounds not much less than the
+        largest: an action that only rounding or noise moves is still.
+        """
+        width = self.high - self.low
+        least = 0.0 if self.bounded else LOCKED * float(width.max())
+        return width.clamp_min(max(least, torch.finfo(width.dtype).eps))
 
     @property
     def relative(self) -> Tensor:
-        """The actions ``[T, A]`` with their range as the unit."""
-        return (self.actions - self.low) / self.range
+        """The actions ``[T, A]`` with their range as the unit, without bounds clipped into it."""
+        relative = (self.actions - self.low) / self.range
+        return relative if self.bounded else relative.clamp(0.0, 1.0)
 
     @property
     def gain(self) -> Tensor:
@@ -343,7 +351,9 @@ def bounds_of(spec: TensorSpec, actions: Tensor) -> tuple[Tensor, Tensor, bool]:
         low, high = (bound.flatten().float().cpu() for bound in (spec.space.low, spec.space.high))
         if low.isfinite().all() and high.isfinite().all():
             return low, high, True
-    return actions.amin(0), actions.amax(0), False
+    odd = len(actions) // 200  # such as a spike of a sensor
+    low, high = (actions.kthvalue(k, 0).values for k in (1 + odd, len(actions) - odd))
+    return low, high, False
 
 
 def _spread(

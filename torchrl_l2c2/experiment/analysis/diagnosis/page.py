@@ -114,6 +114,8 @@ def _measures(diagnoses: Sequence[Diagnosis]) -> Table:
         for measure, name in MEASURES.items()
         if any(measure in one.measures for one in diagnoses)
     ]
+    largest = ["largest change in one step", *map(_largest_change, diagnoses)]
+    rows.append(largest)
     note = (
         "Smaller is smoother, except for the return and the gain on the action before, where 1 is "
         "smooth. Definitions and units: torchrl_l2c2.metrics."
@@ -136,12 +138,18 @@ def _measures(diagnoses: Sequence[Diagnosis]) -> Table:
         )
         rows += [list(row) for row in zip(names, *of_policy, strict=True)]
         note += (
-            " Means over the test episodes with mean actions. The last three rows: the first "
+            " Means over the test episodes with mean actions. The last four rows: the first "
             "episode. Change by noise: root mean square change of the action by noise on "
             "observations with this standard deviation, and its square as a part of the mean "
             "squared change per step. Deviation of samples: in units of half the action's range."
         )
     return Table("Measures", ["", *(one.name for one in diagnoses)], rows, [note])
+
+
+def _largest_change(one: Diagnosis) -> str:
+    change = one.actions.diff(dim=0).abs()
+    step, number = divmod(int(change.argmax()), change.shape[1])
+    return f"{_number(change.max().item())} ({one.action_name(number)}, step {step + 1})"
 
 
 def _steepest(one: Diagnosis) -> Table:

@@ -14,11 +14,15 @@ from torchrl.data import Bounded, TensorSpec, Unbounded
 
 from torchrl_l2c2.experiment.analysis.diagnosis.measured import Diagnosis, bounds_of
 from torchrl_l2c2.experiment.errors import UserError
-from torchrl_l2c2.experiment.run.evaluation import LEAST_STEPS, measure
+from torchrl_l2c2.experiment.run.evaluation import measure
 from torchrl_l2c2.metrics import action_variation
 
+LEAST_STEPS = 20  # Shorter recordings do not show what shakes.
 TIME = "time"  # the column of seconds
-GAP = 1.5  # times the median time step: a longer one is a gap
+LIKELY = (1e-5, 1.0)  # seconds from one step to the next
+GAP = 2.5  # times the median time step: a longer one is a gap
+BEYOND = 0.5  # share of an action that may lie beyond its bounds, where a task would clip it
+EVEN = 0.9  # share of the actions that are repeated equally often, if a logger repeats them
 
 
 def diagnose_actions(
@@ -31,9 +35,12 @@ def diagnose_actions(
 ) -> Diagnosis:
     """Measures how recorded actions shake; why they do, only :func:`~.measured.diagnose` can tell.
 
+    A logger that is faster than the policy repeats every action. Repetitions are then left out,
+    with a warning.
+
     Args:
         actions (Tensor): The actions of one recording without resets, ``[T, A]``, one row for each
-            control step, at least 4.
+            control step, at least 20.
 
     Keyword Args:
         name (str): name of the recording, for comparisons. Default ``"recording"``.
@@ -41,16 +48,16 @@ def diagnose_actions(
         bounds (tuple of float, optional): lower and upper bound of all actions. Shares in the
             findings are relative to their distance. Default: none; then every action's own span
             takes its place, and no action is said to be at its bounds.
-        rate (float, optional): control steps per second, greater than 0, for frequencies in hertz.
-            Default: cycles per step.
+        rate (float, optional): rows per second, greater than 0, for frequencies in hertz. Default:
+            shares of the control rate.
 
     Returns:
         Diagnosis: The input of :func:`~.words.findings` and :func:`~.page.write_page`, without
         everything that needs the policy or its observations.
 
     Raises:
-        ValueError: the shape, the bounds, the rate or the number of names is wrong, or an action is
-            not finite.
+        ValueError: the shape, the bounds, the rate or the number of names is wrong, an action is
+            not finite, or most of an action lies beyond the bounds.
 
     Examples:
         >>> flips = torch.tensor([[1.0], [-1.0]]).repeat(50, 1)
@@ -75,19 +82,29 @@ def diagnose_actions(
         raise UserError(f"rate must be a number of steps per second above 0, got {rate}.")
     actions = actions.detach().float().cpu()
     if not actions.isfinite().all():
-        step = int((~actions.isfinite()).any(1).nonzero()[0])
-        raise UserError(f"{name}: actions must be finite, got {actions[step].tolist()} at {step}.")
+        row = int((~actions.isfinite()).any(1).nonzero()[0])
+        raise UserError(
+            f"{name}: actions must be finite, got {actions[row].tolist()} in row {row}: leave such "
+            "rows out."
+        )
+    actions, repeated = _without_repetitions(actions)
+    if repeated > 1:
+        rate = rate and rate / repeated
+        warnings.warn(
+            f"{name} has every action {repeated} times, as of a logger that is faster than the "
+            f"policy: one row of {repeated} is kept.",
+            stacklevel=2,
+        )
     shape = actions.shape[1:]
     spec: TensorSpec = Unbounded(shape) if bounds is None else Bounded(*bounds, shape)
     low, high, bounded = bounds_of(spec, actions)
-    measures = {
-        "length": float(len(actions)),
-        "action_variation": action_variation(actions).item(),
-        **measure(actions, spec),
-    }
-    return Diagnosis(
+    found = Diagnosis(
         name=name,
-        measures=measures,
+        measures={
+            "length": float(len(actions)),
+            "action_variation": action_variation(actions).item(),
+            **measure(actions, spec),
+        },
         actions=actions,
         low=low,
         high=high,
@@ -95,68 +112,134 @@ def diagnose_actions(
         action_names=tuple(action_names),
         rate=rate,
     )
+    if bounded:
+        _check_bounds(found)
+    return found
 
 
 def diagnose_recording(
-    path: str | Path, *, name: str | None = None, bounds: tuple[float, float] | None = None
+    path: str | Path,
+    *,
+    name: str | None = None,
+    columns: Sequence[str] | None = None,
+    bounds: tuple[float, float] | None = None,
 ) -> Diagnosis:
     """Measures the actions in a CSV file: a column for each action, a row for each control step.
 
-    The first line names the columns. A column ``time``, in seconds, is no action: it gives the
-    rate.
+    The first line names the columns, which are separated by commas, semicolons or tabs. A column
+    ``time``, in seconds, is no action: it gives the rate.
 
     Args:
         path (str or Path): The file.
 
     Keyword Args:
         name (str, optional): Name of the recording. Default: the file.
+        columns (sequence of str, optional): The columns that are actions. Default: all but
+            ``time``.
         bounds (tuple of float, optional): As for :func:`diagnose_actions`.
 
     Raises:
         ValueError: the file is no such table; the message names the line.
         OSError: the file cannot be read.
     """
-    columns, rows = _read(Path(path))
-    table = torch.tensor(rows, dtype=torch.float64).reshape(len(rows), len(columns))
+    path = Path(path)
+    header, lines = _read(path)
+    chosen = [each for each in header if each != TIME] if columns is None else list(columns)
+    if missing := [each for each in chosen if each not in header]:
+        raise UserError(f"{path} has no column {missing[0]!r}: choose from {', '.join(header)}.")
+    actions = {each: _numbers(path, header.index(each), each, lines) for each in chosen}
+    for each, values in actions.items():
+        if columns is None and len(values) >= LEAST_STEPS and (values.diff() > 0.0).all():
+            raise UserError(
+                f"{path}: {each!r} increases in every row, which no action does. If it is the time "
+                f"in seconds, name it {TIME!r}; otherwise leave it out, or name the actions with "
+                "--columns."
+            )
     rate = None
-    if TIME in columns:
-        place = columns.index(TIME)
-        rate = _rate(table[:, place], str(path))
-        others = [number for number in range(len(columns)) if number != place]
-        columns, table = [columns[number] for number in others], table[:, others]
+    if TIME in header:
+        rate = _rate(_numbers(path, header.index(TIME), TIME, lines), path, lines)
+    table = torch.stack(list(actions.values()), 1) if actions else torch.empty(len(lines), 0)
     return diagnose_actions(
-        table, name=name or str(path), action_names=columns, bounds=bounds, rate=rate
+        table, name=name or str(path), action_names=chosen, bounds=bounds, rate=rate
     )
 
 
-def _read(path: Path) -> tuple[list[str], list[list[float]]]:
-    """The names of the columns, and the rows."""
+def _without_repetitions(actions: Tensor) -> tuple[Tensor, int]:
+    """Actions of which each is kept once if all are repeated equally often, and how often."""
+    starts = torch.cat(
+        (torch.zeros(1, dtype=torch.long), (actions.diff(dim=0) != 0).any(1).nonzero()[:, 0] + 1)
+    )
+    lengths = torch.cat((starts, torch.tensor([len(actions)]))).diff()
+    often = int(lengths.median())
+    # An action may be held for several steps, and a step may take a row more or less.
+    held = (lengths / often).round()
+    even = ((lengths - held * often).abs() <= often / 10).float().mean()
+    if often < 2 or len(starts) < LEAST_STEPS or even < EVEN:
+        return actions, 1
+    return actions[starts].repeat_interleave(held.long().clamp_min(1), 0), often
+
+
+def _check_bounds(found: Diagnosis) -> None:
+    relative = found.relative
+    beyond = ((relative < 0.0) | (relative > 1.0)).float().mean(0)
+    most = int(beyond.argmax())
+    if beyond[most] > BEYOND:
+        raise UserError(
+            f"{found.name}: {beyond[most]:.0%} of {found.action_name(most)} lies beyond the bounds "
+            f"{found.low[most]:g} and {found.high[most]:g}, as {found.actions[:, most].max():g}: "
+            "give bounds in the actions' units."
+        )
+
+
+def _read(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """The names of the columns, and the number and the cells of each line with content."""
     with path.open(newline="", encoding="utf-8-sig") as file:
-        lines = csv.reader(file)
         try:
-            columns = [cell.strip() for cell in next(lines, [])]
-            _check_names(columns, path)
-            rows = []
-            for cells in filter(None, lines):
-                rows.append([number for cell in cells if (number := _number(cell)) is not None])
-                if len(rows[-1]) != len(columns) or len(cells) != len(columns):
-                    raise UserError(
-                        f"{path}, line {lines.line_num}: expected {len(columns)} numbers, got "
-                        f"{cells}."
-                    )
+            first = file.readline()
+            separator = max(",;\t", key=first.count)
+            (header,) = csv.reader([first], delimiter=separator)
+            names = [cell.strip().lstrip("# ") for cell in header]
+            _check_names(names, path)
+            rest = csv.reader(file, delimiter=separator)
+            lines = [(rest.line_num + 1, cells) for cells in rest if cells]
         except (csv.Error, UnicodeDecodeError) as error:
             raise UserError(f"{path} is not a CSV file of numbers: {error}.") from error
-    return columns, rows
+    for number, cells in lines:
+        if len(cells) != len(names):
+            raise UserError(
+                f"{path}, line {number}: expected {len(names)} cells as in the first line, got "
+                f"{len(cells)}."
+            )
+    return names, lines
 
 
-def _check_names(columns: list[str], path: Path) -> None:
-    numbers = all(_number(name) is not None for name in columns)
-    if numbers or "" in columns or len(set(columns)) < len(columns):
+def _check_names(names: list[str], path: Path) -> None:
+    if not any(names) or all(_number(name) is not None for name in names):
         raise UserError(
-            f"{path}, line 1: expected a different name for each action, got {columns}. For "
-            "example, np.savetxt(file, actions, delimiter=',', header='hip,knee', comments='') "
-            "writes them."
+            f"{path}, line 1: expected the names of the columns, got {names[:4]}. For example, "
+            "np.savetxt(file, actions, delimiter=',', header='hip,knee', comments='') writes them."
         )
+    if "" in names:
+        raise UserError(
+            f"{path}, line 1: column {names.index('') + 1} has no name. If it is the index of a "
+            "DataFrame, write the file with to_csv(file, index=False)."
+        )
+    if double := [name for name in names if names.count(name) > 1]:
+        raise UserError(f"{path}, line 1: several columns are named {double[0]!r}: rename them.")
+
+
+def _numbers(path: Path, place: int, name: str, lines: Sequence[tuple[int, list[str]]]) -> Tensor:
+    """The numbers of a column."""
+    values = []
+    for number, cells in lines:
+        value = _number(cells[place])
+        if value is None or not math.isfinite(value):
+            raise UserError(
+                f"{path}, line {number}: {name!r} must be a finite number, got {cells[place]!r}: "
+                "leave such lines out, or choose other columns with --columns."
+            )
+        values.append(value)
+    return torch.tensor(values, dtype=torch.float64)
 
 
 def _number(text: str) -> float | None:
@@ -166,16 +249,28 @@ def _number(text: str) -> float | None:
         return None
 
 
-def _rate(seconds: Tensor, name: str) -> float:
+def _rate(seconds: Tensor, path: Path, lines: Sequence[tuple[int, list[str]]]) -> float | None:
+    """Rows per second."""
     steps = seconds.diff()
-    if not len(steps) or not bool((steps > 0.0).all()):
-        raise UserError(f"{name}: the column {TIME!r} must increase, in seconds.")
-    median = steps.median()
-    gaps = steps > GAP * median
-    if gaps.any():
+    if not len(steps):
+        return None
+    if (back := (steps <= 0.0).nonzero()).numel():
+        raise UserError(
+            f"{path}, line {lines[int(back[0]) + 1][0]}: the column {TIME!r} must increase from "
+            "line to line. If an episode begins here, write a file for each episode."
+        )
+    median = steps.median().item()
+    if not LIKELY[0] <= median <= LIKELY[1]:
+        raise UserError(
+            f"{path}: the column {TIME!r} must be in seconds, got steps of {median:g}: divide it, "
+            "for example by 1e9 if it has nanoseconds."
+        )
+    gaps = (steps > GAP * median).nonzero()[:, 0]
+    if len(gaps):
         warnings.warn(
-            f"the column {TIME!r} of {name} has gaps ({int(gaps.sum())}, the first after row "
-            f"{int(gaps.nonzero()[0]) + 1}): the measures treat all steps as equally long.",
+            f"the column {TIME!r} of {path} has gaps ({len(gaps)}, the first before line "
+            f"{lines[int(gaps[0]) + 1][0]}, the longest of {steps.max():.3g} s): the measures "
+            "treat all steps as equally long.",
             stacklevel=3,
         )
-    return 1.0 / median.item()
+    return 1.0 / median

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from torchrl_l2c2.experiment.analysis.diagnosis.measured import Diagnosis
@@ -18,10 +19,9 @@ THRESHOLDS = {
     "BANG_BANG": (0.5, "smallest share of steps at the bounds of a bang-bang or pinned action"),
     "EITHER_BOUND": (0.05, "smallest share of steps at each bound of a bang-bang action"),
     "ROUGH": (0.2, "smallest roughness of an action that moves like noise; white noise has 0.25"),
-    "CHATTERS": (
-        0.5,
-        "smallest share of steps in which an action that chatters turns back",
-    ),
+    "CHATTERS": (0.012, "smallest median size of the fast part of an action that chatters"),
+    "FAST": (0.25, "lower end of the fast part's frequencies, in cycles per step, or"),
+    "FAST_HERTZ": (8.0, "the same in hertz, if the rate is known and this is lower"),
     "SMOOTH": (0.02, "largest mean change per step of a smooth policy, of the action's range"),
     "NOISY": (
         0.5,
@@ -41,6 +41,11 @@ THRESHOLDS = {
 def threshold(name: str) -> float:
     """The value of a threshold."""
     return THRESHOLDS[name][0]
+
+
+PARTS = 20  # of an episode in which an action may chatter
+PERIODS = 4  # of the slowest of the fast frequencies, at least, in a part
+TAIL = 1.4  # times the peak's height: a higher spectrum just below it is of a slower movement
 
 
 @dataclass(frozen=True)
@@ -101,6 +106,8 @@ def comparison(diagnoses: Sequence[Diagnosis]) -> list[str]:
 
 
 def _compared(first: Diagnosis, other: Diagnosis) -> str:
+    if (first.is_recording or other.is_recording) and (reason := _unlike_kind(first, other)):
+        return f"{other.name} and {first.name} do not compare: {reason}."
     before, now = (one.measures["action_variation"] for one in (first, other))
     ratio = now / before if before > 0.0 else math.inf if now > 0.0 else 1.0
     if ratio > 2.0:
@@ -116,6 +123,19 @@ def _compared(first: Diagnosis, other: Diagnosis) -> str:
         f"{text}, and its return is "
         f"{'higher' if new > old else 'lower' if new < old else 'the same'} ({new:.4g}, {old:.4g})."
     )
+
+
+def _unlike_kind(first: Diagnosis, other: Diagnosis) -> str:
+    """Why changes per step of two recordings, or of a recording and a run, do not compare."""
+    ours, theirs = other.actions.shape[1], first.actions.shape[1]
+    if ours != theirs:
+        return f"they have {ours} and {theirs} actions"
+    if first.action_names and other.action_names and first.action_names != other.action_names:
+        return "their actions have other names"
+    rate, before = other.rate or math.nan, first.rate or math.nan
+    if abs(rate - before) > 0.05 * before:
+        return f"their steps have {rate:.3g} and {before:.3g} Hz"
+    return ""
 
 
 def _unlike(diagnosis: Diagnosis) -> Iterator[Finding]:
@@ -135,16 +155,17 @@ def _unlike(diagnosis: Diagnosis) -> Iterator[Finding]:
 
 
 def _actions(diagnosis: Diagnosis) -> Iterator[Finding]:
-    """Findings about each action dimension that moves."""
-    for number, action in enumerate(diagnosis.relative.split(1, 1)):
+    """Findings about each action dimension that moves, by the size of its changes."""
+    changes = diagnosis.relative.diff(dim=0).abs().mean(0)
+    for number in changes.argsort(descending=True).tolist():
+        action = diagnosis.relative[:, number : number + 1]
         if action.std() <= threshold("STILL"):
             continue
-        name, change = diagnosis.action_name(number), _change(action)
-        at_bounds = saturation(action, 0.0, 1.0).item()
-        if diagnosis.bounded and at_bounds >= threshold("BANG_BANG"):
+        name, change = diagnosis.action_name(number), changes[number].item()
+        at_bounds = diagnosis.bounded and saturation(action, 0.0, 1.0).item()
+        if at_bounds >= threshold("BANG_BANG"):
             yield _at_bounds(name, action, at_bounds)
         gain, rough = previous_action_gain(action).item(), roughness(action).item()
-        turns = _turns(action).mean().item()
         if gain <= threshold("FLIPS"):
             yield _flips(name, action, gain, diagnosis.rate)
         elif rough >= threshold("ROUGH") and change > threshold("SMOOTH"):
@@ -154,15 +175,54 @@ def _actions(diagnosis: Diagnosis) -> Iterator[Finding]:
                 f"{_where(action.diff(dim=0).abs())}."
             )
             yield Finding("rough", text)
-        elif turns >= threshold("CHATTERS") and change > threshold("SMOOTH"):
-            rate = diagnosis.rate
-            speed = "" if rate is None else f", which is shaking at about {turns * rate / 2:.3g} Hz"
-            text = (
-                f"{name} chatters around a slower movement{speed}: it turns back in {turns:.0%} of "
-                f"the steps (white noise in 67%), and changes by {change:.1%} of its range per "
-                f"step, {_where(action.diff(dim=0).abs())}."
-            )
-            yield Finding("chatters", text)
+        elif at_bounds < threshold("BANG_BANG"):
+            yield from _chatters(name, action.squeeze(1), diagnosis.rate)
+
+
+def _chatters(name: str, action: Tensor, rate: float | None) -> Iterator[Finding]:
+    """Finding about fast movement around a slower one, in the whole episode or in a part of it."""
+    above = threshold("FAST")
+    if rate is not None:
+        above = min(above, threshold("FAST_HERTZ") / rate)
+    spectrum = torch.fft.rfft(action - action.mean())
+    spectrum[: math.ceil(above * len(action))] = 0.0
+    fast = torch.fft.irfft(spectrum, len(action))
+    length = max(-(-len(action) // PARTS), math.ceil(PERIODS / above))
+    starts = range(0, len(action) - length + 1, length)
+    places = [slice(0, len(action)), *(slice(start, start + length) for start in starts)]
+    sizes = [fast[place].abs().median().item() for place in places]
+    # The whole episode goes before its parts.
+    most = 0 if sizes[0] >= threshold("CHATTERS") else max(range(len(sizes)), key=sizes.__getitem__)
+    found = action[places[most]]
+    peak = _peak(found, above)
+    if sizes[most] < threshold("CHATTERS") or peak is None:
+        return
+    speed = f"{peak:.2g} of the control rate" if rate is None else f"{peak * rate:.3g} Hz"
+    size = fast[places[most]].square().mean().sqrt()
+    place = places[most]
+    text = (
+        f"{name} chatters around a slower movement, which is shaking at about {speed}: its fast "
+        f"part moves by {size:.1%} of its range (root mean square), "
+        + (f"in steps {place.start} to {place.stop - 1}." if most else "throughout the episode.")
+    )
+    yield Finding("chatters", text)
+
+
+def _peak(action: Tensor, above: float) -> float | None:
+    """The strongest of the fast frequencies, in cycles per step.
+
+    ``None`` if it belongs to the tail of a slower movement's spectrum, such as a jump's.
+    """
+    if len(action) * above < PERIODS:
+        return None
+    window = torch.hann_window(len(action), dtype=action.dtype)
+    heights = torch.fft.rfft((action - action.mean()) * window).abs()
+    first = math.ceil(above * len(action))
+    peak = first + int(heights[first:].argmax())
+    slower = heights[peak // 3 : peak - 2]
+    if len(slower) and slower.max() > TAIL * heights[peak]:
+        return None
+    return peak / len(action)
 
 
 def _at_bounds(name: str, action: Tensor, share: float) -> Finding:
@@ -175,21 +235,25 @@ def _at_bounds(name: str, action: Tensor, share: float) -> Finding:
         )
         return Finding("pinned", text)
     jumps = action.diff(dim=0).abs() > 0.5
-    every = f", one in {len(action) / max(1, int(jumps.sum())):.0f} steps" if jumps.any() else ""
+    if not jumps.any():
+        text = f"{name} is pinned at its bounds in {share:.0%} of the steps: wider bounds may help."
+        return Finding("pinned", text)
     text = (
         f"{name} is bang-bang: it is at its bounds in {share:.0%} of the steps and jumps over more "
-        f"than half of its range {int(jumps.sum())} times{every}, {_where(jumps.float())}."
+        f"than half of its range {int(jumps.sum())} times, one in "
+        f"{len(action) / int(jumps.sum()):.0f} steps, {_where(jumps.float())}."
     )
     return Finding("bang-bang", text)
 
 
 def _flips(name: str, action: Tensor, gain: float, rate: float | None) -> Finding:
-    back, change = _turns(action), action.diff(dim=0).abs()
+    change = action.diff(dim=0)
+    back = (change[1:] * change[:-1] < 0).float()
     speed = "half the control rate" if rate is None else f"{rate / 2:.3g} Hz, half the control rate"
     text = (
         f"{name} flips from step to step, which is shaking at {speed}: its gain on the previous "
         f"action is {gain:.2f}, and it turns back in {back.mean():.0%} of the steps, by "
-        f"{_change(action):.1%} of its range on average; {_where(back * change[1:])}."
+        f"{_change(action):.1%} of its range on average; {_where(back * change[1:].abs())}."
     )
     return Finding("flips", text)
 
@@ -210,7 +274,7 @@ def _steepest(diagnosis: Diagnosis) -> Iterator[Finding]:
 
 def _reasons(diagnosis: Diagnosis) -> Iterator[Finding]:
     """Causes of the movement."""
-    shaking = _change(diagnosis.relative) > threshold("SMOOTH")
+    shaking = diagnosis.relative.diff(dim=0).abs().mean(0).max() > threshold("SMOOTH")
     if shaking and diagnosis.noise_share >= threshold("NOISY"):
         text = (
             f"It is sensitive to noise on its observations: noise of {diagnosis.noise_scale:.2g} "
@@ -263,26 +327,24 @@ def _training(diagnosis: Diagnosis) -> Iterator[Finding]:
 
 def _movement(diagnosis: Diagnosis) -> Finding:
     """Finding about a policy whose actions have no fault."""
-    change = _change(diagnosis.relative)
+    changes = diagnosis.relative.diff(dim=0).abs().mean(0)
+    change, most = changes.max().item(), int(changes.argmax())
     place = "" if diagnosis.is_recording else "in the first episode "
+    which = "the action changes" if len(changes) == 1 else f"{diagnosis.action_name(most)} changes"
+    most_of_all = "" if len(changes) == 1 else "most, "
     numbers = (
-        f"{place}the action changes by {change:.1%} of its range per step, and its "
-        f"gain on the previous action is {diagnosis.measures['previous_action_gain']:.2f}"
+        f"{place}{which} {most_of_all}by {change:.1%} of its range per step, and its gain on the "
+        f"previous action is {diagnosis.measures['previous_action_gain']:.2f}"
     )
     if change <= threshold("SMOOTH"):
         return Finding("smooth", f"It is smooth: {numbers}.", fault=False)
-    where = _where(diagnosis.relative.diff(dim=0).abs().mean(1, keepdim=True))
+    where = _where(diagnosis.relative[:, most : most + 1].diff(dim=0).abs())
+    faults = ["flip", "chatter", *(["jump between its bounds"] if diagnosis.bounded else [])]
     text = (
-        "It moves much, but it does not flip, chatter, jump between its bounds or move like noise: "
-        f"{numbers}; the change is {where}."
+        f"It moves much, but it does not {', '.join(faults)} or move like noise: {numbers}; the "
+        f"change is {where}."
     )
     return Finding("moves", text, fault=False)
-
-
-def _turns(action: Tensor) -> Tensor:
-    """1 where a change has the other sign than the one before, and 0 elsewhere, ``[T - 2, A]``."""
-    change = action.diff(dim=0)
-    return (change[1:] * change[:-1] < 0).float()
 
 
 def _change(relative: Tensor) -> float:
