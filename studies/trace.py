@@ -1,7 +1,7 @@
-"""One joint's action over time, of a baseline and of a policy trained with L2C2.
+"""The action of Walker2d's busiest joint, of a baseline and of a policy trained with L2C2.
 
 ``python -m studies.trace BASELINE L2C2 PICTURE`` plays a test episode of each run and writes the
-picture of the README.
+picture of the README. It shows of each policy the joint that changes most.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torchrl_l2c2.experiment.collect.episodes import play_episodes
 from torchrl_l2c2.experiment.run.policies import load_policy, seed_of_test
 from torchrl_l2c2.experiment.run.process import ProcessState
 
-JOINT = 0  # Hopper's thigh
+JOINTS = ("right hip", "right knee", "right foot", "left hip", "left knee", "left foot")
 STEPS = slice(400, 600)
 COLORS = ("#c44e52", "#1f6fb4")
 
@@ -33,7 +33,7 @@ def actions_of(run: str | Path) -> np.ndarray:
 
 
 def draw(actions: Sequence[np.ndarray], names: Sequence[str], path: str | Path) -> None:
-    """Draws a joint's action, one row for each policy, with letters as outlines.
+    """Draws the joint that changes most, one row for each policy.
 
     Args:
         actions (sequence of array): Actions ``[T, A]`` of each policy.
@@ -43,11 +43,14 @@ def draw(actions: Sequence[np.ndarray], names: Sequence[str], path: str | Path) 
     figure, axes = subplots(1, len(actions), (9.0, 1.6 * len(actions)))
     figure.set_facecolor("white")
     for axis, each, name, color in zip(axes, actions, names, COLORS, strict=True):
-        shown = each[STEPS, JOINT]
+        joint = int(np.abs(np.diff(each, axis=0)).mean(0).argmax())
+        shown = each[STEPS, joint]
         change = np.abs(np.diff(shown)).mean()
         axis.plot(np.arange(STEPS.start, STEPS.start + len(shown)), shown, color=color)
         axis.set(ylim=(-1.1, 1.1), ylabel="action", xlim=(STEPS.start, STEPS.stop - 1))
-        axis.set_title(f"{name}: mean change per step {change:.2f}", loc="left", fontsize=11)
+        axis.set_title(
+            f"{name}, {JOINTS[joint]}: mean change per step {change:.2f}", loc="left", fontsize=11
+        )
         axis.grid(alpha=0.25)
     axes[-1].set_xlabel("step")
     save(figure, path)

@@ -176,8 +176,27 @@ def test_page_and_picture_are_of_the_records():
     assert f"{noisy['return'] / plain['return'] - 1:.0%} below the baseline's" in page
     assert ours["action_variation"] < 0.5 * plain["action_variation"]
     hopper, noisy = means.loc["hopper_v5", "as trained"], means.loc["hopper_v5", "noise"]
-    returns = [hopper.loc[name, "return"] for name in ("baseline", "baseline, filter 0.1")]
-    assert "most of its return ({:.0f} to {:.0f})".format(*returns) in page
+    walker, walker_noisy = (means.loc["walker2d_v5", each] for each in ("as trained", "noise"))
+    returns = [
+        task.loc[name, "return"]
+        for task in (hopper, walker)
+        for name in ("baseline", "baseline, filter 0.1")
+    ]
+    said = "most of their return ({:.0f} to {:.0f}, and {:.0f} to {:.0f})"
+    assert said.format(*returns) in page
+
+    def lowered(condition, name):
+        variation = means.loc["walker2d_v5", condition]["action_variation"]
+        return f"{1 - variation[name] / variation['baseline']:.0%}"
+
+    ours = lowered("as trained", "L2C2"), lowered("noise", "L2C2")
+    said = "on Walker2d the actions vary {} less than the baseline's, and with sensor noise {} less"
+    assert said.format(*ours) in page
+    rewarded = [lowered(each, "action-rate reward 0.1") for each in ("as trained", "delay")]
+    assert f"Walker2d by only {rewarded[0]}, where L2C2 reaches {ours[0]}, and" in page
+    assert "as trained and with a delay, by {} and {}, and".format(*rewarded) in page
+    weak = walker_noisy.loc["baseline, filter 0.3"] / walker_noisy.loc["L2C2"]
+    assert f"on Hopper, and {weak['action_variation']:.1f} times on Walker2d" in page
     less, noisy_less = (1 - each.loc["L2C2"] / each.loc["baseline"] for each in (hopper, noisy))
     variation = "vary {:.0%} less than the baseline's, and with sensor noise {:.0%} less"
     assert variation.format(less["action_variation"], noisy_less["action_variation"]) in page
@@ -186,10 +205,30 @@ def test_page_and_picture_are_of_the_records():
     assert "(means {:.3f}, {:.3f} and {:.3f})".format(*rough) in page
     weak = noisy.loc["baseline, filter 0.3", "action_variation"]
     assert weak / rough[0] == pytest.approx(2.0, abs=0.1)
-    assert f"by {less['action_variation']:.0%} at a return" in (ROOT / "docs/robots.md").read_text()
+    robots = " ".join((ROOT / "docs" / "robots.md").read_text().split())
+    assert f"by {less['action_variation']:.0%} and {ours[0]} at a return" in robots
     lander = means.loc["lunarlander", "as trained"]
     filtered, baseline = lander.loc["baseline, filter 0.1"], lander.loc["baseline"]
     assert 0.6 < filtered["action_variation"] / baseline["action_variation"] < 0.7
     assert filtered["return"] > baseline["return"]
     for rougher in ("L2C2", "action-rate reward 0.1", "action-rate reward 1"):
         assert lander.loc[rougher, "action_variation"] > baseline["action_variation"]
+
+
+def test_the_readmes_picture_is_of_the_median_baseline():
+    """Of Walker2d as trained, by action variation; its caption has the recorded returns."""
+    found = deployments.read(deployments.PAGE.with_suffix(".csv"))
+    found = found[(found["task"] == "walker2d_v5") & (found["condition"] == "as trained")]
+    runs = {
+        name: found[found["deployment"] == name].set_index("seed") for name in ("baseline", "L2C2")
+    }
+    variation = runs["baseline"]["action_variation"]
+    (seed,) = variation.index[variation == variation.median()]
+    own, means = ([run["return"][each] for run in runs.values()] for each in (seed, range(5)))
+    readme = " ".join((ROOT / "README.md").read_text().split())
+    assert "PPO returns {:.0f} on average, with L2C2 {:.0f}".format(*own) in readme
+    assert "the mean returns are {:.0f} and {:.0f}".format(*(m.mean() for m in means)) in readme
+    page = " ".join((ROOT / "docs" / "results.md").read_text().split())
+    assert f"Walker2d with PPO, seed {seed}, commit" in page
+    smooth = runs["L2C2"]["action_variation"][seed]
+    assert f"{variation[seed]:.3f} over 10 test episodes. L2C2 has {smooth:.3f} with" in page

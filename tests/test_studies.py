@@ -967,17 +967,17 @@ class TestStrength:
 
 
 class TestTrace:
-    def test_a_row_shows_one_joint_and_its_mean_change(self, tmp_path):
+    def test_a_row_shows_the_busiest_joint_and_its_mean_change(self, tmp_path):
         """By hand: from -1 to 1 and back is a change of 2 per step; a constant has none."""
         steps = np.arange(700)
-        shaking = np.stack([(-1.0) ** steps, 0.0 * steps], 1)
-        still = np.stack([0.0 * steps, (-1.0) ** steps], 1)
+        shaking = np.stack([0.0 * steps, (-1.0) ** steps], 1)
+        still = np.stack([0.0 * steps, 0.0 * steps], 1)
         for path in (tmp_path / "one.svg", tmp_path / "two.svg"):
             trace.draw([shaking, still], ["PPO", "PPO with L2C2"], path)
         content = (tmp_path / "one.svg").read_text()
         assert content == (tmp_path / "two.svg").read_text()
-        assert "<!-- PPO: mean change per step 2.00 -->" in content
-        assert "<!-- PPO with L2C2: mean change per step 0.00 -->" in content
+        assert "<!-- PPO, right knee: mean change per step 2.00 -->" in content
+        assert "<!-- PPO with L2C2, right hip: mean change per step 0.00 -->" in content
 
     def test_two_runs_are_played_and_drawn(self, tmp_path):
         """The actions are those of the first test episode."""
