@@ -703,6 +703,12 @@ def test_the_runners_iterations_are_the_ramp(monkeypatch: pytest.MonkeyPatch) ->
     assert "max_iterations" not in config["algorithm"] and config["max_iterations"] == 20
 
 
+def test_a_setting_beside_the_class_name_is_told_its_place() -> None:
+    """rsl_rl's own message does not name it."""
+    with pytest.raises(TypeError, match=r"as in \{'regularizer_cfg': \{'strength': 2.0\}\}"):
+        make(rsl.L2C2PPO, strength=2.0)
+
+
 def test_settings_beside_the_algorithm_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """rsl_rl would train without them."""
     monkeypatch.syspath_prepend(EXAMPLE.parent)

@@ -77,6 +77,12 @@ class RegularizedPPO(PPO):
         max_iterations: int | None = None,
         **kwargs: Any,
     ) -> None:
+        for unknown in kwargs.keys() - signature(PPO.__init__).parameters.keys():
+            place = {"regularizer_cfg": {unknown: kwargs[unknown]}}
+            raise TypeError(
+                f"{unknown!r} is no argument of rsl_rl's PPO. A setting of the regularizer belongs "
+                f"in regularizer_cfg, as in {place}."
+            )
         networks = ActorCriticLoss(actor, critic)
         _check_groups(storage.observations.keys(), (*ENTRIES, ROW, "next"))
         super().__init__(actor, critic, SuccessorStorage(storage), *args, **kwargs)
