@@ -87,16 +87,15 @@ def _actions(axes: Sequence[Any], one: Diagnosis) -> None:
     sums = change.unfold(0, min(ZOOM, len(change)), 1).sum(1)
     start = int(sums.argmax())
     end = min(start + ZOOM, len(one.actions) - 1)
+    # Without common bounds, a joint with a small span would be a flat line beside a large one.
+    shown = one.actions if one.bounded else one.relative
     for axis, marker in zip(axes, (None, "."), strict=True):
         for place, number in enumerate(busiest(one)):
-            steps = range(len(one.actions))
-            axis.plot(
-                steps, one.actions[:, number].numpy(), marker=marker, **_line(place, number, one)
-            )
+            axis.plot(shown[:, number].numpy(), marker=marker, **_line(place, number, one))
         if one.bounded:
             for bound in {*one.low.tolist(), *one.high.tolist()}:
                 axis.axhline(bound, color="black", linewidth=0.6, linestyle=":")
-        axis.set_ylabel("action")
+        axis.set_ylabel("action" if one.bounded else "action, of its span")
     if end - start < len(one.actions) - 1:
         axes[0].axvspan(start, end, color=WORST, alpha=0.12, linewidth=0)
     axes[1].set_xlim(start, end)
