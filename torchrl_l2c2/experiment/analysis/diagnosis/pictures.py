@@ -87,7 +87,7 @@ def _actions(axes: Sequence[Any], one: Diagnosis) -> None:
     sums = change.unfold(0, min(ZOOM, len(change)), 1).sum(1)
     start = int(sums.argmax())
     end = min(start + ZOOM, len(one.actions) - 1)
-    # Without common bounds, a joint with a small span would be a flat line beside a large one.
+    # Without common bounds, a joint with a small span would be a flat line next to a large one.
     shown = one.actions if one.bounded else one.relative
     for axis, marker in zip(axes, (None, "."), strict=True):
         for place, number in enumerate(busiest(one)):
