@@ -195,6 +195,13 @@ def test_page_and_picture_are_of_the_records():
     rewarded = [lowered(each, "action-rate reward 0.1") for each in ("as trained", "delay")]
     assert f"Walker2d by only {rewarded[0]}, where L2C2 reaches {ours[0]}, and" in page
     assert "as trained and with a delay, by {} and {}, and".format(*rewarded) in page
+    plain, large, smooth = (walker.loc[n] for n in ("baseline", "action-rate reward 1", "L2C2"))
+    said = "(action variation {:.3f} and {:.3f}), at {:.0%} less return"
+    lost = 1 - large["return"] / plain["return"]
+    assert said.format(large["action_variation"], smooth["action_variation"], lost) in page
+    returns = means.loc[:, "as trained", :]["return"].unstack("deployment")
+    lost = returns["baseline"] - returns["action-rate reward 1"]
+    assert (lost > 0.5 * returns["baseline"].abs()).all()
     weak = walker_noisy.loc["baseline, filter 0.3"] / walker_noisy.loc["L2C2"]
     assert f"on Hopper, and {weak['action_variation']:.1f} times on Walker2d" in page
     less, noisy_less = (1 - each.loc["L2C2"] / each.loc["baseline"] for each in (hopper, noisy))
