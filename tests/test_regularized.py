@@ -35,6 +35,7 @@ from tensordict.nn import (
     ProbabilisticTensorDictSequential,
     TensorDictModule,
     TensorDictSequential,
+    set_composite_lp_aggregate,
 )
 from torch import nn
 from torchrl.data import Bounded
@@ -649,6 +650,15 @@ class TestWhatIsRefused:
         with pytest.raises(TypeError, match="join several heads in one CompositeDistribution"):
             L2C2Loss(loss)
         assert L2C2Loss(PPOLoss(composite_actor(), critic()))
+
+    def test_a_loss_whose_keys_cannot_be_read_is_told_what_to_do(self):
+        """A2C takes the actions of a composite policy as a list, which TorchRL hashes."""
+        with set_composite_lp_aggregate(False):
+            base = A2CLoss(composite_actor(), critic(), entropy_bonus=False)
+            with pytest.raises(TypeError, match=r"in_keys of A2CLoss cannot be read .*set_keys"):
+                L2C2Loss(base)
+            base.set_keys(action="move", sample_log_prob="move_log_prob")
+            assert L2C2Loss(base)
 
 
 class TestNetworks:

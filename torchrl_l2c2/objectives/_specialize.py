@@ -218,7 +218,13 @@ def _adopt(self: SpecializedLoss, base_loss: LossModule) -> None:
     original = weakref.ref(base_loss), copy.copy(base_loss.tensor_keys), estimator
     inner = _ORIGINALS.get(base_loss, []) if isinstance(base_loss, SpecializedLoss) else []
     _ORIGINALS[self] = [original, *inner]
-    self.in_keys = getattr(base_loss, "in_keys", [])
+    try:
+        self.in_keys = getattr(base_loss, "in_keys", [])
+    except TypeError as error:  # Of A2CLoss with several actions.
+        raise TypeError(
+            f"the in_keys of {type(base_loss).__name__} cannot be read ({error}): call its "
+            "set_keys, such as set_keys(action=..., sample_log_prob=...), before it is wrapped."
+        ) from error
     self.out_keys = getattr(base_loss, "out_keys", [])
 
 
