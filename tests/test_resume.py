@@ -496,6 +496,10 @@ def test_metrics_that_another_program_has_saved_are_refused(tmp_path):
         with pytest.raises(ValueError, match="is not as it was at the checkpoint"):
             Experiment(config, tmp_path)
     metrics.write_bytes(content)
+    newest = list_checkpoints(tmp_path)[0]
+    state = load_checkpoint(newest)
+    del state["metrics_log"]["sha256"]  # as in an older checkpoint
+    save_checkpoint(tmp_path, int(newest.stem.split("_")[1]), state, keep=1)
     assert len(Experiment(config, tmp_path).train()) == 3
 
 

@@ -88,9 +88,10 @@ class MetricsLog:
             )
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the columns, and the size and the hash of the file."""
-        content = b"" if self.columns is None or self.path is None else self.path.read_bytes()
-        return {"columns": self.columns, "size": self._size, "sha256": _sha256(content)}
+        """Returns the columns, and the size and the hash of what was written."""
+        content = b"" if self.path is None or self.columns is None else self.path.read_bytes()
+        found = _sha256(content[: self._size])
+        return {"columns": self.columns, "size": self._size, "sha256": found}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restores a state and removes later lines from the file.
@@ -104,7 +105,9 @@ class MetricsLog:
         content = self.path.read_bytes() if self.path.exists() else b""
         written = content[: state["size"]]
         # Spreadsheet programs may change line ends or the format of numbers.
-        if len(written) < state["size"] or _sha256(written) != state["sha256"]:
+        found = _sha256(written)
+        # Older checkpoints have no hash.
+        if len(written) < state["size"] or found != state.get("sha256", found):
             raise UserError(
                 f"the beginning of {self.path} ({state['size']} bytes) is not as it was at the "
                 "checkpoint. Restore it, or choose another folder."
