@@ -212,6 +212,13 @@ class TestWords:
         found = re.search(r"in steps (\d+) to (\d+)", said(made_up(actions), "chatters").text)
         assert 700 <= int(found[1]) < int(found[2]) < 800
 
+    def test_the_end_of_an_episode_may_chatter(self):
+        """Also what is left if the parts do not fill it: 19 of 52 steps, and 42."""
+        steps = torch.arange(1030).unsqueeze(-1)
+        actions = 0.5 * torch.sin(2 * torch.pi * steps / 515)
+        actions[988:] += 0.06 * (-1.0) ** steps[988:]
+        assert said(made_up(actions), "chatters").text.endswith("in steps 978 to 1029.")
+
     @pytest.mark.parametrize("rate", [None, 50.0, 500.0])
     @pytest.mark.parametrize("shape", ["sine", "steps", "sawtooth", "clipped", "noisy"])
     def test_slow_movement_does_not_chatter(self, shape, rate):

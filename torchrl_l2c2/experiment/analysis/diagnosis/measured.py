@@ -346,7 +346,7 @@ def _means(played: Sequence[TensorDictBase], env: EnvBase) -> dict[str, float]:
 
 
 def bounds_of(spec: TensorSpec, actions: Tensor) -> tuple[Tensor, Tensor, bool]:
-    """Bounds of the task, or else of the played actions."""
+    """Bounds of the task, or else of the actions, but for one in 200 at either end."""
     if isinstance(spec, Bounded) and spec.dtype.is_floating_point:
         low, high = (bound.flatten().float().cpu() for bound in (spec.space.low, spec.space.high))
         if low.isfinite().all() and high.isfinite().all():

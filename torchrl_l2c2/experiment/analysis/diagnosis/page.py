@@ -114,8 +114,7 @@ def _measures(diagnoses: Sequence[Diagnosis]) -> Table:
         for measure, name in MEASURES.items()
         if any(measure in one.measures for one in diagnoses)
     ]
-    largest = ["largest change in one step", *map(_largest_change, diagnoses)]
-    rows.append(largest)
+    rows.append(["largest change in one step", *map(_largest_change, diagnoses)])
     note = (
         "Smaller is smoother, except for the return and the gain on the action before, where 1 is "
         "smooth. Definitions and units: torchrl_l2c2.metrics."

@@ -20,8 +20,8 @@ THRESHOLDS = {
     "EITHER_BOUND": (0.05, "smallest share of steps at each bound of a bang-bang action"),
     "ROUGH": (0.2, "smallest roughness of an action that moves like noise; white noise has 0.25"),
     "CHATTERS": (0.012, "smallest median size of the fast part of an action that chatters"),
-    "FAST": (0.25, "lower end of the fast part's frequencies, in cycles per step, or"),
-    "FAST_HERTZ": (8.0, "the same in hertz, if the rate is known and this is lower"),
+    "FAST": (0.25, "lowest frequency of the fast part, of the control rate"),
+    "FAST_HERTZ": (8.0, "lowest frequency of the fast part in hertz, if this is lower"),
     "SMOOTH": (0.02, "largest mean change per step of a smooth policy, of the action's range"),
     "NOISY": (
         0.5,
@@ -106,7 +106,7 @@ def comparison(diagnoses: Sequence[Diagnosis]) -> list[str]:
 
 
 def _compared(first: Diagnosis, other: Diagnosis) -> str:
-    if (first.is_recording or other.is_recording) and (reason := _unlike_kind(first, other)):
+    if (first.is_recording or other.is_recording) and (reason := _why_incomparable(first, other)):
         return f"{other.name} and {first.name} do not compare: {reason}."
     before, now = (one.measures["action_variation"] for one in (first, other))
     ratio = now / before if before > 0.0 else math.inf if now > 0.0 else 1.0
@@ -125,7 +125,7 @@ def _compared(first: Diagnosis, other: Diagnosis) -> str:
     )
 
 
-def _unlike_kind(first: Diagnosis, other: Diagnosis) -> str:
+def _why_incomparable(first: Diagnosis, other: Diagnosis) -> str:
     """Why changes per step of two recordings, or of a recording and a run, do not compare."""
     ours, theirs = other.actions.shape[1], first.actions.shape[1]
     if ours != theirs:
@@ -156,13 +156,14 @@ def _unlike(diagnosis: Diagnosis) -> Iterator[Finding]:
 
 def _actions(diagnosis: Diagnosis) -> Iterator[Finding]:
     """Findings about each action dimension that moves, by the size of its changes."""
-    changes = diagnosis.relative.diff(dim=0).abs().mean(0)
+    relative = diagnosis.relative
+    changes = relative.diff(dim=0).abs().mean(0)
     for number in changes.argsort(descending=True).tolist():
-        action = diagnosis.relative[:, number : number + 1]
+        action = relative[:, number : number + 1]
         if action.std() <= threshold("STILL"):
             continue
         name, change = diagnosis.action_name(number), changes[number].item()
-        at_bounds = diagnosis.bounded and saturation(action, 0.0, 1.0).item()
+        at_bounds = saturation(action, 0.0, 1.0).item() if diagnosis.bounded else 0.0
         if at_bounds >= threshold("BANG_BANG"):
             yield _at_bounds(name, action, at_bounds)
         gain, rough = previous_action_gain(action).item(), roughness(action).item()
@@ -188,7 +189,8 @@ def _chatters(name: str, action: Tensor, rate: float | None) -> Iterator[Finding
     spectrum[: math.ceil(above * len(action))] = 0.0
     fast = torch.fft.irfft(spectrum, len(action))
     length = max(-(-len(action) // PARTS), math.ceil(PERIODS / above))
-    starts = range(0, len(action) - length + 1, length)
+    last = max(0, len(action) - length)
+    starts = [*range(0, last, length), last]
     places = [slice(0, len(action)), *(slice(start, start + length) for start in starts)]
     sizes = [fast[place].abs().median().item() for place in places]
     # The whole episode goes before its parts.
@@ -327,18 +329,19 @@ def _training(diagnosis: Diagnosis) -> Iterator[Finding]:
 
 def _movement(diagnosis: Diagnosis) -> Finding:
     """Finding about a policy whose actions have no fault."""
-    changes = diagnosis.relative.diff(dim=0).abs().mean(0)
-    change, most = changes.max().item(), int(changes.argmax())
+    changes = diagnosis.relative.diff(dim=0).abs()
+    most = int(changes.mean(0).argmax())
+    change = changes[:, most].mean().item()
     place = "" if diagnosis.is_recording else "in the first episode "
-    which = "the action changes" if len(changes) == 1 else f"{diagnosis.action_name(most)} changes"
-    most_of_all = "" if len(changes) == 1 else "most, "
+    several = changes.shape[1] > 1
+    moves = f"{diagnosis.action_name(most)} changes most," if several else "the action changes"
     numbers = (
-        f"{place}{which} {most_of_all}by {change:.1%} of its range per step, and its gain on the "
-        f"previous action is {diagnosis.measures['previous_action_gain']:.2f}"
+        f"{place}{moves} by {change:.1%} of its range per step, and its gain on the previous "
+        f"action is {diagnosis.measures['previous_action_gain']:.2f}"
     )
     if change <= threshold("SMOOTH"):
         return Finding("smooth", f"It is smooth: {numbers}.", fault=False)
-    where = _where(diagnosis.relative[:, most : most + 1].diff(dim=0).abs())
+    where = _where(changes[:, most : most + 1])
     faults = ["flip", "chatter", *(["jump between its bounds"] if diagnosis.bounded else [])]
     text = (
         f"It moves much, but it does not {', '.join(faults)} or move like noise: {numbers}; the "
