@@ -88,7 +88,7 @@ class MetricsLog:
             )
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the columns, and the size and the hash of what was written."""
+        """Returns the columns, and the size and the hash of the file."""
         content = b"" if self.path is None or self.columns is None else self.path.read_bytes()
         found = _sha256(content[: self._size])
         return {"columns": self.columns, "size": self._size, "sha256": found}
