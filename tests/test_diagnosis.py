@@ -127,6 +127,14 @@ class TestWords:
         actions = torch.cat([0.5 * SINE, 0.5 * FLIPPING], 1)
         assert said(made_up(actions), "flips").text.startswith("action[1]")
 
+    def test_many_actions_with_one_fault_share_a_finding(self):
+        """Two have a sentence each; with three, one sentence names all, the largest first."""
+        sizes = torch.tensor([0.3, 0.5, 0.4])
+        found = said(made_up(sizes * FLIPPING), "flips")
+        assert found.text.startswith("action[1]")
+        assert found.text.endswith("The same holds for 2 other actions: action[2], action[0].")
+        assert kinds(made_up(sizes[:2] * FLIPPING))[:2] == ["flips", "flips"]
+
     def test_where_it_is_steepest_is_told_in_what_it_observes(self):
         """Of a policy that shakes; steps are the first entry here, their squares the second."""
         constants = torch.ones(100)

@@ -22,8 +22,11 @@ BINS = 40
 
 
 def draw_actions(diagnoses: Sequence[Diagnosis]) -> list[bytes]:
-    """Mean actions over an episode, and enlarged where they change most, as SVG."""
-    return [_draw(2, 3.6, _actions, one) for one in diagnoses]
+    """Mean actions over an episode, and each enlarged where they change most, as SVG."""
+    return [
+        _draw(1 + len(busiest(one)), 2.5 + 1.1 * len(busiest(one)), _actions, one)
+        for one in diagnoses
+    ]
 
 
 def draw_together(diagnoses: Sequence[Diagnosis]) -> bytes:
@@ -40,8 +43,10 @@ def draw_together(diagnoses: Sequence[Diagnosis]) -> bytes:
         axis.set_title(title, fontsize=10, parse_math=False)
         axis.set_ylabel("action")
         axis.grid(alpha=0.25)
-        _legend(axis, one)  # Policies differ in which actions change most.
-    axes[-1].set_xlabel("step")
+        if one.actions.shape[1] > 1:  # Policies differ in which actions change most.
+            beside = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
+            axis.legend(frameon=False, fontsize=8, **beside)
+    axes[-1].set_xlabel(_step(diagnoses))
     return drawn(figure)
 
 
@@ -89,19 +94,26 @@ def _actions(axes: Sequence[Any], one: Diagnosis) -> None:
     end = min(start + ZOOM, len(one.actions) - 1)
     # Without common bounds, a joint with a small span would be a flat line next to a large one.
     shown = one.actions if one.bounded else one.relative
-    for axis, marker in zip(axes, (None, "."), strict=True):
-        for place, number in enumerate(busiest(one)):
-            axis.plot(shown[:, number].numpy(), marker=marker, **_line(place, number, one))
+    together, *each = axes
+    for place, (axis, number) in enumerate(zip(each, busiest(one), strict=True)):
+        line = _line(place, number, one)
+        together.plot(shown[:, number].numpy(), **line)
+        axis.plot(shown[:, number].numpy(), marker=".", **line)
+        axis.set_xlim(start, end)
+        if len(each) > 1:
+            name = one.action_name(number)
+            axis.set_title(name, loc="left", fontsize=8, color=line["color"], parse_math=False)
+            axis.tick_params(labelbottom=axis is each[-1])
+    for axis in axes:
         if one.bounded:
             for bound in {*one.low.tolist(), *one.high.tolist()}:
                 axis.axhline(bound, color="black", linewidth=0.6, linestyle=":")
-        axis.set_ylabel("action" if one.bounded else "action, of its span")
+        axis.set_ylim(together.get_ylim())
+    together.set_ylabel("action" if one.bounded else "of its span")
     if end - start < len(one.actions) - 1:
-        axes[0].axvspan(start, end, color=WORST, alpha=0.12, linewidth=0)
-    axes[1].set_xlim(start, end)
-    axes[1].set_ylim(axes[0].get_ylim())
-    axes[1].set_xlabel("step, where it changes most")
-    _legend(axes[0], one)
+        together.axvspan(start, end, color=WORST, alpha=0.12, linewidth=0)
+    what = "they change" if len(each) > 1 else "it changes"
+    each[-1].set_xlabel(f"{_step([one])}, where {what} most")
 
 
 def _spectrum(
@@ -115,7 +127,10 @@ def _spectrum(
     axis.set_ylim(top * 1e-4, top * 1.5)
     axis.set_xlabel("cycles per step" if one.rate is None else "hertz")
     axis.set_ylabel("amplitude, of the range")
-    _legend(axis, one)
+    if one.actions.shape[1] > 1:
+        figure, above = axis.figure, {"loc": "outside upper right", "ncols": 2}
+        figure.legend(frameon=False, fontsize=8, **above)
+        figure.set_figheight(figure.get_figheight() + 0.5)
 
 
 def _steepness(
@@ -127,7 +142,7 @@ def _steepness(
         of_value.text(0.5, 0.5, "no value function", ha="center", transform=of_value.transAxes)
     else:
         _along(of_value, one.value_lipschitz, one, value, "value")
-    of_value.set_xlabel("step")
+    of_value.set_xlabel(_step([one]))
     _plane(plane, one, policy)
 
 
@@ -252,6 +267,8 @@ def _line(place: int, number: int, one: Diagnosis) -> dict[str, Any]:
     return {"color": COLORS[place], "linewidth": 0.9, "markersize": 3, "label": label}
 
 
-def _legend(axis: Any, one: Diagnosis) -> None:
-    if one.actions.shape[1] > 1:
-        axis.legend(frameon=False, fontsize=8, ncols=2, loc="best")
+def _step(diagnoses: Sequence[Diagnosis]) -> str:
+    """The label of an axis of steps, with the length of a step if all have the same."""
+    rates = {one.rate for one in diagnoses}
+    (rate,) = rates if len(rates) == 1 else (None,)
+    return "step" if rate is None else f"step of {1 / rate:.3g} s"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -45,6 +45,8 @@ def threshold(name: str) -> float:
 
 PARTS = 20  # of an episode in which an action may chatter
 PERIODS = 4  # of the slowest of the fast frequencies, at least, in a part
+FULL = 2  # findings of one kind that each have a sentence
+MOST_NAMES = 12  # of further actions with the same finding
 TAIL = 1.4  # times the peak's height: a higher spectrum just below it is of a slower movement
 
 
@@ -77,7 +79,7 @@ def findings(diagnosis: Diagnosis) -> list[Finding]:
             f"around ({at}). This is smooth, but the policy does not react to its observations."
         )
         return [*unlike, Finding("still", text), *_training(diagnosis)]
-    found = list(_actions(diagnosis))
+    found = list(_grouped(_actions(diagnosis)))
     found = [*found, *_steepest(diagnosis)] if found else [_movement(diagnosis)]
     return [*unlike, *found, *_reasons(diagnosis), *_training(diagnosis)]
 
@@ -154,8 +156,26 @@ def _unlike(diagnosis: Diagnosis) -> Iterator[Finding]:
         yield Finding("unlike", text, fault=False)
 
 
-def _actions(diagnosis: Diagnosis) -> Iterator[Finding]:
-    """Findings about each action dimension that moves, by the size of its changes."""
+def _grouped(found: Iterable[tuple[str, Finding]]) -> Iterator[Finding]:
+    """Findings about actions; of a kind with more than ``FULL`` the first, which names the others.
+
+    Args:
+        found: name of an action, and a finding about it.
+    """
+    kinds: dict[str, list[tuple[str, Finding]]] = {}
+    for name, finding in found:
+        kinds.setdefault(finding.kind, []).append((name, finding))
+    for kind, each in kinds.items():
+        if len(each) <= FULL:
+            yield from (finding for _, finding in each)
+            continue
+        others = listed([name for name, _ in each[1:]], MOST_NAMES)
+        text = f"{each[0][1].text} The same holds for {len(each) - 1} other actions: {others}."
+        yield Finding(kind, text)
+
+
+def _actions(diagnosis: Diagnosis) -> Iterator[tuple[str, Finding]]:
+    """Findings about each action dimension that moves, by the size of its changes, and its name."""
     relative = diagnosis.relative
     changes = relative.diff(dim=0).abs().mean(0)
     for number in changes.argsort(descending=True).tolist():
@@ -165,19 +185,20 @@ def _actions(diagnosis: Diagnosis) -> Iterator[Finding]:
         name, change = diagnosis.action_name(number), changes[number].item()
         at_bounds = saturation(action, 0.0, 1.0).item() if diagnosis.bounded else 0.0
         if at_bounds >= threshold("BANG_BANG"):
-            yield _at_bounds(name, action, at_bounds)
+            yield name, _at_bounds(name, action, at_bounds)
         gain, rough = previous_action_gain(action).item(), roughness(action).item()
         if gain <= threshold("FLIPS"):
-            yield _flips(name, action, gain, diagnosis.rate)
+            yield name, _flips(name, action, gain, diagnosis.rate)
         elif rough >= threshold("ROUGH") and change > threshold("SMOOTH"):
             text = (
                 f"{name} moves like noise: its roughness is {rough:.2f} of the control rate (white "
                 f"noise has 0.25); it changes by {change:.1%} of its range per step, "
                 f"{_where(action.diff(dim=0).abs())}."
             )
-            yield Finding("rough", text)
+            yield name, Finding("rough", text)
         elif at_bounds < threshold("BANG_BANG"):
-            yield from _chatters(name, action.squeeze(1), diagnosis.rate)
+            chatter = _chatters(name, action.squeeze(1), diagnosis.rate)
+            yield from ((name, finding) for finding in chatter)
 
 
 def _chatters(name: str, action: Tensor, rate: float | None) -> Iterator[Finding]:
