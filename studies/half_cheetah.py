@@ -1,7 +1,7 @@
 """Share of an episode that policies of HalfCheetah-v5 spend on their backs.
 
 ``python -m studies.half_cheetah FOLDER FILE.csv`` plays the runs below a folder, and writes a line
-for each of them.
+for each of them. Lines of other runs stay.
 """
 
 from __future__ import annotations
@@ -42,8 +42,11 @@ def share_on_back(observations: NDArray[np.floating]) -> float:
 
 
 def main(folder: Path, path: Path) -> None:
-    """Plays the runs of HalfCheetah-v5 below a folder, and writes the file."""
-    rows = []
+    """Plays the runs of HalfCheetah-v5 below a folder, and adds or replaces their lines."""
+    rows = {}
+    if path.exists():
+        with path.open(newline="") as file:
+            rows = {(row[0], int(row[1])): row for row in list(csv.reader(file))[1:]}
     for run in find_runs([folder], required=True).runs:
         if run.task != "HalfCheetah-v5":
             continue
@@ -53,10 +56,11 @@ def main(folder: Path, path: Path) -> None:
         total = np.mean([episode[0] for episode in played])
         on_back = np.mean([share_on_back(episode[2]) for episode in played])
         commit = run.versions.get("commit", "")
-        rows.append([run.regularizer, run.seed, f"{total:.6g}", f"{on_back:.4g}", commit])
-        print(*rows[-1], flush=True)
+        row = [run.regularizer, str(run.seed), f"{total:.6g}", f"{on_back:.4g}", commit]
+        rows[run.regularizer, run.seed] = row
+        print(*row, flush=True)
     with path.open("w", newline="") as file:
-        csv.writer(file).writerows([COLUMNS, *sorted(rows)])
+        csv.writer(file).writerows([COLUMNS, *(rows[key] for key in sorted(rows))])
 
 
 def table(path: Path) -> str:

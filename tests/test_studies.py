@@ -1003,9 +1003,13 @@ class TestHalfCheetah:
             config = ExperimentConfig(task=task, regularizer=L2C2Config())
             make_run(tmp_path / name, config, 1.0, 0.1)
         monkeypatch.setattr(half_cheetah, "act", lambda run: lambda seen: np.zeros(6, np.float32))
-        half_cheetah.main(tmp_path, path := tmp_path / "half_cheetah.csv")
-        (row,) = pd.read_csv(path).to_dict("records")
-        assert row["method"] == "l2c2" and row["on_back"] == 0.0 and abs(row["return"]) < 5
+        path = tmp_path / "half_cheetah.csv"
+        path.write_text("method,seed,return,on_back,commit\nl2c2,0,9,1,c\nnone,10,8,1,c\n")
+        half_cheetah.main(tmp_path, path)
+        played, other = pd.read_csv(path).to_dict("records")
+        assert played["method"] == "l2c2" and played["on_back"] == 0.0
+        assert abs(played["return"]) < 5
+        assert list(other.values()) == ["none", 10, 8, 1, "c"]
 
     def test_the_table_by_hand(self, tmp_path):
         """Seeds in order, methods in the order of tables."""
