@@ -3,8 +3,17 @@
 import os
 from importlib.util import find_spec
 
+from _pytest.doctest import DoctestItem
+from pytest import Item
+
 # Before torch is imported: threads of several processes on the same cores wait for each other.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 # Its doctests import the extra rsl-rl.
 collect_ignore = [] if find_spec("rsl_rl") else ["torchrl_l2c2/rsl_rl"]
+
+
+def pytest_itemcollected(item: Item) -> None:
+    """Runs the examples of components as a reader would, without the names of their module."""
+    if isinstance(item, DoctestItem) and not item.name.startswith("torchrl_l2c2.experiment."):
+        item.dtest.globs = {}

@@ -254,7 +254,19 @@ def test_a_likelihood_of_each_action_is_no_likelihood():
     for key in ("loss_actor", "loss_critic", "ratio_threshold"):
         torch.testing.assert_close(found[1][key], found[0][key])
     with pytest.raises(ValueError, match=r"shape \(2,\) in this batch, got \(2, 3\): use a"):
-        of_each_transition(torch.zeros(2, 3), torch.zeros(2))
+        of_each_transition(torch.zeros(2, 3), torch.Size([2]))
+
+
+def test_the_stored_likelihood_has_one_number_per_transition():
+    """With a last dimension of 1 it is the same; with more, the error names the batch's entry."""
+    loss = make_loss()
+    batch = make_batch(loss, [1.5, 0.7], [0.3, -2.0])
+    expected, own = copy.deepcopy(loss)(batch.clone()), batch.clone()
+    own["action_log_prob"] = own["action_log_prob"].unsqueeze(-1)
+    torch.testing.assert_close(loss(own)["loss_actor"], expected["loss_actor"])
+    own["action_log_prob"] = own["action_log_prob"].expand(2, 3)
+    with pytest.raises(ValueError, match=r"the batch's 'action_log_prob' must be one number"):
+        loss(own)
 
 
 @pytest.mark.parametrize(("importance", "weights"), [("max", (1.0, 0.5)), ("mean", (4 / 3, 2 / 3))])

@@ -200,6 +200,8 @@ class TestTheClass:
         """Classes and objects that cannot be combined are refused with their names."""
         with pytest.raises(TypeError, match="LossModule, got a Linear"):
             L2C2Loss(nn.Linear(1, 1))
+        with pytest.raises(TypeError, match="the class DDPGLoss: make the loss first"):
+            L2C2Loss(DDPGLoss)
         with pytest.raises(TypeError, match="takes a class of losses"):
             L2C2Loss[nn.Linear]
         with pytest.raises(TypeError, match=r"L2C2Loss\[SACLoss\] cannot wrap a DDPGLoss"):

@@ -705,8 +705,16 @@ def test_the_runners_iterations_are_the_ramp(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_a_setting_beside_the_class_name_is_told_its_place() -> None:
     """rsl_rl's own message does not name it."""
-    with pytest.raises(TypeError, match=r"as in \{'regularizer_cfg': \{'strength': 2.0\}\}"):
+    with pytest.raises(TypeError, match=r"write \{'regularizer_cfg': \{'strength': 2.0\}\}"):
         make(rsl.L2C2PPO, strength=2.0)
+
+
+def test_a_misspelled_argument_is_told_its_name() -> None:
+    """It is no setting of the regularizer, as ``beta`` is none of CATS."""
+    with pytest.raises(TypeError, match="Did you mean 'learning_rate'"):
+        make(rsl.L2C2PPO, learning_rat=2.0)
+    with pytest.raises(TypeError, match=r"It has .*'learning_rate'"):
+        make(rsl.CATSPPO, beta=1.0)
 
 
 def test_settings_beside_the_algorithm_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -35,7 +35,6 @@ from torchrl.objectives import (
     DTLoss,
     GAILLoss,
     IQLLoss,
-    PPOLoss,
     SACLoss,
     TD3Loss,
 )
@@ -602,7 +601,7 @@ class MySACLoss(SACLoss):
 
 
 EXACT = {
-    "ppo": [ppo, lambda: PPOLoss(gaussian_actor(), critic())],
+    "ppo": [ppo],
     "sac": [sac, lambda: MySACLoss(gaussian_actor(), qvalue(), action_spec=BOUNDS)],
     "td3": [td3],
     "ppo_rpe": [lambda: PPORPELoss(gaussian_actor(), heads_critic())],
@@ -612,7 +611,7 @@ EXACT = {
 class TestPresets:
     """Which settings a loss takes, and what is said of it."""
 
-    SIMILAR = ("A2C", "KLPENPPO", "MAPPO", "IPPO", "REDQ", "TQC", "CrossQ", "CQL", "DDPG")
+    SIMILAR = ("PPO", "A2C", "KLPENPPO", "MAPPO", "IPPO", "REDQ", "TQC", "CrossQ", "CQL", "DDPG")
     WITHOUT = ("Reinforce", "BC", "deterministic BC", "TD3BC", "IQL", "DiscreteIQL", "DiscreteSAC")
 
     @pytest.mark.parametrize("kind", EXACT)
@@ -644,7 +643,7 @@ class TestPresets:
         with pytest.warns(UserWarning) as told:
             loss = smooth(case.make())
         (message,) = (str(each.message) for each in told)
-        nearest = "TD3Loss" if name == "DDPG" else "SACLoss" if "Q" in name else "PPOLoss"
+        nearest = "TD3Loss" if name == "DDPG" else "SACLoss" if "Q" in name else "ClipPPOLoss"
         base = type(case.make()).__name__
         assert message.startswith(f"{base} takes the preset of {nearest}")
         assert f"not tried with {base}" in message
@@ -687,11 +686,18 @@ class TestPresets:
 
     @pytest.mark.parametrize("method", ["grad_caps", "asap", "lcp", "sr2l"])
     def test_methods_without_runs_say_so_and_what_they_take(self, method):
-        with pytest.warns(UserWarning, match="takes the settings of its authors, ") as told:
+        with pytest.warns(UserWarning, match="takes settings that were not tuned, ") as told:
             smooth(sac(), method)
         (message,) = (str(each.message) for each in told)
         for name, value in PRESETS[method]["sac"].settings.items():
             assert f"{name}={value!r}" in message
+
+    def test_settings_without_runs_are_not_said_to_be_found_with_a_similar_loss(self):
+        """With a gain of the user's own, there is nothing to warn of."""
+        (case,) = (case for case in CASES if case.name == "REDQ")
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            smooth(case.make(), "lcp", coeff=0.01)
 
     def test_without_a_preset_single_settings_replace_those_of_the_nearest(self):
         """As they replace a preset's; the others are told."""
@@ -733,6 +739,9 @@ class TestPresets:
                 r"settings of caps, .*got \['neighbors'\]",
             ),
             ({"method": "l2c3"}, ValueError, r"one of \['l2c2', .*got 'l2c3'"),
+            ({"method": ["l2c2"]}, ValueError, r"got \['l2c2'\]"),
+            ({"fold": "no"}, TypeError, "fold must be True or False, got 'no'"),
+            ({"skip_ends": "false"}, TypeError, "skip_ends must be True or False"),
             (
                 {"neighborhood": Neighborhood(), "sigma": 1.0},
                 TypeError,
@@ -752,9 +761,7 @@ class TestPresets:
         with pytest.raises(TypeError, match=r"a loss without a regularizer, got a L2C2Loss\[SAC"):
             smooth(smooth(sac()), "cats")
         for module in (torch.compile(sac(), backend="eager"), sac().actor_network):
-            with pytest.raises(
-                TypeError, match=r"Call smooth on the loss, such as SACLoss.*before"
-            ):
+            with pytest.raises(TypeError, match=r"Regularize the loss, such as SACLoss.*before"):
                 smooth(module)
         with pytest.raises(
             TypeError, match=r"the class SACLoss: make the loss first, SACLoss\(\.\."

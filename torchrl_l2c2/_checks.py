@@ -83,6 +83,16 @@ def check_real(
         raise ValueError(f"{name} must be {allowed}, got {value!r}.{hint and ' ' + hint}")
 
 
+def check_bool(name: str, value: Any) -> None:
+    """Checks for ``True`` or ``False``; ``"false"`` would count as true.
+
+    Raises:
+        TypeError: it is neither.
+    """
+    if not isinstance(value, bool):
+        raise TypeError(f"{name} must be True or False, got {value!r} ({type(value).__name__}).")
+
+
 def check_choice(name: str, value: Any, allowed: Sequence[str], *, hint: str = "") -> None:
     """Checks for one of the allowed strings.
 
@@ -158,3 +168,17 @@ def check_takes_gradients(regularizer: str) -> None:
             f"{regularizer} takes gradients of its own, of which torch.inference_mode keeps "
             "none: validate under torch.no_grad()."
         )
+
+
+def describe_no_loss(given: object) -> str:
+    """Describes an argument that is no loss, and what to do.
+
+    Examples:
+        >>> from torchrl_l2c2._checks import describe_no_loss
+        >>> describe_no_loss(dict), describe_no_loss(1)
+        ('the class dict: make the loss first, dict(...)', 'a int')
+    """
+    if isinstance(given, type):
+        return f"the class {given.__name__}: make the loss first, {given.__name__}(...)"
+    hint = ". Regularize the loss, such as SACLoss(policy, ...), before it is compiled"
+    return f"a {type(given).__name__}{hint if isinstance(given, torch.nn.Module) else ''}"

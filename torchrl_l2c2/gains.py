@@ -36,6 +36,7 @@ class ConstantGain:
         ValueError: if it is out of its range.
 
     Examples:
+        >>> from torchrl_l2c2.gains import ConstantGain
         >>> ConstantGain(0.5).step()
         0.5
     """
@@ -56,13 +57,12 @@ class ConstantGain:
         """Restores the result of :meth:`state_dict`; set the loss's gain to ``value`` then.
 
         Raises:
-            ValueError: the entries differ, as in the state of another kind of gain; nothing is
+            ValueError: there are other entries, or the value is out of its range; nothing is
                 changed.
         """
         if state.keys() != self.state_dict().keys():
             raise ValueError(
-                f"{type(self).__name__} has {list(self.state_dict())}, got {list(state)}: that is "
-                "the state of another kind of gain."
+                f"Expected the state of a gain, with {list(self.state_dict())}, got {list(state)}."
             )
         check_real("value", state["value"], at_least=0)
         self.value = state["value"]
@@ -87,6 +87,7 @@ class RampGain(ConstantGain):
         ValueError: if it is out of its range.
 
     Examples:
+        >>> from torchrl_l2c2.gains import RampGain
         >>> ramp = RampGain(2.0, length=0.5)
         >>> ramp.value, ramp.step(0.25), ramp.step(0.9)
         (0.0, 1.0, 2.0)
@@ -138,6 +139,7 @@ class TargetGain(ConstantGain):
         ValueError: if it is out of its range.
 
     Examples:
+        >>> from torchrl_l2c2.gains import TargetGain
         >>> gain = TargetGain(0.5)
         >>> round(gain.step(0.75), 4), round(gain.step(0.25), 4)
         (1.0513, 1.0)
@@ -221,6 +223,7 @@ def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]
         >>> from torchrl.modules import MLP, Actor, ValueOperator
         >>> from torchrl.objectives import DDPGLoss
         >>> from torchrl_l2c2 import CATSLoss
+        >>> from torchrl_l2c2.gains import gradient_shares
         >>> _ = torch.manual_seed(0)
         >>> critic = ValueOperator(MLP(4, 1), in_keys=["observation", "action"])
         >>> loss = CATSLoss(DDPGLoss(Actor(torch.nn.Linear(3, 1)), critic), lambda_temporal=0.5)

@@ -274,7 +274,10 @@ def _body(
 
 def _read(in_keys: str | Sequence[NestedKey]) -> list[NestedKey]:
     """A string is one key, and not its letters."""
-    return [in_keys] if isinstance(in_keys, str) else list(in_keys)
+    keys = [in_keys] if isinstance(in_keys, str) else list(in_keys)
+    if not keys:
+        raise ValueError("in_keys must name at least one observation, got none.")
+    return keys
 
 
 def _action_size(spec: TensorSpec) -> int:
@@ -299,6 +302,6 @@ def _bounds(spec: TensorSpec) -> dict[str, Tensor]:
     if not (finite and (low < high).all()):
         raise ValueError(
             "make_actor: squashing needs finite bounds of the action, the lower below the upper, "
-            f"got {spec}: use squash='none'."
+            f"got {low.tolist()} and {high.tolist()}: use squash='none'."
         )
     return {"low": low, "high": high}

@@ -230,6 +230,7 @@ class Neighborhood:
 
         Examples:
             >>> import torch
+            >>> from torchrl_l2c2 import Neighborhood
             >>> near = Neighborhood(sigma=1.0)
             >>> uniform = torch.tensor([[[0.5, 0.5]], [[0.75, 0.5]]])
             >>> neighbor, _ = near.place(torch.zeros(2, 2), torch.ones(2, 2), uniform)

@@ -48,6 +48,7 @@ def choose_policy_distance(
     Examples:
         >>> import torch
         >>> from torch.distributions import Normal
+        >>> from torchrl_l2c2.policy_distances import choose_policy_distance
         >>> distance = choose_policy_distance(lambda p, q: (p.mean - q.mean).abs())
         >>> distance(Normal(torch.zeros(2), 1.0), Normal(torch.ones(2), 1.0))
         tensor([1., 1.])
@@ -141,6 +142,7 @@ def policy_mean(policy: Distribution | Tensor, *, squashed: bool = False) -> Ten
     Examples:
         >>> import torch
         >>> from torchrl.modules import TanhNormal
+        >>> from torchrl_l2c2.policy_distances import policy_mean
         >>> policy = TanhNormal(torch.tensor([[2.0]]), 1.0)
         >>> policy_mean(policy), policy_mean(policy, squashed=True)
         (tensor([[2.]]), tensor([[0.9640]]))
@@ -203,11 +205,12 @@ def mean_distance(p: Distribution, q: Distribution) -> Tensor:
 
     Raises:
         NotImplementedError: a policy has no mean.
-        ValueError: the means have other shapes.
+        ValueError: the policies have other numbers of actions.
 
     Examples:
         >>> import torch
         >>> from torchrl.modules import TanhNormal
+        >>> from torchrl_l2c2.policy_distances import mean_distance
         >>> p, q = TanhNormal(torch.zeros(1, 2), 1.0), TanhNormal(torch.ones(1, 2), 3.0)
         >>> mean_distance(p, q)
         tensor([1.])
@@ -235,11 +238,13 @@ def mean_squared_error(p: Distribution | Tensor, q: Distribution | Tensor) -> Te
 
     Raises:
         NotImplementedError: a policy has no mean.
-        ValueError: the means have other shapes.
+        ValueError: the policies have other numbers of actions.
 
     Examples:
         >>> import torch
         >>> from torchrl.modules import TanhNormal
+        >>> from torchrl_l2c2.policy_distances import mean_squared_error
+        >>> from torchrl_l2c2.policy_distances import mean_distance
         >>> p, q = TanhNormal(torch.zeros(1, 4), 1.0), TanhNormal(torch.ones(1, 4), 3.0)
         >>> mean_squared_error(p, q), mean_distance(p, q)
         (tensor([1.]), tensor([2.]))

@@ -21,8 +21,8 @@ class Preset:
     Attributes:
         settings: keyword arguments of the regularizer, and of its ``Neighborhood``.
         ramp: share of training over which the gain rises from 0; ``None`` for a constant gain.
-        evidence: page with the runs of these settings; ``None`` for settings of the method's
-            authors, without recorded runs with this kind of loss.
+        evidence: page with the runs of these settings; ``None`` for settings without recorded runs
+            with this kind of loss.
         tasks: tasks of the runs.
     """
 
@@ -59,8 +59,8 @@ METHODS = {
 
 KINDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "ppo": (
-        ("PPOLoss", "ClipPPOLoss", "ActorCriticLoss"),
-        ("A2CLoss", "KLPENPPOLoss", "MAPPOLoss", "IPPOLoss"),
+        ("ClipPPOLoss", "ActorCriticLoss"),
+        ("PPOLoss", "A2CLoss", "KLPENPPOLoss", "MAPPOLoss", "IPPOLoss"),
     ),
     "sac": (("SACLoss",), ("REDQLoss", "TQCLoss", "CrossQLoss", "CQLLoss")),
     "td3": (("TD3Loss",), ("DDPGLoss",)),
@@ -73,8 +73,8 @@ _PPO_TASKS = "Pendulum, LunarLander, Walker2d and Hopper"
 _SR2L = {"coeff": 0.1, "epsilon": 0.05, "steps": 10}
 
 
-def _of_authors(**settings: Any) -> dict[str, Preset]:
-    """The settings of a method's authors for every kind of loss; runs are recorded with PPO."""
+def _for_all(**settings: Any) -> dict[str, Preset]:
+    """The same settings for every kind of loss; runs are recorded with PPO."""
     ran = Preset(settings, evidence="results/other_methods.md", tasks="Pendulum and LunarLander")
     return {kind: ran if kind == "ppo" else Preset(settings) for kind in KINDS}
 
@@ -162,15 +162,15 @@ PRESETS: dict[str, dict[str, Preset]] = {
         ),
         "ppo_rpe": Preset({"lambda_temporal": 0.1}, ramp=1.0),
     },
-    "grad_caps": _of_authors(lambda_temporal=0.01, epsilon=0.1),
-    "asap": _of_authors(lambda_spatial=0.3, lambda_temporal=2.0, lambda_grad=0.05),
+    "grad_caps": _for_all(lambda_temporal=0.01, epsilon=0.1),
+    "asap": _for_all(lambda_spatial=0.3, lambda_temporal=2.0, lambda_grad=0.05),
     # "mean": a learned deviation would grow, because that lowers the likelihood's gradient or KL.
     "lcp": {
-        **_of_authors(coeff=0.002, of="mean"),
+        **_for_all(coeff=0.002, of="mean"),
         "ppo_rpe": Preset({"coeff": 0.002, "of": "log_prob"}),
     },
     "sr2l": {
-        **_of_authors(**_SR2L, policy_distance="mean"),
+        **_for_all(**_SR2L, policy_distance="mean"),
         "ppo_rpe": Preset({**_SR2L, "policy_distance": "jeffreys"}),
     },
 }
@@ -203,6 +203,7 @@ def kind_of(loss_class: type) -> tuple[str | None, bool]:
 
     Examples:
         >>> from torchrl.objectives import REDQLoss, SACLoss
+        >>> from torchrl_l2c2.presets import kind_of
         >>> kind_of(SACLoss), kind_of(REDQLoss), kind_of(dict)
         (('sac', True), ('sac', False), (None, False))
     """
@@ -228,6 +229,7 @@ def preset(method: str, kind: str) -> Preset:
         ValueError: there is no such method or kind.
 
     Examples:
+        >>> from torchrl_l2c2.presets import preset
         >>> preset("l2c2", "sac").settings["lambda_min"], preset("l2c2", "ppo").ramp
         (10.0, 1.0)
     """
@@ -248,6 +250,7 @@ def presets_table() -> str:
     """The table of presets as Markdown, for the docs.
 
     Examples:
+        >>> from torchrl_l2c2.presets import presets_table
         >>> print(presets_table().splitlines()[0])
         | loss | method | settings | evidence |
     """

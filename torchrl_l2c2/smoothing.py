@@ -8,11 +8,10 @@ from collections.abc import Mapping
 from difflib import get_close_matches
 from typing import Any
 
-from torch import nn
 from torchrl.objectives import LossModule, TD3BCLoss
 
 from torchrl_l2c2 import objectives
-from torchrl_l2c2._checks import as_number, check_real
+from torchrl_l2c2._checks import as_number, check_bool, check_real, describe_no_loss
 from torchrl_l2c2.neighborhood import Neighborhood
 from torchrl_l2c2.objectives import RegularizedLoss
 from torchrl_l2c2.objectives._batch import check_evaluates_states
@@ -38,12 +37,14 @@ def smooth(
     """Adds a smoothness regularizer to a loss, with the preset for its class.
 
     The result is a loss of the same class with the same parameters. Train it as before: the penalty
-    is added to ``loss_actor`` or ``loss_objective``, so loops that sum terms by name, or all
-    ``loss_*`` keys, need no change. The penalty is reported as ``penalty_*``.
+    is added to ``loss_actor`` or ``loss_objective``, and a value function's to its loss, so loops
+    that sum terms by name, or all ``loss_*`` keys, need no change. The penalty is reported as
+    ``penalty_*``.
 
-    The presets are in ``torchrl_l2c2.presets.PRESETS``. The gains for PPO and TD3 rise with the
-    progress of training: call ``loss.set_progress(frames / total_frames)`` before the updates on
-    every rollout. Without this call the gains stay at their final value.
+    The presets are in ``torchrl_l2c2.presets.PRESETS``. The gain of ``"l2c2"`` with PPO and
+    TD3, and of ``"cats"`` with every loss, rises with the progress of training: call
+    ``loss.set_progress(frames / total_frames)`` before the updates on every rollout. Without this
+    call the gain stays at its final value.
 
     Args:
         loss (LossModule): a loss with a policy that is trained on transitions.
@@ -51,8 +52,8 @@ def smooth(
             ``"asap"``, ``"lcp"`` or ``"sr2l"``. ``grad_caps`` and ``asap`` need the observation
             before each state in the batch. Defaults to ``"l2c2"``.
         strength (float): factor of the penalty, at least 0. Larger values smooth more; too large
-            values lower the return. 0 leaves the loss's values and gradients unchanged. Defaults to
-            ``1.0``, the preset.
+            values lower the return. 0 leaves the loss's values and gradients unchanged, if the
+            penalty is finite. Defaults to ``1.0``, the preset.
         fold (bool): whether to add the penalty to the loss's own terms. ``False`` returns separate
             ``loss_*`` terms, for loops that weigh or log them; the loss's own terms are then
             unchanged, bit for bit. Defaults to ``True``.
@@ -69,8 +70,7 @@ def smooth(
         ValueError: the method is unknown, or a value is out of its range.
 
     Warns:
-        UserWarning: the preset was tuned with a similar loss, or consists of the settings of the
-            method's authors, not tuned here.
+        UserWarning: the preset was tuned with a similar loss, or was not tuned.
 
     Examples:
         >>> import torch
@@ -85,17 +85,18 @@ def smooth(
         ['loss_actor', 'loss_qvalue', 'penalty_l2c2_actor']
     """
     if not isinstance(loss, LossModule):
-        raise TypeError(f"Expected a torchrl.objectives.LossModule, got {_what(loss)}.")
+        raise TypeError(f"Expected a torchrl.objectives.LossModule, got {describe_no_loss(loss)}.")
     if isinstance(loss, RegularizedLoss):
         raise TypeError(
             f"Expected a loss without a regularizer, got a {type(loss).__name__}. Call smooth once "
             "with overrides, or combine the classes: CATSLoss(L2C2Loss(loss, ...), ...)."
         )
-    if method not in METHODS:
+    if not isinstance(method, str) or method not in METHODS:
         hint = f" For a strength: strength={method!r}." if isinstance(method, int | float) else ""
         raise ValueError(f"Expected method to be one of {list(METHODS)}, got {method!r}.{hint}")
     strength = as_number("strength", strength)
     check_real("strength", strength, at_least=0)
+    check_bool("fold", fold)
     if overrides.get("ramp") is not None:
         check_real("ramp", overrides["ramp"], above=0, at_most=1, hint="None: no ramp.")
     check_evaluates_states(loss)
@@ -118,11 +119,11 @@ def _chosen(loss: LossModule, method: str, overrides: Mapping[str, Any]) -> Pres
     found_with = KINDS[kind][0][0]
     if chosen.evidence is None and GAIN_SETTING[method] not in overrides:
         warnings.warn(
-            f"{method} takes the settings of its authors, {_shown(chosen.settings)}: there are no "
+            f"{method} takes settings that were not tuned, {_shown(chosen.settings)}: there are no "
             f"recorded runs of it with losses like {found_with}.",
             stacklevel=3,
         )
-    elif not exact:
+    elif not exact and chosen.evidence is not None:
         warnings.warn(
             f"{name} takes the preset of {found_with}, the nearest: it was found with that on "
             f"{chosen.tasks}, and not tried with {name}.",
@@ -174,14 +175,6 @@ def _nearest_kind(loss: LossModule) -> str:
     if isinstance(loss, TD3BCLoss):
         return "td3"
     return "sac" if getattr(loss, "qvalue_network", None) is not None else "ppo"
-
-
-def _what(loss: object) -> str:
-    """Describes an argument that is no loss, and the remedy."""
-    if isinstance(loss, type):
-        return f"the class {loss.__name__}: make the loss first, {loss.__name__}(...)"
-    hint = ". Call smooth on the loss, such as SACLoss(policy, ...), before the loss is compiled"
-    return f"a {type(loss).__name__}{hint if isinstance(loss, nn.Module) else ''}"
 
 
 def _shown(settings: Mapping[str, Any]) -> str:

@@ -151,9 +151,10 @@ def previous_action_gain(actions: Tensor) -> Tensor:
         \frac{\sum_t (a_t - \bar a)(a_{t-1} - \bar a)}{\sum_t (a_{t-1} - \bar a)^2}
 
     The sums are over all dimensions, and :math:`\bar a` is the episode's mean. Apart from the
-    episode's ends, this is the lag-1 autocorrelation of the actions, between -1 and 1. Near 1 the
-    action moves slowly. Near 0 successive actions are unrelated. Near -1 the action flips from
-    step to step, which is shaking at half the control rate.
+    episode's ends, this is the lag-1 autocorrelation of the actions. It is between -1 and 1 in long
+    episodes; in episodes of a few steps it may lie beyond. Near 1 the action moves slowly. Near 0
+    successive actions are unrelated. Near -1 the action flips from step to step, which is shaking
+    at half the control rate.
 
     Args:
         actions (Tensor): actions of whole episodes, shape ``[*B, T, A]`` with at least two steps.

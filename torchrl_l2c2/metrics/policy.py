@@ -118,10 +118,11 @@ def noise_sensitivity(
         tensor(0.0600)
     """
     check_real("noise_sensitivity: scale", scale, above=0)
-    if not observations.is_floating_point():
+    if not isinstance(observations, Tensor) or not observations.is_floating_point():
+        given = getattr(observations, "dtype", type(observations).__name__)
         raise TypeError(
-            f"noise_sensitivity: observations must be floating point, got {observations.dtype}: "
-            "noise on integers would be rounded away. Cast them as the policy does."
+            f"noise_sensitivity: observations must be a floating-point tensor, got {given}: noise "
+            "on integers would be rounded away. Cast them as the policy does."
         )
     noise = torch.randn(
         observations.shape,

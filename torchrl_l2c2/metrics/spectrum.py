@@ -75,8 +75,9 @@ def spectral_smoothness(actions: Tensor, form: Literal["caps", "asap"] = "caps")
     CAPS plot the first form. ASAP, PAVE and CATS print the second form, without normalization of
     the transform: :math:`\frac{2}{T f_s} \sum_i f_i |\mathrm{FFT}_i|`. Both are means over the
     action's dimensions. Smaller is smoother. For even :math:`T` the second form is
-    :math:`(T - 2) / 4` times the first. It grows with the episode's length: do not compare episodes
-    of different lengths by it.
+    :math:`(T - 2) / 4` times the first. Both depend on the episode's length: of white noise the
+    first form falls with its square root, and the second form grows with it. Do not compare
+    episodes of different lengths.
 
     Both leave the highest frequency out, as their authors' code does: sums and means are over
     :math:`i = 0, \dots, n - 1`. For even :math:`T` this frequency is half the rate, and an action

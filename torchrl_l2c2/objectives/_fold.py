@@ -60,6 +60,7 @@ def fold_targets(term: str, trains_policy: bool, own: Iterable[str]) -> list[str
         TypeError: there is no such term, or the choice is ambiguous.
 
     Examples:
+        >>> from torchrl_l2c2.objectives._fold import fold_targets
         >>> fold_targets("loss_caps_spatial", True, ["loss_objective", "loss_critic"])
         ['loss_objective']
         >>> fold_targets("loss_l2c2_critic", False, ["loss_objective", "loss_critic"])
@@ -254,9 +255,9 @@ class TermWatch:
             share = 1.0 - counts.float().mean().item()
             warnings.warn(
                 f"{share:.2%} of the transitions in the batch have an observation or a next "
-                "observation that is not finite, as some environments give at resets: "
-                f"{type(loss).__name__} leaves these transitions out. If all are left out, the "
-                "regularizer has no effect: keep the true next observations.",
+                "observation without a finite entry, as some environments give at resets: the "
+                f"terms of {type(loss).__name__} that compare the two leave these transitions out, "
+                "and have no effect if all are left out: keep the true next observations.",
                 stacklevel=5,
             )
 
@@ -357,6 +358,7 @@ def penalty_key(term: str) -> str:
     """The key under which a folded term is reported.
 
     Examples:
+        >>> from torchrl_l2c2.objectives._fold import penalty_key
         >>> penalty_key("loss_l2c2_actor")
         'penalty_l2c2_actor'
     """

@@ -16,6 +16,8 @@ from tensordict.nn.common import _OutKeysSelect
 from torch import nn
 from torchrl.objectives import LossModule
 
+from torchrl_l2c2._checks import describe_no_loss
+
 # The losses that each was made of, while they live, with their keys and value estimators of then.
 _ORIGINALS: WeakKeyDictionary[SpecializedLoss, list[tuple[weakref.ref[LossModule], Any, Any]]] = (
     WeakKeyDictionary()
@@ -90,8 +92,8 @@ class SpecializedLoss(LossMixin):
     def __new__(cls, base_loss: LossModule, *args: Any, **kwargs: Any) -> SpecializedLoss:
         if not isinstance(base_loss, LossModule):
             raise TypeError(
-                f"{cls.__name__} wraps a torchrl.objectives.LossModule, got a "
-                f"{type(base_loss).__name__}: a loss is compiled when it is wrapped already."
+                f"{cls.__name__} wraps a torchrl.objectives.LossModule, got "
+                f"{describe_no_loss(base_loss)}."
             )
         specialized = cls if cls._parts else cls.__class_getitem__(type(base_loss))
         if type(base_loss) not in specialized.__mro__:

@@ -10,7 +10,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from torchrl_l2c2._checks import check_choice, check_real
+from torchrl_l2c2._checks import check_bool, check_choice, check_real
 from torchrl_l2c2.distances import squared_error
 from torchrl_l2c2.objectives._batch import at_rows, finite_successor, is_floating_point
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
@@ -108,7 +108,8 @@ class CAPSLoss(RegularizedLoss):
         check_real("fraction", fraction, above=0, at_most=1)
         self.caps_mean = mean
         self.caps_fraction = float(fraction)
-        self.skip_ends = self.skip_ends or bool(skip_ends)
+        check_bool("skip_ends", skip_ends)
+        self.skip_ends = self.skip_ends or skip_ends
         self.register_coefficient("caps_lambda_temporal", lambda_temporal)
         self.register_coefficient("caps_lambda_spatial", lambda_spatial)
         self.declare_policy()

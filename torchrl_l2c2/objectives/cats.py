@@ -8,7 +8,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from torchrl_l2c2._checks import check_choice, check_real
+from torchrl_l2c2._checks import check_bool, check_choice, check_real
 from torchrl_l2c2.distances import squared_error
 from torchrl_l2c2.objectives._batch import at_rows, finite_successor
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
@@ -83,7 +83,8 @@ class CATSLoss(RegularizedLoss):
         check_real("fraction", fraction, above=0, at_most=1)
         self.cats_mean = mean
         self.cats_fraction = float(fraction)
-        self.skip_ends = self.skip_ends or bool(skip_ends)
+        check_bool("skip_ends", skip_ends)
+        self.skip_ends = self.skip_ends or skip_ends
         self.register_coefficient("cats_lambda_temporal", lambda_temporal)
         self.declare_policy()
         self.declare_terms(policy=["loss_cats"], diagnostics=["cats_counted"])

@@ -9,7 +9,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from torchrl_l2c2._checks import check_choice, check_real, read_key
+from torchrl_l2c2._checks import check_bool, check_choice, check_real, read_key
 from torchrl_l2c2.objectives._batch import at_rows, finite_successor, is_floating_point
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
 from torchrl_l2c2.policy_distances import policy_mean
@@ -131,7 +131,8 @@ class GradCAPSLoss(RegularizedLoss):
         self.grad_caps_epsilon = float(epsilon)
         self.grad_caps_mean = mean
         self.grad_caps_fraction = float(fraction)
-        self.skip_ends = self.skip_ends or bool(skip_ends)
+        check_bool("skip_ends", skip_ends)
+        self.skip_ends = self.skip_ends or skip_ends
         self.grad_caps_frames_key = read_key("frames_key", frames_key)
         self.grad_caps_previous_key = previous_key
         if previous_key is not None:

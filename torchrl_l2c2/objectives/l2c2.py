@@ -13,6 +13,7 @@ from torch.distributions import Categorical
 from torchrl.objectives import DistributionalDQNLoss, LossModule
 
 from torchrl_l2c2._checks import (
+    check_bool,
     check_choice,
     check_of_each,
     check_positive_int,
@@ -120,7 +121,7 @@ class L2C2Loss(RegularizedLoss):
     used. Otherwise the loss draws them from the observations and next observations with torch's
     global generator. It then moves ``moved_keys`` or, by default, every floating-point input of the
     regularized networks that has a successor in the batch; the distance is the largest over these
-    inputs. Transitions whose next observation is not finite, or whose step exceeds the
+    inputs. Transitions whose next observation has no finite coordinate, or whose step exceeds the
     neighborhood's ``max_step``, do not count: means are over the other transitions.
 
     ``forward`` adds these entries:
@@ -135,7 +136,8 @@ class L2C2Loss(RegularizedLoss):
       ``l2c2_action_distance`` (deterministic policies);
     * ``l2c2_value_distance``, the mean :math:`d_V`, summed over the value functions.
 
-    With ``reduction="none"`` these diagnostics are not averaged.
+    With ``reduction="none"`` these diagnostics are not averaged; ``fraction`` applies to them as to
+    the terms.
 
     .. note:: Gains are buffers: assign to them at any time, as in ``loss.l2c2_coeff = 0.5``, also
         between calls of a compiled loss. They are not part of the ``state_dict``.
@@ -247,7 +249,8 @@ class L2C2Loss(RegularizedLoss):
                 "largest is the mean."
             )
         check_real("fraction", fraction, above=0, at_most=1)
-        self.skip_ends = self.skip_ends or bool(skip_ends)
+        check_bool("skip_ends", skip_ends)
+        self.skip_ends = self.skip_ends or skip_ends
         self._l2c2_distance = choose_policy_distance(policy_distance, hellinger_samples)
         own_distance = not isinstance(policy_distance, str)  # Not a module: it is the caller's.
         self.l2c2_policy_distance = "a function" if own_distance else policy_distance

@@ -35,6 +35,7 @@ def relative_density_ratio(
 
     Examples:
         >>> import torch
+        >>> from torchrl_l2c2.objectives.ppo_rpe import relative_density_ratio
         >>> relative_density_ratio(torch.tensor([0.0, 1.0, 3.0]), beta=0.5)
         tensor([0.0000, 1.0000, 1.5000])
     """
@@ -59,6 +60,7 @@ def penalty_gain(
 
     Examples:
         >>> import torch
+        >>> from torchrl_l2c2.objectives.ppo_rpe import penalty_gain
         >>> penalty_gain(torch.tensor([1.0, -1.0]), torch.tensor(0.4), beta=0.5)
         tensor([6.2500, 4.1667])
     """
@@ -85,6 +87,7 @@ def actor_loss(
 
     Examples:
         >>> import torch
+        >>> from torchrl_l2c2.objectives.ppo_rpe import actor_loss
         >>> actor_loss(torch.tensor(1.0), torch.tensor([1.0, 3.0]), torch.tensor(0.4), beta=0.5)
         tensor([-1.0000, -1.4375])
     """
@@ -106,6 +109,7 @@ def critic_loss(
 
     Examples:
         >>> import torch
+        >>> from torchrl_l2c2.objectives.ppo_rpe import critic_loss
         >>> critic_loss(torch.tensor([[1.0]]), torch.tensor([[0.0, 3.0]]))
         tensor([2.5000])
     """
@@ -142,6 +146,7 @@ def update_deviation(
 
     Examples:
         >>> import torch
+        >>> from torchrl_l2c2.objectives.ppo_rpe import update_deviation
         >>> ratio = torch.tensor([1.0, 1.5])
         >>> update_deviation(torch.tensor(0.1), ratio, decay=0.9, floor=0.1, statistic="max")
         (tensor(0.5000), tensor(0.5000))
@@ -173,6 +178,7 @@ def importance_weight(
 
     Examples:
         >>> import torch
+        >>> from torchrl_l2c2.objectives.ppo_rpe import importance_weight
         >>> weight, mask = torch.tensor([1.0, 2.0, 8.0]), torch.tensor([True, True, False])
         >>> importance_weight(weight, "max", mask)
         tensor([0.5000, 1.0000, 0.0000])
@@ -186,23 +192,24 @@ def importance_weight(
 
 
 def of_each_transition(
-    log_ratio: Tensor,  # shape: [*B] or [*B, 1]
-    advantage: Tensor,  # shape: [*B]
+    log_prob: Tensor,  # shape: [*B] or [*B, 1]
+    batch: torch.Size,  # [*B]
+    name: str = "the policy's log-likelihood of an action",
 ) -> Tensor:  # shape: [*B]
-    """The log-likelihood in the shape of the advantage, one number per transition.
+    """A log-likelihood in the shape of the batch, one number per transition.
 
     Raises:
         ValueError: it has one number for each of several actions.
     """
-    if log_ratio.shape == (*advantage.shape, 1):
-        return log_ratio.squeeze(-1)
-    if log_ratio.shape != advantage.shape:
+    if log_prob.shape == (*batch, 1):
+        return log_prob.squeeze(-1)
+    if log_prob.shape != batch:
         raise ValueError(
-            f"the log-likelihood of an action must be one number, of shape "
-            f"{tuple(advantage.shape)} in this batch, got {tuple(log_ratio.shape)}: use a "
-            "distribution over whole actions, such as torchrl's IndependentNormal or TanhNormal."
+            f"{name} must be one number, of shape {tuple(batch)} in this batch, got "
+            f"{tuple(log_prob.shape)}: use a distribution over whole actions, such as torchrl's "
+            "IndependentNormal or TanhNormal."
         )
-    return log_ratio
+    return log_prob
 
 
 # At exp(20) the relative ratio is within 1e-8 of its limit, and the square fits float32.
@@ -439,7 +446,7 @@ class PPORPELoss(SharedEvaluation):
         advantage = (target - value).detach().squeeze(-1)
         tensordict.set(self.tensor_keys.priority, advantage.abs())
 
-        log_ratio = of_each_transition(self._log_ratio(tensordict), advantage)
+        log_ratio = self._log_ratio(tensordict)
         ratio = log_ratio.clamp(-MAX_LOG_RATIO, MAX_LOG_RATIO).exp()
         relative_ratio = relative_density_ratio(ratio.detach(), self.beta)
         mask = self._mask(tensordict, relative_ratio)
@@ -500,13 +507,16 @@ class PPORPELoss(SharedEvaluation):
         action = read_taken(tensordict, self.tensor_keys.action)
         parameters = self.evaluate_at_batch("actor_network", tensordict)
         log_prob = self.actor_network.build_dist_from_params(parameters).log_prob(action)
+        log_prob = of_each_transition(log_prob, batch := tensordict.batch_size)
         if self.baseline == "stored":
             key = self.tensor_keys.sample_log_prob
-            return log_prob - read_taken(tensordict, key, ", or take baseline='target'")
+            stored = read_taken(tensordict, key, ", or take baseline='target'")
+            return log_prob - of_each_transition(stored, batch, f"the batch's {key!r}")
         states = tensordict.select(*self.actor_network.in_keys)
         with torch.no_grad(), self.target_actor_network_params.to_module(self.actor_network):
             baseline = self.actor_network.get_dist(states).log_prob(action)
-        return log_prob - baseline  # Outside of no_grad: keeps the policy's gradient.
+        # Outside of no_grad: keeps the policy's gradient.
+        return log_prob - of_each_transition(baseline, batch)
 
     @torch.no_grad()
     def _update_threshold(

@@ -52,7 +52,7 @@ from torchrl_l2c2.presets import NEIGHBORHOOD_FIELDS
 Made = TypeVar("Made")
 
 GAIN = "regularizer_gain"
-"""Name of the coefficient that multiplies all added terms of a regularized loss."""
+"""Name of the coefficient that multiplies all added terms but the auxiliary ones."""
 
 NOT_SETTINGS = ("fold", "ramp", "set_progress", "unfold")
 """Methods that could be taken for settings."""
@@ -99,9 +99,10 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         base_loss (LossModule): the loss.
 
     Attributes:
-        strength (float): factor of all added terms, at least 0; of a ramp, its final value. Larger
-            values regularize more; 0 leaves the base loss's values and gradients unchanged. Assign
-            to it at any time, also between calls of a compiled loss.
+        strength (float): factor of all added terms but the auxiliary ones, at least 0; of a ramp,
+            its final value. Larger values regularize more; 0 leaves the base loss's values and
+            gradients unchanged, if the terms are finite. Assign to it at any time, also between
+            calls of a compiled loss.
         regularizer_gain (Tensor): the factor at present, at least 0; initially 1. A ramp sets it at
             every :meth:`set_progress`. Without a ramp it is the strength.
         policy_terms (frozenset of str): the added ``loss_*`` keys that train the policy.
@@ -333,7 +334,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
 
     @property
     def strength(self) -> float:
-        """Factor of all added terms; of a ramp, its final value."""
+        """Factor of all added terms but the auxiliary ones; of a ramp, its final value."""
         return self._buffers[GAIN].item() if self._ramp is None else self._ramp[0]
 
     @strength.setter
@@ -865,7 +866,10 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         rows: Tensor | None = None,
         counts: Tensor | None = None,
     ) -> Tensor:
-        """The unweighted mean over the unmasked batch, detached; with reduction="none" the values.
+        """The unweighted mean over the unmasked batch, detached.
+
+        With ``reduction="none"`` these are the values; with ``rows``, the values of these rows
+        multiplied by the batch's size divided by their number, and 0 in the other rows.
 
         The arguments are the same as for :meth:`reduce_term`.
         """

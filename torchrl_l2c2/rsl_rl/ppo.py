@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from difflib import get_close_matches
 from inspect import signature
 from typing import Any, ClassVar
 
@@ -77,12 +78,15 @@ class RegularizedPPO(PPO):
         max_iterations: int | None = None,
         **kwargs: Any,
     ) -> None:
-        for unknown in kwargs.keys() - signature(PPO.__init__).parameters.keys():
-            place = {"regularizer_cfg": {unknown: kwargs[unknown]}}
-            raise TypeError(
-                f"{unknown!r} is no argument of rsl_rl's PPO. A setting of the regularizer belongs "
-                f"in regularizer_cfg, as in {place}."
-            )
+        known = signature(PPO.__init__).parameters.keys()
+        for unknown in kwargs.keys() - known:
+            advice = f"It has {sorted(known - {'self'})}."
+            if unknown in _allowed_options((regularizer_cfg or {}).get("method", self.method)):
+                place = {"regularizer_cfg": {unknown: kwargs[unknown]}}
+                advice = f"It is a setting of the regularizer: write {place}."
+            elif near := get_close_matches(unknown, known, 1):
+                advice = f"Did you mean {near[0]!r}?"
+            raise TypeError(f"{unknown!r} is no argument of rsl_rl's PPO. {advice}")
         networks = ActorCriticLoss(actor, critic)
         _check_groups(storage.observations.keys(), (*ENTRIES, ROW, "next"))
         super().__init__(actor, critic, SuccessorStorage(storage), *args, **kwargs)
@@ -241,7 +245,8 @@ class L2C2PPO(RegularizedPPO):
     diagnostics of L2C2Loss.
 
     Takes the arguments of :class:`RegularizedPPO`. ``regularizer_cfg`` accepts the arguments of
-    :class:`~torchrl_l2c2.Neighborhood` and L2C2Loss, ``strength`` and ``ramp_updates``.
+    :class:`~torchrl_l2c2.Neighborhood` and of L2C2Loss (but ``neighborhood`` and ``skip_ends``),
+    ``strength`` and ``ramp_updates``.
 
     Examples:
         >>> import torch
@@ -283,7 +288,7 @@ class CATSPPO(RegularizedPPO):
     treated as in :class:`L2C2PPO`.
 
     Takes the arguments of :class:`RegularizedPPO`. ``regularizer_cfg`` accepts the arguments of
-    CATSLoss, ``strength`` and ``ramp_updates``.
+    CATSLoss (but ``skip_ends``), ``strength`` and ``ramp_updates``.
     """
 
     method = "cats"
@@ -304,13 +309,18 @@ def _check_method(method: str, algorithm: type[RegularizedPPO]) -> None:
         )
 
 
-def _check_options(method: str, options: Iterable[str]) -> None:
-    allowed = set(signature(getattr(objectives, METHODS[method])).parameters)
+def _allowed_options(method: str | None) -> set[str]:
+    """Names of the entries of ``regularizer_cfg``; of an unknown method, those of L2C2."""
+    allowed = set(signature(getattr(objectives, METHODS.get(method or "", "L2C2Loss"))).parameters)
     if "neighborhood" in allowed:
         allowed |= NEIGHBORHOOD_FIELDS
     # Transitions that end an episode are always left out.
     allowed -= {"base_loss", "neighborhood", "skip_ends"}
-    allowed |= {"method", "strength", "ramp_updates"}
+    return allowed | {"method", "strength", "ramp_updates"}
+
+
+def _check_options(method: str, options: Iterable[str]) -> None:
+    allowed = _allowed_options(method)
     if unknown := sorted(set(options) - allowed):
         raise TypeError(
             f"Expected settings of {method} in regularizer_cfg, {sorted(allowed)}, got {unknown}."

@@ -35,6 +35,7 @@ class SuccessorStorage(RolloutStorage):
         >>> import torch
         >>> from rsl_rl.storage import RolloutStorage
         >>> from tensordict import TensorDict
+        >>> from torchrl_l2c2.rsl_rl import SuccessorStorage
         >>> obs = TensorDict({"policy": torch.zeros(2, 3)}, [2])
         >>> storage = SuccessorStorage(RolloutStorage("rl", 2, 4, obs, [1]))
         >>> storage.observations.shape

@@ -25,12 +25,13 @@ def draw_neighbors(
 ) -> TensorDictBase:
     """Draws the neighbors of a batch ``[*B]``, which the transform writes and the loss reads.
 
-    Arguments and errors are the same as for :class:`NeighborTransform`.
+    Arguments are the same as for :class:`NeighborTransform`, without defaults for the first three.
 
     Returns:
         The entry that :class:`NeighborTransform` writes.
 
     Examples:
+        >>> from tensordict import TensorDict
         >>> import torch
         >>> from torchrl_l2c2 import Neighborhood
         >>> from torchrl_l2c2.transforms import draw_neighbors
