@@ -78,6 +78,11 @@ class RegularizedPPO(PPO):
         max_iterations: int | None = None,
         **kwargs: Any,
     ) -> None:
+        if not isinstance(regularizer_cfg, Mapping | None):
+            raise TypeError(
+                "Expected regularizer_cfg to be a dict of settings, such as {'strength': 2.0}, got "
+                f"{regularizer_cfg!r}."
+            )
         known = signature(PPO.__init__).parameters.keys()
         for unknown in kwargs.keys() - known:
             advice = f"It has {sorted(known - {'self'})}."
@@ -90,11 +95,6 @@ class RegularizedPPO(PPO):
         networks = ActorCriticLoss(actor, critic)
         _check_groups(storage.observations.keys(), (*ENTRIES, ROW, "next"))
         super().__init__(actor, critic, SuccessorStorage(storage), *args, **kwargs)
-        if not isinstance(regularizer_cfg, Mapping | None):
-            raise TypeError(
-                "Expected regularizer_cfg to be a dict of settings, such as {'strength': 2.0}, got "
-                f"{regularizer_cfg!r}."
-            )
         if max_iterations is not None:
             check_positive_int("max_iterations", max_iterations)
         overrides = dict(regularizer_cfg or {})
@@ -310,7 +310,7 @@ def _check_method(method: str, algorithm: type[RegularizedPPO]) -> None:
 
 
 def _allowed_options(method: str | None) -> set[str]:
-    """Names of the entries of ``regularizer_cfg``; of an unknown method, those of L2C2."""
+    """Names of the entries of ``regularizer_cfg``; for an unknown method, the entries of L2C2."""
     allowed = set(signature(getattr(objectives, METHODS.get(method or "", "L2C2Loss"))).parameters)
     if "neighborhood" in allowed:
         allowed |= NEIGHBORHOOD_FIELDS
