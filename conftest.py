@@ -15,5 +15,6 @@ collect_ignore = [] if find_spec("rsl_rl") else ["torchrl_l2c2/rsl_rl"]
 
 def pytest_itemcollected(item: Item) -> None:
     """Runs the examples of components as a reader would, without the names of their module."""
-    if isinstance(item, DoctestItem) and not item.name.startswith("torchrl_l2c2.experiment."):
+    experiment = item.name.startswith("torchrl_l2c2.experiment.")
+    if isinstance(item, DoctestItem) and item.name.startswith("torchrl_l2c2.") and not experiment:
         item.dtest.globs = {}

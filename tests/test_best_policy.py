@@ -118,24 +118,26 @@ def test_without_a_seed_evaluate_plays_the_runs_own_test(folder):
 
 
 @pytest.mark.parametrize(
-    ("option", "told"),
+    ("output", "told"),
     [
-        ("--output=file/x.json", r"the folder '.*file' cannot be written to .*; choose another"),
-        ("--output=.", "expected a file, got the folder"),
+        ("file/x", r"the folder '.*file' cannot be written to .*; choose another"),
+        ("folder", "expected a file, got the folder"),
     ],
 )
 def test_what_could_not_be_written_is_refused_before_it_is_played(
-    folder, tmp_path, monkeypatch, option, told
+    folder, tmp_path, monkeypatch, output, told
 ):
     """By all commands that write what they played."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
+    for ending in ("json", "html"):
+        (tmp_path / f"folder.{ending}").mkdir()
     for module, name in LOADS:
         monkeypatch.setattr(module, name, None)
     with pytest.raises(SystemExit, match=f"error: .*{told}"):
-        main([str(folder), option])
+        main([str(folder), f"--output={output}.json"])
     with pytest.raises(SystemExit, match=f"error: .*{told}"):
-        diagnose.main([str(folder), option])
+        diagnose.main([str(folder), f"--output={output}.html"])
 
 
 @pytest.mark.parametrize(

@@ -48,6 +48,7 @@ from torchrl_l2c2.experiment.analysis.diagnosis.film import film
 from torchrl_l2c2.experiment.analysis.diagnosis.names import run_folders, run_names
 from torchrl_l2c2.experiment.analysis.diagnosis.page import page
 from torchrl_l2c2.experiment.analysis.diagnosis.run import _batch
+from torchrl_l2c2.experiment.cli import evaluate
 from torchrl_l2c2.experiment.cli.diagnose import main
 from torchrl_l2c2.experiment.errors import SimulatorError, UserError
 from torchrl_l2c2.experiment.learn.learner import Learner
@@ -126,6 +127,14 @@ class TestWords:
         """Beside a smooth one."""
         actions = torch.cat([0.5 * SINE, 0.5 * FLIPPING], 1)
         assert said(made_up(actions), "flips").text.startswith("action[1]")
+
+    def test_a_short_recording_chatters_as_a_long_one_does(self):
+        """A sine of 30 Hz at 200 Hz; four periods are enough."""
+        time = torch.arange(400.0) / 200
+        action = torch.sin(2 * torch.pi * 30 * time).unsqueeze(-1)
+        for length in (30, 60, 99, 400):
+            found = diagnose_actions(action[:length], bounds=(-1.5, 1.5), rate=200.0)
+            assert "chatters" in kinds(found)
 
     def test_many_actions_with_one_fault_share_a_finding(self):
         """Two have a sentence each; with three, one sentence names all, the largest first."""
@@ -889,18 +898,30 @@ class TestCommand:
             main([str(run)])
         assert ended.value.code == 130 and capsys.readouterr().err == "interrupted.\n"
 
+    def test_no_file_of_a_run_is_overwritten(self, run, tmp_path):
+        """Nor a recording: the page ends in .html, a picture in .svg, a test in .json."""
+        before = {path: path.read_bytes() for path in run.iterdir() if path.is_file()}
+        for wrong, message in (
+            (["--output", str(run / "policy.pt")], r"ends in \.html, got '.*policy.pt'"),
+            (["--actions", str(tmp_path / "a.png")], r"ends in \.svg, got '.*a.png'"),
+        ):
+            with pytest.raises(SystemExit, match=message):
+                main([str(run), *wrong])
+        for name in ("evaluation.json", "config.json"):
+            with pytest.raises(SystemExit, match=f"{name}' is a file of the run there"):
+                evaluate.main([str(run), "--episodes", "1", "--output", str(run / name)])
+        with pytest.raises(SystemExit, match=r"ends in \.json, got '.*metrics.csv'"):
+            evaluate.main([str(run), "--output", str(run / "metrics.csv")])
+        assert before == {path: path.read_bytes() for path in before}
+
     def test_what_is_wrong_is_one_line(self, run, tmp_path, capsys):
         """A folder that is no run; the same run twice; names that are too few."""
         with pytest.raises(SystemExit):
             main([str(run), str(tmp_path), "--names", "one"])
         assert "--names must have 2 names, one per run" in capsys.readouterr().err
-        for wrong, message in (
-            (["--names", "a", "a"], "--names must differ from each other"),
-            (["--actions", "a.png"], "--actions must be an SVG file"),
-        ):
-            with pytest.raises(SystemExit):
-                main([str(run), str(tmp_path), *wrong])
-            assert message in capsys.readouterr().err
+        with pytest.raises(SystemExit):
+            main([str(run), str(tmp_path), "--names", "a", "a"])
+        assert "--names must differ from each other" in capsys.readouterr().err
         with pytest.raises(SystemExit, match=r"^error: '.*' is not a run folder"):
             main([str(tmp_path)])
         for name in ("a", "b"):

@@ -395,7 +395,8 @@ def test_a_regularizer_begins_with_the_preset_of_the_algorithm(name, algorithm):
     assert config.regularizer.ramped == ramped
     told = describe_preset(config)
     assert all(f"{setting}={value}" in told for setting, value in table.settings.items())
-    assert (table.evidence or "its authors' settings") in told
+    other = "gain" in own and own["gain"] != ("constant" if table.ramp is None else "ramp")
+    assert ("except gain)" if other else table.evidence or "not tuned") in told
 
 
 def test_the_strength_is_set_beside_a_preset():
@@ -405,6 +406,8 @@ def test_the_strength_is_set_beside_a_preset():
         for given in ([], ["regularizer.strength=0.5"])
     )
     assert stronger.regularizer == dataclasses.replace(usual.regularizer, strength=0.5)
+    told = describe_preset(stronger)
+    assert "strength=0.5 (the preset for sac except strength)" in told and "results" not in told
 
 
 def test_l2c2_paper_begins_with_the_papers_settings():
@@ -440,6 +443,15 @@ def test_every_setting_says_what_it_is():
                 assert f"| `{prefix}{name}` |" in written
                 assert meaning.replace("|", "\\|") in written
     assert (ROOT / "docs" / "settings.md").read_text() == written, "write it anew"
+
+
+def test_the_help_has_the_defaults_of_the_usual_choice():
+    """And those of the others after their names; a number may stand among words."""
+    lines = {line.split("=")[0].strip(): line for line in manual().splitlines() if "=" in line}
+    distance = lines["regularizer.policy_distance"]
+    assert "=hellinger " in distance and distance.endswith("(sr2l, l2c2; sr2l: jeffreys)")
+    assert "=0.001 " in lines["optimizer.lr"] and lines["optimizer.lr"].endswith("(adam: 0.0003)")
+    assert describe(SACConfig)["target_entropy"][0] == "scaled | a number"
 
 
 def test_settings_are_read_without_torch():

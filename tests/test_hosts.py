@@ -266,7 +266,7 @@ def test_only_missing_next_observations_are_warned_of(
 ) -> None:
     """Once; the reset state looks like any other."""
     missing = request.node.callspec.params["trained"] == MISSING
-    assert sum("not finite" in message for message in trained.warned) == missing
+    assert sum("without a finite entry" in message for message in trained.warned) == missing
 
 
 def test_the_page_tells_the_next_observations_apart(

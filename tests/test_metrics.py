@@ -268,7 +268,9 @@ def test_noise_sensitivity_refuses_what_is_no_action():
 
 def test_noise_sensitivity_refuses_integers():
     """Noise on them would be rounded away."""
-    with pytest.raises(TypeError, match=r"floating point, got torch\.uint8: noise on integers"):
+    with pytest.raises(
+        TypeError, match=r"floating-point tensor, got torch\.uint8: noise on integers"
+    ):
         noise_sensitivity(lambda s: s, torch.zeros(4, 3, dtype=torch.uint8), 0.2)
 
 

@@ -252,8 +252,9 @@ class TestGroups:
         assert [group.name for group in groups] == ["baseline", "L2C2"]
         notes = settings_notes(groups)
         assert [note.removeprefix("swingup, ppo_rpe: ") for note in notes] == [
-            "other than the defaults in every row: `algorithm.replay_ratio=5`, `task.episodes=20`.",
-            "L2C2, other than the defaults: `regularizer.gain=ramp`.",
+            "in every row, other than the defaults without a preset: `algorithm.replay_ratio=5`, "
+            "`task.episodes=20`.",
+            "L2C2, other than the defaults without a preset: `regularizer.gain=ramp`.",
         ]
 
     def test_runs_of_several_versions_are_pooled_and_told(self, records):

@@ -474,6 +474,15 @@ def test_a_setting_that_changes_nothing_may_be_new():
         check_same_settings(saved, now.to_dict())
 
 
+def test_all_changed_settings_are_named():
+    saved = small().to_dict()
+    saved["optimizer"]["lr"], saved["algorithm"]["gamma"] = 0.5, 0.25
+    with pytest.raises(
+        OtherRunError, match=r"made with algorithm.gamma=0.25, .*; optimizer.lr=0.5"
+    ):
+        check_same_settings(saved, small().to_dict())
+
+
 def test_another_choice_is_named_and_not_what_it_brings():
     """Its settings are others, too, and come first in the alphabet."""
     saved = small(regularizer=NoRegularizerConfig()).to_dict()

@@ -28,6 +28,16 @@ class MissingPackageError(UserError, ImportError):
     """A package of an optional extra is not installed."""
 
 
+def how_to_install(extra: str) -> str:
+    """Tells how to install an extra of this package, which is not on PyPI.
+
+    Examples:
+        >>> how_to_install("video")
+        'In a clone of the repository, run: pip install -e ".[video]"'
+    """
+    return f'In a clone of the repository, run: pip install -e ".[{extra}]"'
+
+
 class SimulatorError(RuntimeError):
     """An error in the environment or its policy. The original error is chained."""
 

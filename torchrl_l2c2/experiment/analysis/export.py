@@ -27,7 +27,7 @@ from torchrl_l2c2.experiment.agents.networks import action_bounds
 from torchrl_l2c2.experiment.collect.episodes import play_episodes
 from torchrl_l2c2.experiment.envs.environments import untransformed
 from torchrl_l2c2.experiment.envs.pictures import control_rate
-from torchrl_l2c2.experiment.errors import MissingPackageError, UserError
+from torchrl_l2c2.experiment.errors import MissingPackageError, UserError, how_to_install
 from torchrl_l2c2.experiment.run.files import (
     make_folder,
     read_config,
@@ -111,8 +111,8 @@ def export_policy(
     missing = [name for name in NEEDED if find_spec(name) is None]
     if missing:
         raise MissingPackageError(
-            f"Expected the packages of the export extra, got none of {', '.join(missing)}. "
-            'Run pip install "torchrl-l2c2[export]".'
+            f"Expected the packages of the export extra, {', '.join(missing)} not installed. "
+            f"{how_to_install('export')}"
         )
     policy, env, max_steps = load_policy(run, best=best)
     folder = make_folder(output or Path(run) / "export")
@@ -123,7 +123,9 @@ def export_policy(
     # Two rows, even if an episode has one step: torch treats a batch of 1 as a constant.
     program, content = _translate(mean, observations[[0, -1]])
     act = _onnx_function(content)
-    agreement = _compare(mean, act, observations)
+    agreement = _compare(mean, act, observations, "ONNX")
+    run_program = program.module()
+    _compare(mean, lambda batch: run_program(torch.from_numpy(batch)), observations, "torch.export")
     contract = {
         **_origin(Path(run), best),
         "observation": _describe_observation(env),
@@ -174,14 +176,14 @@ def _onnx_function(content: bytes) -> Callable[[Any], Any]:
 
 @torch.no_grad()
 def _compare(
-    mean: MeanPolicy, act: Callable[[Any], Any], observations: Tensor
+    mean: MeanPolicy, act: Callable[[Any], Any], observations: Tensor, kind: str
 ) -> dict[str, float | int]:
     expected = mean(observations).numpy()
     difference = float(np.abs(act(observations.numpy()) - expected).max())
     largest = float(np.abs(expected).max())
     if not difference <= TOLERANCE * max(1.0, largest):
         raise UserError(
-            f"the ONNX policy differs from PyTorch's by {difference:.3g} on {len(observations)} "
+            f"the {kind} policy differs from PyTorch's by {difference:.3g} on {len(observations)} "
             f"recorded observations with actions up to {largest:.3g}. No file was written."
         )
     return {"observations": len(observations), "largest_difference": difference}

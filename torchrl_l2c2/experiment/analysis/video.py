@@ -20,7 +20,7 @@ from torchrl_l2c2.experiment.agents._torchrl_internals import simulator_of
 from torchrl_l2c2.experiment.collect.episodes import play_episodes
 from torchrl_l2c2.experiment.envs.environments import untransformed
 from torchrl_l2c2.experiment.envs.pictures import USUAL_RATE, Drawing, control_rate
-from torchrl_l2c2.experiment.errors import MissingPackageError, UserError
+from torchrl_l2c2.experiment.errors import MissingPackageError, UserError, how_to_install
 from torchrl_l2c2.experiment.run.files import make_parent_folder
 from torchrl_l2c2.experiment.run.policies import load_policy, seed_of_test
 from torchrl_l2c2.experiment.run.process import ProcessState
@@ -39,8 +39,8 @@ def check_video(path: Path) -> None:
     """
     if find_spec("imageio_ffmpeg") is None:
         raise MissingPackageError(
-            "Expected the package imageio-ffmpeg, which is not installed. Run pip install "
-            '"torchrl-l2c2[video]".'
+            "Expected the package imageio-ffmpeg, which is not installed. "
+            f"{how_to_install('video')}"
         )
     if path.suffix.lower() not in ENDINGS:
         raise UserError(

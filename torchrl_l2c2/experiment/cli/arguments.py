@@ -17,7 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_l2c2.experiment.cli.composition import one_line_message, read
 from torchrl_l2c2.experiment.cli.sweep import list_jobs, list_jobs_to_check
-from torchrl_l2c2.experiment.errors import UserError, is_lack_of_memory
+from torchrl_l2c2.experiment.errors import UserError, how_to_install, is_lack_of_memory
 from torchrl_l2c2.experiment.run.metrics_log import check_installed
 from torchrl_l2c2.experiment.settings.config import ExperimentConfig
 from torchrl_l2c2.experiment.settings.fields import SettingError
@@ -47,8 +47,7 @@ def check_launcher(arguments: Sequence[str]) -> None:
     """
     for name, (plugin, extra) in LAUNCHERS.items():
         if f"hydra/launcher={name}" in arguments and find_spec(plugin) is None:
-            needed = f"pip install 'torchrl-l2c2[{extra}]'"
-            sys.exit(f"error: hydra/launcher={name} needs the extra {extra}: {needed}.")
+            sys.exit(f"error: hydra/launcher={name} needs an extra. {how_to_install(extra)}")
 
 
 def check_sweep(arguments: Sequence[str]) -> None:

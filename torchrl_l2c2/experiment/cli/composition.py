@@ -31,7 +31,11 @@ from omegaconf.errors import ValidationError as OmegaConfValidationError
 from torchrl_l2c2.experiment.settings.config import COMMAND_SETTINGS, GROUPS, ExperimentConfig
 from torchrl_l2c2.experiment.settings.fields import SettingError, describe
 from torchrl_l2c2.experiment.settings.naming import run_name
-from torchrl_l2c2.experiment.settings.regularizers import BEGIN_WITH_PRESET, preset_settings
+from torchrl_l2c2.experiment.settings.regularizers import (
+    BEGIN_WITH_PRESET,
+    REGULARIZERS,
+    preset_settings,
+)
 from torchrl_l2c2.presets import KINDS, preset
 
 PACKAGE = Path(__file__).parents[2]
@@ -325,11 +329,15 @@ def describe_preset(config: ExperimentConfig) -> str | None:
     if regularizer.name not in BEGIN_WITH_PRESET:
         return None
     method, _ = BEGIN_WITH_PRESET[regularizer.name]
-    initial = preset_settings(regularizer.name, algorithm)
-    chosen = ", ".join(f"{name}={getattr(regularizer, name)}" for name in initial)
-    source = preset(method, algorithm)
-    origin = f"{source.evidence}, on {source.tasks}" if source.evidence else "its authors' settings"
-    return f"regularizer={regularizer.name}: {chosen} (the preset for {algorithm}: {origin})"
+    initial, source = preset_settings(method, algorithm), preset(method, algorithm)
+    usual = REGULARIZERS[method]
+    expected = {name: getattr(usual, name) for name in describe(type(usual))} | initial
+    changed = [name for name in expected if getattr(regularizer, name) != expected[name]]
+    shown = dict.fromkeys([*initial, *changed])
+    chosen = ", ".join(f"{name}={getattr(regularizer, name)}" for name in shown)
+    origin = f": {source.evidence}, on {source.tasks}" if source.evidence else ", not tuned"
+    note = f" except {', '.join(changed)}" if changed else origin
+    return f"regularizer={regularizer.name}: {chosen} (the preset for {algorithm}{note})"
 
 
 def show_sweep_hint() -> None:

@@ -17,12 +17,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         parser.error(f"--episodes must be at least 1, got {chosen.episodes}")
     if len(set(chosen.names or ())) < len(chosen.names or ()):
         parser.error(f"--names must differ from each other, got {chosen.names}")
-    if chosen.actions and not chosen.actions.endswith(".svg"):
-        parser.error(f"--actions must be an SVG file, FILE.svg, got {chosen.actions}")
     with one_line_errors():
         from torchrl_l2c2.experiment.analysis import diagnosis
         from torchrl_l2c2.experiment.envs.environments import TEST_SEED
-        from torchrl_l2c2.experiment.run.files import make_parent_folder, write_atomically
+        from torchrl_l2c2.experiment.run.files import check_output, write_atomically
 
         folders = diagnosis.run_folders(chosen.folders)
         if chosen.names and len(chosen.names) != len(folders):
@@ -33,10 +31,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         page = first.with_suffix(".html") if _is_recording(first) else first / "diagnosis.html"
         path = Path(chosen.output or page)
         # Before the episodes, whose results could otherwise be lost.
-        for each in filter(None, (chosen.output, chosen.actions)):
-            make_parent_folder(each)
-        if path == page and page.parent.is_dir():  # Otherwise the missing run is reported below.
-            make_parent_folder(page)
+        if chosen.output or page.parent.is_dir():  # Otherwise the missing run is reported below.
+            check_output(path, ".html")
+        if chosen.actions:
+            check_output(chosen.actions, ".svg")
         names = chosen.names or diagnosis.run_names(folders)
         diagnoses = [
             diagnosis.diagnose_recording(
@@ -81,7 +79,10 @@ def _parser() -> argparse.ArgumentParser:
         "seconds",
     )
     add("--names", nargs="+", help="names of the runs (default: the settings that differ)")
-    add("--output", help="HTML file (default: diagnosis.html in the first folder)")
+    add(
+        "--output",
+        help="HTML file (default: diagnosis.html in the first folder, or FILE.html of a FILE.csv)",
+    )
     add(
         "--bounds",
         nargs=2,

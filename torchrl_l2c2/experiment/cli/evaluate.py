@@ -21,12 +21,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     chosen = _parser().parse_args(arguments)
     levels = chosen.noise or [None]
     with one_line_errors():
-        from torchrl_l2c2.experiment.run.files import make_parent_folder, to_json, write_json
+        from torchrl_l2c2.experiment.run.files import check_output, to_json, write_json
         from torchrl_l2c2.experiment.run.policies import seed_of_test
 
         # Before the episodes, whose results could otherwise be lost.
         if chosen.output:
-            make_parent_folder(chosen.output)
+            check_output(chosen.output, ".json")
         played = {level: _play(chosen, level) for level in levels}
         one = len(played) == 1
         try:

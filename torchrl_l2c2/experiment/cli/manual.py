@@ -41,12 +41,19 @@ def manual() -> str:
             for name in describe(type(chosen)):
                 having.setdefault(name, []).append(chosen)
         for name, owners in having.items():
-            _, meaning = describe(type(owners[0]))[name]
+            # The default and the meaning of the choice that is used without one.
+            usual = type(getattr(ExperimentConfig(), group))
+            first = next((each for each in owners if isinstance(each, usual)), owners[0])
+            _, meaning = describe(type(first))[name]
             lacking = [kind.name for kind in kinds.values() if kind not in owners]
             only = f"not {', '.join(lacking)}" if lacking else ""
             if len(lacking) >= len(owners):
                 only = ", ".join(each.name for each in owners)
-            lines.append(_line(f"{group}.{name}", getattr(owners[0], name), meaning, only))
+            default = getattr(first, name)
+            if others := [each for each in owners if getattr(each, name) != default]:
+                values = ", ".join(f"{e.name}: {_written(getattr(e, name))}" for e in others)
+                only = "; ".join(filter(None, (only, values)))
+            lines.append(_line(f"{group}.{name}", default, meaning, only))
     end = "Ranges and full descriptions: python -m torchrl_l2c2 settings"
     return HEAD + "\n".join([*lines, "", end]) + "\n"
 

@@ -28,11 +28,19 @@ def check_same_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> Non
         now (Mapping): Current settings.
 
     Raises:
-        OtherRunError: If a setting has changed; states the first one with both values.
+        OtherRunError: If a setting has changed; states each with both values.
     """
-    for name, (was, is_now) in changed_settings(saved, now).items():
+    changed = changed_settings(saved, now)
+    # Another choice of a group brings other settings.
+    chosen = {name.removesuffix(".name") for name in changed if name.endswith(".name")}
+    told = [
+        f"{name.removesuffix('.name')}={was}, not {is_now}"
+        for name, (was, is_now) in changed.items()
+        if name.endswith(".name") or name.partition(".")[0] not in chosen
+    ]
+    if told:
         raise OtherRunError(
-            f"the checkpoint was made with {name.removesuffix('.name')}={was}, not {is_now}: use "
+            f"the checkpoint was made with {'; '.join(told)}: use "
             "the same settings, or start in another folder (on the command line, outputs=FOLDER). "
             "Nothing was changed."
         )

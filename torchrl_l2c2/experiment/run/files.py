@@ -17,6 +17,7 @@ from typing import Any
 from torchrl_l2c2.experiment.errors import UserError
 
 REMEDY = "it was changed or truncated after it was written; restore it."
+OF_A_RUN = ("config.json", "versions.json", "evaluation.json", "evaluations.json")
 RETEST_HINT = " Or delete it: the run's command then tests the policy again."
 
 
@@ -47,6 +48,25 @@ def make_parent_folder(path: str | Path) -> None:
     if Path(path).is_dir():
         raise OSError(f"expected a file, got the folder {str(path)!r}.")
     make_folder(Path(path).parent)
+
+
+def check_output(path: str | Path, ending: str) -> None:
+    """Checks that an output file has its ending and is no file of a run, and creates its folder.
+
+    Args:
+        path (str or Path): The file.
+        ending (str): Ending of the file, such as ``".json"``.
+
+    Raises:
+        UserError: If the file has another ending, or is a file that a run needs.
+        OSError: As :func:`make_parent_folder`.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ending:
+        raise UserError(f"Expected a file that ends in {ending}, got {str(path)!r}. Rename it.")
+    if path.name in OF_A_RUN and (path.parent / "config.json").exists():
+        raise UserError(f"{str(path)!r} is a file of the run there. Choose another name.")
+    make_parent_folder(path)
 
 
 def write_atomically(path: str | Path, content: bytes) -> None:

@@ -11,7 +11,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torchrl_l2c2.experiment.errors import OtherRunError, UserError
+from torchrl_l2c2.experiment.errors import OtherRunError, UserError, how_to_install
 from torchrl_l2c2.experiment.run.files import append_line, write_atomically
 from torchrl_l2c2.experiment.settings.fields import SettingError
 
@@ -136,8 +136,8 @@ def check_installed(name: str) -> None:
     if package is not None and find_spec(package) is None:
         raise SettingError(
             "logger.name",
-            f"{name!r} needs the package {package}, which is not installed: "
-            f'pip install "torchrl-l2c2[{name}]", or use csv or tensorboard.',
+            f"{name!r} needs the package {package}, which is not installed. Use csv or "
+            f"tensorboard, or install it. {how_to_install(name)}",
         )
 
 

@@ -123,6 +123,7 @@ def describe(group: type) -> dict[str, tuple[str, str]]:
     return _described[group]
 
 
+NUMBERS = ("number", "integer")
 _LIMITS = {
     "exclusiveMinimum": "> {}",
     "minimum": ">= {}",
@@ -138,6 +139,8 @@ def _allowed(annotation: Any, declared: Any) -> str:
     limits = [
         form.format(kind[key]) for kind in kinds for key, form in _LIMITS.items() if key in kind
     ]
+    if choices and not limits and any(kind.get("type") in NUMBERS for kind in kinds):
+        limits = ["a number"]
     return " | ".join([*choices, *([", ".join(limits)] if limits else [])])
 
 

@@ -44,7 +44,7 @@ def threshold(name: str) -> float:
 
 
 PARTS = 20  # of an episode in which an action may chatter
-PERIODS = 4  # of the slowest of the fast frequencies, at least, in a part
+PERIODS = 4  # of the slowest of the fast frequencies, at least, in an episode or a part of it
 FULL = 2  # findings of one kind that each have a sentence
 MOST_NAMES = 12  # of further actions with the same finding
 TAIL = 1.4  # times the peak's height: a higher spectrum just below it is of a slower movement
@@ -206,6 +206,7 @@ def _chatters(name: str, action: Tensor, rate: float | None) -> Iterator[Finding
     above = threshold("FAST")
     if rate is not None:
         above = min(above, threshold("FAST_HERTZ") / rate)
+    above = max(above, PERIODS / len(action))
     spectrum = torch.fft.rfft(action - action.mean())
     spectrum[: math.ceil(above * len(action))] = 0.0
     fast = torch.fft.irfft(spectrum, len(action))
@@ -236,8 +237,6 @@ def _peak(action: Tensor, above: float) -> float | None:
 
     ``None`` if it belongs to the tail of a slower movement's spectrum, such as a jump's.
     """
-    if len(action) * above < PERIODS:
-        return None
     window = torch.hann_window(len(action), dtype=action.dtype)
     heights = torch.fft.rfft((action - action.mean()) * window).abs()
     first = math.ceil(above * len(action))

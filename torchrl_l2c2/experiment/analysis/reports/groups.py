@@ -110,11 +110,11 @@ def settings_notes(groups: Sequence[Group]) -> list[str]:
     for together in by_task(groups):
         where = f"{together[0].first.task}, {together[0].first.algorithm}"
         shared = _common(together)
-        rows = [("other than the defaults in every row", shared)]
+        rows = [("in every row, other than the defaults without a preset", shared)]
         for method in dict.fromkeys(group.first.method for group in together):
             common = _common([group for group in together if group.first.method == method])
             own = {k: v for k, v in common.items() if _is_own(k) and k not in shared}
-            rows.append((f"{method_name(method)}, other than the defaults", own))
+            rows.append((f"{method_name(method)}, other than the defaults without a preset", own))
         for which, settings in rows:
             if settings:
                 listed = ", ".join(f"`{name}={value}`" for name, value in settings.items())
