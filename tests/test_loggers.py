@@ -57,6 +57,6 @@ def test_a_logger_that_is_not_installed_is_refused_with_what_to_do(tmp_path, mon
         "torchrl_l2c2.experiment.run.metrics_log.find_spec",
         lambda package: None if package == name else find_spec(package),
     )
-    with pytest.raises(SettingError, match=rf"logger.name '{name}' needs .*torchrl-l2c2\[{name}\]"):
+    with pytest.raises(SettingError, match=rf"logger.name '{name}' needs .*\.\[{name}\]"):
         trained(tmp_path / "run", name)
     assert not list(tmp_path.iterdir())
