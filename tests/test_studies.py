@@ -584,18 +584,21 @@ class TestProse:
                 group.scores("last_mean", "return").mean() for group in (ours, baseline)
             )
             higher.append(total > other)
-        assert len(rough) == 12 and len(smooth) == 5 and sum(higher) == 7 and len(higher) == 17
+        assert len(rough) == 12 and len(smooth) == 5 and sum(higher) == 6 and len(higher) == 17
         assert f"fell by {-max(rough)} to {-min(rough)}%, in ten of them beyond" in readme
         assert f"the other five it changed by {min(smooth)} to {max(smooth):+}%" in readme
         # Eleven with LunarLander, which is among the other five.
         assert beyond["action_variation", True, False] == 11
         assert beyond["action_variation", False, True] == 0
-        assert "was higher in seven and lower in ten, of these beyond seed noise in two" in readme
-        assert beyond["return", False, True] == 2
+        assert (
+            "was higher in six and lower in eleven. Beyond seed noise, runs return more" in readme
+        )
+        assert "more in four benchmarks and less in two" in readme
+        assert beyond["return", True, False] == 4 and beyond["return", False, True] == 2
         cheetah, baseline = benchmarks()["HalfCheetah", "PPO"]
         returned = [group.scores("last_mean", "return").mean() for group in (cheetah, baseline)]
-        assert f"by {1 - returned[0] / returned[1]:.0%} for PPO on HalfCheetah, with thr" in readme
-        assert len(cheetah.seeds) == 3
+        assert f"by {1 - returned[0] / returned[1]:.0%} for PPO on HalfCheetah, with five" in readme
+        assert len(cheetah.seeds) == 5
         points, baseline = benchmarks()["noisy points", "PPO of rsl_rl"]
         returned = [group.scores("last_mean", "return").mean() for group in (points, baseline)]
         assert f"by {1 - returned[0] / returned[1]:.1%} on rsl_rl's noisy points" in readme
@@ -607,10 +610,10 @@ class TestProse:
         means = [[g.scores("last_mean", "action_variation").mean() for g in pair] for pair in pairs]
         smoother = sum(cats < ours for cats, ours in means)
         table = (ROOT / "docs" / "results.md").read_text().split("### CATS against L2C2")[1]
-        assert (smoother, len(pairs)) == (8, 11)
-        assert "8 of 11 |\n" in table
+        assert (smoother, len(pairs)) == (7, 11)
+        assert "7 of 11 |\n" in table
         for path in ("README.md", "docs/methods.md", "docs/limitations.md"):
-            assert "8 of 11 benchmarks" in " ".join((ROOT / path).read_text().split())
+            assert "7 of 11 benchmarks" in " ".join((ROOT / path).read_text().split())
         sides = [list(side) for side in zip(*pairs, strict=True)]
         for quantity in ("action_variation", "return", "sm_asap"):
             assert improvement(*sides, "last_mean", quantity).text() in table
@@ -711,32 +714,34 @@ class TestProse:
         shares = (ours / baseline)["last_mean_action_variation"]
         smoother = shares[["Ant-v5", "BipedalWalker-v3", "HalfCheetah-v5"]]
         assert f"{100 * smoother.min():.0f} to {smoother.max():.0%} of the baseline's" in page
-        assert 0.95 < shares["Reacher-v5"] < 1.05
+        assert 0.9 < shares["Reacher-v5"] < 1.1
         returns = {name: side["last_mean_return"] for name, side in (("l", ours), ("b", baseline))}
         gained = (returns["l"] - returns["b"]) / returns["b"].abs()
-        assert set(gained[gained < -0.01].index) == {"HalfCheetah-v5"}
+        assert set(gained[gained < -0.02].index) == {"HalfCheetah-v5"}
         assert set(gained[gained > 0.01].index) == {"Ant-v5", "BipedalWalker-v3", "Swimmer-v5"}
         assert f"on HalfCheetah ({gained['HalfCheetah-v5']:.0%}, less than the baseline" in page
         lost = f"[HalfCheetah](../results/new_tasks.md) it is {-gained['HalfCheetah-v5']:.0%} lower"
         assert lost in (ROOT / "docs" / "limitations.md").read_text()
         by_seed = records("new_tasks").pivot_table("last_mean_return", ["task", "seed"], "method")
         cheetah = by_seed.loc["HalfCheetah-v5"]
-        assert len(cheetah) == 3 and (cheetah["l2c2"] < cheetah["none"]).all()
+        assert len(cheetah) == 5 and (cheetah["l2c2"] < cheetah["none"]).all()
         gait = pd.read_csv(ROOT / "results" / "half_cheetah.csv").set_index(["method", "seed"])
         assert set(gait.index) == set(cheetah.stack().index.swaplevel())
         on_back = gait["on_back"] > 0.5
         counts = on_back.groupby("method").sum()
-        assert counts["l2c2"] == 3 and counts["none"] == 1
+        assert dict(counts) == {"l2c2": 5, "none": 2, "cats": 4}
         totals = gait["return"]
-        assert totals[on_back].max() < totals[~on_back].min() / 2
-        assert 0.85 < totals[on_back]["l2c2"].mean() / totals[on_back]["none"].mean() < 1.0
+        assert totals[on_back].max() < 0.75 * totals[~on_back].min()
+        less = 1 - totals[on_back]["l2c2"].mean() / totals[on_back]["none"].mean()
+        assert f"the mean return with L2C2 is {less:.0%} lower" in page
         ant = [returns[side]["Ant-v5"] for side in "bl"]
         assert f"return {ant[0]:.0f} on average, and with L2C2 {ant[1]:.0f}" in page
         swimmer = records("new_tasks").query("task == 'Swimmer-v5'").set_index(["method", "seed"])
         varied, total = swimmer["last_mean_action_variation"], swimmer["last_mean_return"]
-        assert varied["none"].min() < varied["l2c2"].min() < varied["l2c2"].max()
-        assert varied["l2c2"].max() < varied["none"].max()
-        assert total["l2c2"].min() > total["none"].max()
+        share = varied["l2c2"].mean() / varied["none"].mean()
+        assert f"On Swimmer it is {share:.0%}, within seed noise" in page
+        assert [(varied[method] < 0.05).sum() for method in ("none", "l2c2")] == [1, 1]
+        assert total["l2c2"].mean() > total["none"].mean()
 
     def test_how_many_short_trainings_do_not_learn(self):
         """The counts of results/front_door.md: returns below -200."""
@@ -881,7 +886,10 @@ class TestForest:
         low, high = overall.better[1].interval
         assert low < 0.5 < high
         lost = [row.label for row in rows if row.better[1].interval[1] < 0.5]
-        assert lost == ["HalfCheetah, PPO (3 seeds)", "noisy points, PPO of rsl_rl (5 seeds)"]
+        risen = [row.label.partition(" (")[0] for row in rows if row.better[1].interval[0] > 0.5]
+        names = ["Ant, PPO", "BipedalWalker, PPO", "Swimmer, PPO", "noisy Reacher, PPO-RPE"]
+        assert risen == names
+        assert lost == ["HalfCheetah, PPO (5 seeds)", "noisy points, PPO of rsl_rl (5 seeds)"]
 
 
 class TestStrength:
