@@ -117,6 +117,13 @@ def test_without_a_seed_evaluate_plays_the_runs_own_test(folder):
         assert evaluated(folder, *arguments)["episodes"]["returns"] == returns
 
 
+def test_the_summary_by_hand():
+    """Returns of 1 and 3, action variations of 2 and 6."""
+    summary = Evaluation([1.0, 3.0], [2.0, 6.0], [5, 5]).summary()
+    assert (summary["return_mean"], summary["return_std"]) == (2.0, 1.0)
+    assert (summary["action_variation_mean"], summary["action_variation_std"]) == (4.0, 2.0)
+
+
 @pytest.mark.parametrize(
     ("output", "told"),
     [

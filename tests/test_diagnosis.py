@@ -136,6 +136,10 @@ class TestWords:
             found = diagnose_actions(action[:length], bounds=(-1.5, 1.5), rate=200.0)
             assert "chatters" in kinds(found)
 
+    def test_where_nothing_is_steep_no_step_is_steepest(self):
+        flat = made_up(0.5 * FLIPPING, policy_lipschitz=torch.zeros(len(FLIPPING)))
+        assert flat.worst() == [] and kinds(flat) == ["flips"]
+
     def test_many_actions_with_one_fault_share_a_finding(self):
         """Two have a sentence each; with three, one sentence names all, the largest first."""
         sizes = torch.tensor([0.3, 0.5, 0.4])
@@ -293,6 +297,7 @@ class TestWords:
             in said(made_up(shares={**own, "l2c2_actor": faint}), "small").text
         )
         assert "small" not in kinds(made_up(shares={**own, "l2c2_actor": strong}))
+        assert "small" not in kinds(made_up(shares={**own, "caps": TermShare(True, 0.1)}))
         by_size = said(made_up(shares={**own, "caps": TermShare(True, 5e-4)}), "small")
         assert "caps 0.05% of the loss" in by_size.text and by_size.fault
         both = said(made_up(shares={"a": faint, "b": strong}), "small")
@@ -721,12 +726,16 @@ class TestRecording:
         with pytest.raises(UserError, match=r"must be finite, got \[nan\] in row 7"):
             diagnose_actions(broken)
 
+    def test_bounds_must_be_apart(self):
+        with pytest.raises(UserError, match="the lower one first"):
+            diagnose_actions(SINE, bounds=(1.0, 1.0))
+
     def test_what_does_not_compare_is_not_compared(self):
         """Other actions, or another rate."""
         hip = diagnose_actions(SINE, name="a", action_names=["hip"], rate=50.0)
         for other, why in (
             (diagnose_actions(SINE, name="b", action_names=["knee"]), "actions have other names"),
-            (diagnose_actions(SINE, name="b", rate=100.0), "steps have 100 and 50 Hz"),
+            (diagnose_actions(SINE, name="b", rate=60.0), "steps have 60 and 50 Hz"),
             (diagnose_actions(SINE.repeat(1, 2), name="b"), "they have 2 and 1 actions"),
         ):
             (sentence,) = comparison([hip, other])

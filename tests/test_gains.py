@@ -241,6 +241,22 @@ class TestInARun:
         assert run.agent.loss.regularizer_gain.item() == pytest.approx(math.exp(3.0))
         assert run.agent.loss.l2c2_beta.item() == pytest.approx(0.1)
 
+    @pytest.mark.parametrize("gain", ["constant", "ramp"])
+    def test_the_strength_scales_the_gain_of_a_run(self, gain):
+        """At the end of a ramp, or at once."""
+        run = Experiment(small(regularizer=L2C2Config(strength=0.5, gain=gain)))
+        run.train()
+        assert run.agent.loss.regularizer_gain.item() == 0.5
+
+    def test_a_first_call_is_no_loop_without_the_terms(self):
+        """Before its first ``backward`` nothing is differentiated yet."""
+        case = next(case for case in CASES if case.name == "SAC")
+        loss, batch = CAPSLoss(case.make()), case.batch(8)
+        loss(batch.copy())
+        with warnings.catch_warnings():
+            warnings.filterwarnings("error", ".*were never differentiated")
+            gradient_shares(loss, batch)
+
     def test_shares_are_measured_where_no_gradients_are_kept(self):
         """As between updates; terms that are not single numbers are refused."""
         run = Experiment(small())

@@ -37,6 +37,7 @@ from torchrl.objectives import (
     DDPGLoss,
     DiscreteSACLoss,
     DQNLoss,
+    IQLLoss,
     PPOLoss,
     SACLoss,
     TD3Loss,
@@ -138,6 +139,30 @@ class TestHandComputedNumbers:
         loss.l2c2_coeff = 0.5
         terms = loss.policy_regularizer(linear_batch())
         assert terms["l2c2_gain"].item() == pytest.approx((1 / 3 + 1 / 5) / 4)
+
+    def test_the_gain_that_is_told_has_the_strength(self):
+        loss = linear_loss()
+        loss.strength = 0.5
+        terms = loss.policy_regularizer(linear_batch())
+        assert terms["l2c2_gain"].item() == pytest.approx((1 / 3 + 1 / 5) / 4)
+
+    def test_gains_without_effect_are_told(self):
+        """The paper's gains, up to 1, had none with PPO, SAC and TD3."""
+        with pytest.warns(UserWarning, match="no measurable effect"):
+            L2C2Loss(PPOLoss(gaussian_actor(), None), beta=0.0)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            L2C2Loss(PPOLoss(gaussian_actor(), None), Neighborhood(lambda_max=2.0), beta=0.0)
+
+    def test_the_value_distance_is_summed_over_the_networks(self):
+        """With a gain that hardly depends on the distance, as the terms are."""
+        torch.manual_seed(0)
+        base = IQLLoss(gaussian_actor(), qvalue(), value_network=critic())
+        loss = L2C2Loss(base, Neighborhood(lambda_min=1.0, lambda_max=1.00001), beta=1.0)
+        terms = loss.value_regularizer(transitions(16))
+        added = sum(terms[key] for key in loss.added_terms - loss.policy_terms)
+        assert len(loss.added_terms - loss.policy_terms) == 2
+        torch.testing.assert_close(terms["l2c2_value_distance"], added, rtol=1e-3, atol=0.0)
 
     def test_gradients_flow_through_both_states(self):
         """d/dv of (v.x)^2 is 2 (v.x) x with x the difference of the states, not one of them."""
@@ -606,6 +631,11 @@ class TestWhichStatesAreMoved:
         loss, batch = self.two_part_loss(moved_keys=keys)
         mean = loss.policy_regularizer(batch)["l2c2_distance"].item() - NEAR.epsilon
         assert mean == pytest.approx(0.5, abs=0.05)
+
+    def test_the_transform_moves_the_same_keys(self):
+        loss, batch = self.two_part_loss(moved_keys=["velocity"])
+        neighbors = loss.neighbor_transform()(batch)["neighbor"]
+        assert set(neighbors.keys()) == {"velocity", "distance"}
 
     def test_a_key_that_the_batch_lacks_is_named(self):
         """With what there is."""

@@ -266,6 +266,12 @@ def test_noise_sensitivity_refuses_what_is_no_action():
         noise_sensitivity(lambda s: (s, s), torch.zeros(4, 3), 0.2)
 
 
+def test_of_an_odd_number_of_steps_the_last_frequency_is_whole():
+    """A cosine with two periods in five steps has the amplitude 1."""
+    cosine = torch.cos(2 * torch.pi * 2 * torch.arange(5.0) / 5).unsqueeze(-1)
+    assert amplitude_spectrum(cosine)[1][-1].item() == pytest.approx(1.0, abs=1e-5)
+
+
 def test_noise_sensitivity_refuses_integers():
     """Noise on them would be rounded away."""
     with pytest.raises(

@@ -225,6 +225,42 @@ class TestUnknownNextObservations:
 
 
 @pytest.mark.filterwarnings("ignore:.*of the transitions in the batch")
+@pytest.mark.parametrize("kind", TEMPORAL)
+def test_the_ends_of_the_drawn_rows_are_left_out(kind, monkeypatch):
+    """skip_ends with a fraction: of the rows 1, 4 and 6 the second ends an episode."""
+    make, _, counted = TEMPORAL[kind]
+    batch = batch_of(8)
+    batch["next", "done"] = (torch.arange(8) == 4).unsqueeze(-1)
+    monkeypatch.setattr(
+        torch, "randperm", lambda n, **_: torch.tensor([1, 4, 6, 0, 2, 3, 5, 7])[:n]
+    )
+    loss = make(base_loss(), skip_ends=True, fraction=3 / 8)
+    assert loss.policy_regularizer(batch)[counted].item() == pytest.approx(2 / 3)
+    batch["next", "done"] = (torch.arange(8) < 1).unsqueeze(-1)
+    assert loss.policy_regularizer(batch)[counted] == 1
+
+
+def test_all_observations_have_to_be_known():
+    """Of two that the policy reads, one is unknown in one row."""
+    actor = Actor(mlp(2 * OBSERVATION, ACTION), in_keys=["observation", "other"])
+    batch = batch_of(8)
+    batch["other"], batch["next", "other"] = (
+        batch["observation"],
+        batch["next", "observation"].clone(),
+    )
+    batch["next", "other"][0] = math.nan
+    terms = CATSLoss(DDPGLoss(actor, qvalue())).policy_regularizer(batch)
+    assert terms["cats_counted"] == 7 / 8 and terms["loss_cats"].isfinite()
+
+
+def test_the_spatial_term_of_caps_keeps_all_rows():
+    """It reads no next observation."""
+    loss, batch = CAPSLoss(base_loss(), lambda_temporal=1.0), batch_of(8)
+    expected = seeded(loss.policy_regularizer, batch)["loss_caps_spatial"]
+    batch["next", "observation"][:3] = math.nan
+    assert seeded(loss.policy_regularizer, batch)["loss_caps_spatial"] == expected
+
+
 def test_value_terms_leave_the_same_rows_out():
     batch = batch_of(8)
     values = L2C2Loss(base_loss(reduction="none"), NEAR).value_regularizer

@@ -449,8 +449,9 @@ def test_the_threshold_adapts_in_training_alone():
     """A validation loss leaves no trace."""
     loss, batch = paper_loss_and_batch()
     before = loss.delta.clone()
-    loss.eval()(batch.clone())
+    terms = loss.eval()(batch.clone())
     assert torch.equal(loss.delta, before)
+    assert terms["ratio_threshold"] == loss.kappa * before
     loss.train()(batch.clone())
     assert loss.delta > before
 

@@ -518,6 +518,12 @@ class TestStatistics:
         lower, upper = curve_band(curves, generator=np.random.default_rng(0), confidence=0.4)
         assert lower.tolist() == upper.tolist() == [0.5, 0.5]
 
+    def test_a_band_of_symmetric_runs_is_symmetric(self):
+        curves = np.linspace(-1.0, 1.0, 40)[:, None]
+        generator = np.random.default_rng(0)
+        lower, upper = curve_band(curves, generator=generator, resamples=20_000)
+        assert upper[0] == pytest.approx(-lower[0], rel=0.05)
+
     def test_the_table_by_hand(self, records):
         """Interquartile means of 0 to 4 are those of 1 to 3; 100 more always beats the baseline."""
         groups = group_records(table_of(records))

@@ -524,6 +524,14 @@ class TestSR2L:
             assert not found[key].requires_grad
         assert distance(found).mean() > 2 * distance(chance).mean()
 
+    def test_the_search_starts_on_both_sides_and_crosses_the_box(self, monkeypatch):
+        """Without a slope it stays where it starts; one step reaches from end to end."""
+        states = {"s": torch.zeros(99, 1)}
+        start = ascend(lambda moved: 0.0 * moved["s"].sum(-1), states, 0.1, 1)["s"]
+        assert start.min() < 0.0 < start.max()
+        monkeypatch.setattr(torch, "rand_like", torch.zeros_like)
+        assert ascend(lambda moved: moved["s"].sum(-1), states, 0.1, 1)["s"].unique() == 0.1
+
     def test_other_distances_can_be_chosen(self):
         """Half the squared distance of means in the place of the divergence."""
         loss = SR2LLoss(linear_normal(), epsilon=0.1, coeff=1.0, policy_distance="mean")
@@ -620,6 +628,15 @@ class TestLCP:
             terms += loss.policy_regularizer(batch).values()
         assert terms[0] > 0
         torch.testing.assert_close(terms[0], terms[1])
+
+    def test_of_the_mean_of_one_action_it_has_no_variance(self):
+        """With one action the random sign drops out: |W|^2 in every call."""
+        net = nn.Linear(3, 1, bias=False)
+        net.weight.data = WEIGHT[:1].clone()
+        loss = LCPLoss(DDPGLoss(Actor(net), qvalue()), coeff=1.0, of="mean")
+        for _ in range(8):
+            found = loss.policy_regularizer(transitions(8))["loss_lcp"].item()
+            assert found == pytest.approx(WEIGHT[:1].square().sum().item())
 
     def test_its_gradient_is_that_of_the_penalty(self):
         """A second derivative, against differences."""

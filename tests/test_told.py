@@ -3,6 +3,7 @@
 import json
 import warnings
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -26,6 +27,7 @@ from torchrl_l2c2.experiment import (
     TD3Config,
 )
 from torchrl_l2c2.experiment.agents.build import make_algorithm
+from torchrl_l2c2.experiment.run.schedules import _learn
 from torchrl_l2c2.gains import gradient_shares
 
 PENDULUM = TaskConfig("pendulum", "Pendulum-v1", episodes=2, max_steps=40)
@@ -113,6 +115,30 @@ def test_a_run_without_an_update_says_so(tmp_path):
         "updates": 0,
         "untrained": message,
     }
+
+
+def test_learning_begins_with_the_last_random_frame():
+    """Of ten random frames the tenth is followed by an update."""
+
+    class Memory(list):
+        batch_size = 2
+
+    asked = []
+    learner = SimpleNamespace(replay=Memory(range(20)), learn=asked.append)
+    for frame in (9, 10):
+        _learn(learner, ALGORITHMS["sac"], 1, frame)
+    assert asked == [1]
+
+
+def test_one_term_with_a_gradient_is_enough():
+    """The largest share counts, as a value term may be small by choice."""
+    learner = make("sac").learner
+    learner.update = SimpleNamespace(example=lambda: None)
+    learner.shares = lambda batch: {"loss_a": 1e-6, "loss_b": 0.5}
+    assert not warned(learner._warn_weak_regularizer)
+    learner.shares = lambda batch: {"loss_a": 1e-6, "loss_b": 1e-6}
+    (message,) = warned(learner._warn_weak_regularizer)
+    assert "loss_a: 1e-06, loss_b: 1e-06" in message
 
 
 def test_a_run_of_random_actions_alone_says_so(tmp_path):
