@@ -518,16 +518,14 @@ def mirror(env: Any, obs: TensorDict | None, actions: Tensor | None) -> tuple[An
     return both_obs, None if actions is None else torch.cat((actions, -actions))
 
 
-@pytest.mark.parametrize(
-    ("augment", "mirrored"), [(True, True), (False, True), (True, False)], ids=str
-)
-def test_a_symmetry_extension_works_as_before(augment: bool, mirrored: bool) -> None:
+@pytest.mark.parametrize("augment", [True, False])
+def test_a_symmetry_extension_works_as_before(augment: bool) -> None:
     """At no gain it trains as with plain PPO, and at one it leaves the regularizer's term alone."""
     symmetry = {
         "env": None,
         "data_augmentation_func": mirror,
         "use_data_augmentation": augment,
-        "use_mirror_loss": mirrored,
+        "use_mirror_loss": True,
         "mirror_loss_coeff": 0.7,
     }
     plain = collected(make(PPO, symmetry_cfg=dict(symmetry)))
