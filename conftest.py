@@ -3,8 +3,7 @@
 import os
 from importlib.util import find_spec
 
-from _pytest.doctest import DoctestItem
-from pytest import Item
+from pytest import DoctestItem, Item
 
 # Before torch is imported: threads of several processes on the same cores wait for each other.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
