@@ -358,6 +358,23 @@ def test_a_task_in_python_has_the_simulator_of_its_name(make, told):
         make()
 
 
+@pytest.mark.parametrize(
+    ("method", "setting", "value"),
+    [
+        ("l2c2", "policy_distance", "kl"),
+        ("sr2l", "policy_distance", "kl"),
+        ("lcp", "of", "log_prob"),
+    ],
+)
+def test_a_deterministic_policy_is_no_distribution(method, setting, value):
+    """So says the configuration, not the loss after seconds; PPO and SAC have distributions."""
+    regularizer = replace(REGULARIZERS[method], **{setting: value})
+    for name in ("ppo", "sac"):
+        ExperimentConfig(algorithm=GROUPS["algorithm"][name], regularizer=regularizer)
+    with pytest.raises(SettingError, match=f"regularizer.{setting} must not be {value} with alg"):
+        ExperimentConfig(algorithm=GROUPS["algorithm"]["td3"], regularizer=regularizer)
+
+
 def test_swingup_may_have_another_name():
     """If it is said that it is meant."""
     assert TaskConfig("quiet", TaskConfig().env_id, 0.0).env_id == TaskConfig("swingup").env_id

@@ -153,9 +153,22 @@ def test_the_values_of_a_sweep_are_checked_before_its_first_run(tmp_path):
     process = start(tmp_path, "-m", *sweep, "logger=csv")
     assert process.wait(60) == 1
     first, second, third = said(tmp_path).splitlines()
-    assert first.startswith("error: seed must be greater than or equal to 0, got -1")
-    assert second.startswith("error: Expected regularizer to be one of ")
+    assert first.startswith("error: Expected regularizer to be one of ")
+    assert second.startswith("error: seed must be greater than or equal to 0, got -1")
     assert third.startswith("error: algorithm.gamma must be less than 1, got 1.9")
+    assert not (tmp_path / "o").exists()
+
+
+def test_names_that_do_not_fit_each_other_stop_a_sweep_before_its_first_run(tmp_path):
+    """Each value fits the first one of the other setting: only combinations show the mistake."""
+    names = "algorithm=sac,td3", "regularizer.policy_distance=mean,kl", "regularizer=l2c2"
+    process = start(tmp_path, "-m", *names, "seed=0,1", "task.episodes=2")
+    assert process.wait(60) == 1
+    (line,) = said(tmp_path).splitlines()
+    assert line.startswith(
+        "error: regularizer.policy_distance must not be kl with algorithm=td3, whose policy is "
+        "deterministic and no distribution: choose mean."
+    )
     assert not (tmp_path / "o").exists()
 
 

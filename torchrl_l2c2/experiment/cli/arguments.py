@@ -95,7 +95,7 @@ def check_one_value(arguments: Sequence[str]) -> None:
 
 
 class CheckSweep(Callback):
-    """Hydra callback that checks a sweep's values before its first run, one job for each value."""
+    """Hydra callback that checks a sweep's values and combinations before its first run."""
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         """Composes and checks the jobs.

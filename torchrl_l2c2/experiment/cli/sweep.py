@@ -322,23 +322,42 @@ def list_jobs(overrides: Sequence[str], params: Mapping[str, str]) -> list[dict[
 
 
 def list_jobs_to_check(overrides: Sequence[str], params: Mapping[str, str]) -> list[dict[str, str]]:
-    """Returns the first job of :func:`list_jobs`, and one more for each further value of a setting.
+    """Returns jobs of :func:`list_jobs` that show every wrong value, and names that do not fit.
 
-    A range counts with its first and its last value.
+    Values that are names, such as algorithms, occur in all combinations. Numbers occur once each,
+    in the first combination; a range has its first and its last number.
 
     Examples:
-        >>> jobs = list_jobs_to_check(["seed=range(0,18)", "beta=1,2,-3"], {})
-        >>> [" ".join(f"{name}={value}" for name, value in job.items()) for job in jobs]
-        ['seed=0 beta=1', 'seed=17 beta=1', 'seed=0 beta=2', 'seed=0 beta=-3']
+        >>> sweep = ["seed=range(0,18)", "beta=1,-3", "algorithm=ppo,td3", "task=ant,hopper"]
+        >>> jobs = list_jobs_to_check(sweep, {})
+        >>> for job in jobs:
+        ...     print(" ".join(job.values()))
+        0 1 ppo ant
+        0 1 ppo hopper
+        0 1 td3 ant
+        0 1 td3 hopper
+        17 1 ppo ant
+        0 -3 ppo ant
     """
     sweeps = _parse_sweeps(overrides, params)
     values = {name: list(each.sweep_string_iterator()) for name, each in sweeps.items()}
-    first = {name: each[0] for name, each in values.items()}
-    jobs = [first]
-    for name, (_, *further) in values.items():
-        checked = further[-1:] if sweeps[name].is_range_sweep() else further
-        jobs += [{**first, name: value} for value in checked]
+    numbers = {name for name, each in values.items() if all(map(_is_number, each))}
+    tried = [each[:1] if name in numbers else each for name, each in values.items()]
+    jobs = [dict(zip(values, chosen, strict=True)) for chosen in itertools.product(*tried)]
+    first = jobs[0]
+    for name in values:
+        if name in numbers:
+            further = values[name][-1:] if sweeps[name].is_range_sweep() else values[name][1:]
+            jobs += [{**first, name: value} for value in further]
     return jobs
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _parse_sweeps(overrides: Sequence[str], params: Mapping[str, str]) -> dict[str, Override]:

@@ -10,7 +10,12 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from torchrl_l2c2.experiment.settings.algorithms import ALGORITHMS, AlgorithmConfig, PPORPEConfig
+from torchrl_l2c2.experiment.settings.algorithms import (
+    ALGORITHMS,
+    AlgorithmConfig,
+    PPORPEConfig,
+    TD3Config,
+)
 from torchrl_l2c2.experiment.settings.fields import (
     CHANGES_NO_NUMBERS,
     SettingError,
@@ -162,6 +167,7 @@ class ExperimentConfig:
         self._check_names()
         self._check_device()
         self._check_replay()
+        self._check_distribution()
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> ExperimentConfig:
@@ -210,6 +216,18 @@ class ExperimentConfig:
                 f"{self.replay.name!r} does not work with algorithm {self.algorithm.name!r}: ppo "
                 "needs rollout, the others prioritized or uniform.",
             )
+
+    def _check_distribution(self) -> None:
+        """Checks that TD3, whose policy is deterministic, needs no distribution of actions."""
+        if not isinstance(self.algorithm, TD3Config):
+            return
+        for setting, value in (("policy_distance", "kl"), ("of", "log_prob")):
+            if getattr(self.regularizer, setting, None) == value:
+                raise SettingError(
+                    f"regularizer.{setting}",
+                    f"must not be {value} with algorithm={self.algorithm.name}, whose policy is "
+                    "deterministic and no distribution: choose mean.",
+                )
 
 
 def _read_group(group: str, values: Mapping[str, Any]) -> Any:
