@@ -34,35 +34,18 @@ from torchrl_l2c2.experiment import (
     UniformReplayConfig,
 )
 from torchrl_l2c2.experiment.settings.fields import SettingError
-from torchrl_l2c2.gains import (
-    ConstantGain,
-    RampGain,
-    TargetGain,
-    gradient_shares,
-)
+from torchrl_l2c2.gains import TargetGain, gradient_shares
 
 
 class TestByHand:
-    def test_a_constant_stays(self):
-        """Whatever is measured."""
-        gain = ConstantGain(2.0)
-        assert [gain.step(), gain.step(7.0)] == [2.0, 2.0]
-
-    @pytest.mark.parametrize("make", [RampGain, TargetGain])
-    def test_what_was_measured_may_be_a_tensor(self, make):
+    def test_what_was_measured_may_be_a_tensor(self):
         """Of one number; gain and state are plain numbers, as a file has them."""
-        gain, like = (make(2.0) for _ in range(2))
+        gain, like = (TargetGain(2.0) for _ in range(2))
         assert gain.step(torch.tensor([0.5])) == like.step(0.5)
         assert all(type(value) in (int, float) for value in gain.state_dict().values())
         with pytest.raises(TypeError, match=r"measured must be a single number, .*\(2,\)"):
             gain.step(torch.ones(2))
         assert gain.state_dict() == like.state_dict()
-
-    def test_a_ramp_rises_linearly_and_stays_at_its_end(self):
-        """Half of 3 where a quarter of training is over and it is to rise over half."""
-        ramp = RampGain(3.0, length=0.5)
-        assert ramp.value == 0.0
-        assert [ramp.step(k) for k in (0.0, 0.25, 0.5, 1.0, 1.1)] == [0.0, 1.5, 3.0, 3.0, 3.0]
 
     def test_cloning_that_takes_the_actors_place_is_none_of_its_gradient(self):
         """CQL's two terms of the policy are descended one after the other, and never summed."""
@@ -128,13 +111,12 @@ class TestByHand:
             gain.step(1.0 / (1.0 + gain.value))
         assert gain.value == pytest.approx(3.0, rel=1e-3)
 
-    @pytest.mark.parametrize("make", [lambda: RampGain(), lambda: TargetGain(0.1)])
-    def test_a_restored_gain_goes_on_as_the_other(self, make):
+    def test_a_restored_gain_goes_on_as_the_other(self):
         """From its state_dict."""
-        gain, again = make(), make()
+        gain, again = TargetGain(0.1), TargetGain(0.1)
         gain.step(0.7)
         again.load_state_dict(gain.state_dict())
-        assert again.value == gain.value != make().value
+        assert again.value == gain.value != 1.0
         assert again.step(0.9) == gain.step(0.9)
 
     @pytest.mark.parametrize("measured", ["a", None, True])
@@ -146,9 +128,7 @@ class TestByHand:
     @pytest.mark.parametrize(
         ("make", "message"),
         [
-            (lambda: ConstantGain(-1.0), "value must be finite and at least 0, got -1"),
-            (lambda: RampGain().step(512), r"measured must be in \[0, 2\].* It is a share of tr"),
-            (lambda: RampGain(length=0.0), r"length must be in \(0, 1\], got 0"),
+            (lambda: TargetGain(0.1, value=0.0), "value must be finite and greater than 0, got 0"),
             (lambda: TargetGain(-0.1), "target must be finite and greater than 0"),
             (lambda: TargetGain(0.1, rate=2.0), r"rate must be in \(0, 1\], got 2"),
             (lambda: TargetGain(0.1, limit=1.0), "limit must be finite and greater than 1"),
@@ -218,6 +198,15 @@ class TestInARun:
         assert [row["gain"] for row in rows] == pytest.approx([k / 6 for k in range(6)])
         assert rows[0]["loss_l2c2_actor"] == 0.0 < rows[-1]["loss_l2c2_actor"]
         assert run.agent.loss.regularizer_gain == 1.0
+
+    def test_a_shorter_ramp_ends_before_the_training_does(self):
+        """After half of six episodes; the log has the share of the strength, the loss both."""
+        run = Experiment(small(L2C2Config(gain="ramp", gain_length=0.5, strength=2.0)))
+        rows = run.train(2)
+        assert run.agent.loss.regularizer_gain.item() == pytest.approx(4 / 3)
+        rows = run.train()
+        assert [row["gain"] for row in rows] == pytest.approx([0, 1 / 3, 2 / 3, 1, 1, 1])
+        assert run.agent.loss.regularizer_gain == run.agent.loss.strength == 2.0
 
     def test_a_longer_training_has_a_longer_ramp_and_its_own_rates(self):
         """Of twelve episodes instead of six; one that had ended begins at a rate above 0."""

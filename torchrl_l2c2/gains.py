@@ -1,10 +1,12 @@
-r"""Schedules for the gain of a regularizer: constant, ramp, and a target for a measure.
+r"""A gain that meets a target, and the gradients of a regularizer relative to those of the loss.
 
-A gain has a ``value`` that multiplies a term, a ``step`` that takes a measurement between updates
-and returns the next value, and a ``state_dict``. Assign the value to the gain of a regularized
-loss, also between calls of a compiled loss::
+The gain is for the factor of a regularized loss. Assign it between updates, also if the loss is
+compiled::
 
     loss.regularizer_gain = gain.step(measured)
+
+A gain that rises with the progress of training is part of the loss: ``loss.ramp()`` and
+``loss.set_progress(...)``.
 """
 
 from __future__ import annotations
@@ -25,96 +27,7 @@ from torchrl.objectives import LossModule
 from torchrl_l2c2._checks import as_number, check_real, check_takes_gradients
 
 
-class ConstantGain:
-    """A gain that stays as it is.
-
-    Args:
-        value (float): at least 0. Larger values regularize more. Defaults to ``1.0``.
-
-    Raises:
-        TypeError: if it is not a real number.
-        ValueError: if it is out of its range.
-
-    Examples:
-        >>> from torchrl_l2c2.gains import ConstantGain
-        >>> ConstantGain(0.5).step()
-        0.5
-    """
-
-    def __init__(self, value: float = 1.0) -> None:
-        check_real("value", value, at_least=0)
-        self.value = float(value)
-
-    def step(self, measured: float = math.nan) -> float:
-        """The value, for any measurement."""
-        return self.value
-
-    def state_dict(self) -> dict[str, float]:
-        """The values that the next steps depend on."""
-        return {"value": self.value}
-
-    def load_state_dict(self, state: dict[str, float]) -> None:
-        """Restores the result of :meth:`state_dict`; set the loss's gain to ``value`` then.
-
-        Raises:
-            ValueError: there are other entries, or the value is out of its range; nothing is
-                changed.
-        """
-        if state.keys() != self.state_dict().keys():
-            raise ValueError(
-                f"Expected the state of a gain, with {list(self.state_dict())}, got {list(state)}."
-            )
-        check_real("value", state["value"], at_least=0)
-        self.value = state["value"]
-
-
-class RampGain(ConstantGain):
-    r"""A gain that rises linearly from 0 over a part of training, and stays there.
-
-    .. math::
-        \lambda = \lambda_{\mathrm{end}} \min(1, k / K)
-
-    for the share :math:`k` of training that is over: the schedule of CATS (arXiv 2610.07910), with
-    :math:`K = 1`. A policy is found before it is smoothed.
-
-    Args:
-        end (float): the last value, at least 0. Larger values regularize more. Defaults to ``1.0``.
-        length (float): :math:`K`, the share of training over which it rises, in (0, 1]. Smaller
-            values smooth earlier. Defaults to ``1.0``.
-
-    Raises:
-        TypeError: if a value is not a real number.
-        ValueError: if it is out of its range.
-
-    Examples:
-        >>> from torchrl_l2c2.gains import RampGain
-        >>> ramp = RampGain(2.0, length=0.5)
-        >>> ramp.value, ramp.step(0.25), ramp.step(0.9)
-        (0.0, 1.0, 2.0)
-    """
-
-    def __init__(self, end: float = 1.0, length: float = 1.0) -> None:
-        check_real("end", end, at_least=0)
-        check_real("length", length, above=0, at_most=1)
-        super().__init__(0.0)
-        self.end, self.length = float(end), float(length)
-
-    def step(self, measured: float = math.nan) -> float:
-        """The value after a share of training, ``measured``, from 0 to 1.
-
-        A last batch may exceed the end of training: a share above 1 counts as 1.
-
-        Raises:
-            TypeError: it is no number.
-            ValueError: it is below 0 or above 2, and so a number of frames or updates, no share.
-        """
-        measured = as_number("measured", measured)
-        check_real("measured", measured, at_least=0, at_most=2, hint="It is a share of training.")
-        self.value = self.end * min(1.0, measured / self.length)
-        return self.value
-
-
-class TargetGain(ConstantGain):
+class TargetGain:
     r"""A gain that rises while a measure is above its target, and falls while it is below.
 
     .. math::
@@ -152,13 +65,12 @@ class TargetGain(ConstantGain):
         check_real("rate", rate, above=0, at_most=1)
         check_real("value", value, above=0)
         check_real("limit", limit, above=1)
-        super().__init__(value)
+        self.value = self._first = float(value)
         self.target = float(target)
         self.rate = float(rate)
         self.limit = float(limit)
-        self._first = self.value
 
-    def step(self, measured: float = math.nan) -> float:
+    def step(self, measured: float) -> float:
         """The next value after a measure :math:`m`; NaN and infinity change nothing.
 
         Raises:
@@ -170,6 +82,24 @@ class TargetGain(ConstantGain):
             value = self.value * math.exp(self.rate * excess)
             self.value = min(max(value, self._first / self.limit), self._first * self.limit)
         return self.value
+
+    def state_dict(self) -> dict[str, float]:
+        """The value, which the next steps depend on."""
+        return {"value": self.value}
+
+    def load_state_dict(self, state: dict[str, float]) -> None:
+        """Restores the result of :meth:`state_dict`; set the loss's gain to ``value`` then.
+
+        Raises:
+            ValueError: there are other entries, or the value is out of its range; nothing is
+                changed.
+        """
+        if state.keys() != self.state_dict().keys():
+            raise ValueError(
+                f"Expected the state of a gain, with {list(self.state_dict())}, got {list(state)}."
+            )
+        check_real("value", state["value"], above=0)
+        self.value = state["value"]
 
 
 def _measured(measured: Any) -> float:

@@ -308,6 +308,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             \mathtt{regularizer\_gain} = \mathtt{end} \cdot \min(1, x / \mathtt{length})
 
         :meth:`set_progress` sets the progress :math:`x`. Until its first call the gain is ``end``.
+        CATS (arXiv 2610.07910) has this schedule, with ``length=1``.
 
         Args:
             length (float): share of training after which the gain is ``end``, in (0, 1]. Smaller

@@ -12,7 +12,7 @@ from torchrl_l2c2.experiment.learn.learner import Learner
 from torchrl_l2c2.experiment.settings.config import ExperimentConfig
 from torchrl_l2c2.experiment.settings.regularizers import GainConfig
 from torchrl_l2c2.experiment.settings.tasks import Budget
-from torchrl_l2c2.gains import ConstantGain, RampGain, TargetGain
+from torchrl_l2c2.gains import TargetGain
 
 MEASURE = "action_variation"  # Metric that a target limits.
 
@@ -23,26 +23,30 @@ class GainControl:
     Args:
         config (ExperimentConfig): Settings of the run.
         learner (Learner): Learner with the regularized loss.
-
-    Attributes:
-        gain: Schedule of the gain; ``None`` for a constant gain.
     """
 
     def __init__(self, config: ExperimentConfig, learner: Learner) -> None:
-        self._learner = learner
+        self._learner, self._loss = learner, learner.agent.loss
         self._updates = 0
         # Values since the last step: several episodes may end in a rollout.
         self._seen: list[float] = []
-        self.gain: ConstantGain | None = None
-        if not isinstance(config.regularizer, GainConfig):
+        self._progress = 0.0
+        self._target: TargetGain | None = None
+        regularizer = config.regularizer
+        # None for a constant gain.
+        self._config = (
+            regularizer
+            if isinstance(regularizer, GainConfig) and regularizer.gain != "constant"
+            else None
+        )
+        if self._config is None:
             return
-        self._config = config.regularizer
         if self._config.gain == "ramp":
-            self.gain = RampGain(length=self._config.gain_length)
+            self._loss.ramp(self._config.gain_length, end=self._config.strength)
             learner.at_full_gain = self._at_full_gain
-        elif self._config.gain == "target":
+        else:
             assert self._config.gain_target is not None
-            self.gain = TargetGain(
+            self._target = TargetGain(
                 self._config.gain_target, self._config.gain_rate, self._config.gain_limit
             )
             # This gain increases until it has an effect.
@@ -71,45 +75,62 @@ class GainControl:
             dict: The gain during the episode, the measured value and the target; empty for a
             constant gain.
         """
-        if self.gain is None or (self._config.gain == "target" and MEASURE not in row):
+        if self._config is None or (self._target is not None and MEASURE not in row):
             return {}
         measured = self._measure(row, training)
-        logged = {"gain": self.gain.value, "gain_measured": measured}
-        if self._config.gain_target is not None:
-            logged["gain_target"] = self._config.gain_target
+        logged = {"gain": self._gain, "gain_measured": measured}
+        if self._target is not None:
+            logged["gain_target"] = self._target.target
         if ends_round and self._learner.updates > self._updates:
             self._updates, self._seen = self._learner.updates, []
-            self.gain.step(measured)
+            if self._target is None:
+                self._progress = measured
+            else:
+                self._target.step(measured)
             self._apply()
         return logged
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the gain, the update of its last change, and the values measured since."""
-        gains = {} if self.gain is None else {"all": self.gain.state_dict()}
-        return {"gains": gains, "updates": self._updates, "seen": list(self._seen)}
+        target = {} if self._target is None else self._target.state_dict()
+        state = {"progress": self._progress, "target": target, "updates": self._updates}
+        return {**state, "seen": list(self._seen)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restores a state of :meth:`state_dict`, and sets the loss's gain."""
-        if self.gain is None:
+        if self._config is None:
             return
-        self.gain.load_state_dict(state["gains"]["all"])
-        self._updates, self._seen = state["updates"], list(state.get("seen", []))
+        self._progress = state["progress"]
+        if self._target is not None:
+            self._target.load_state_dict(state["target"])
+        self._updates, self._seen = state["updates"], list(state["seen"])
         self._apply()
+
+    @property
+    def _gain(self) -> float:
+        """Gain without the strength."""
+        assert self._config is not None
+        if self._target is not None:
+            return self._target.value
+        return min(1.0, self._progress / self._config.gain_length)
+
+    def _apply(self) -> None:
+        assert self._config is not None
+        if self._target is None:
+            self._loss.set_progress(self._progress)
+        else:
+            self._loss.regularizer_gain = self._config.strength * self._target.value
 
     @contextmanager
     def _at_full_gain(self) -> Iterator[None]:
-        self._learner.agent.loss.regularizer_gain = self._config.strength
+        self._loss.set_progress(1.0)
         try:
             yield
         finally:
             self._apply()
 
-    def _apply(self) -> None:
-        gain = 1.0 if self.gain is None else self.gain.value
-        self._learner.agent.loss.regularizer_gain = self._config.strength * gain
-
     def _measure(self, row: Mapping[str, float], training: Budget) -> float:
-        if self._config.gain == "ramp":
+        if self._target is None:
             spent = training.spent(int(row["episode"]), int(row["frames"]))
             return min(1.0, spent / training.total)  # The last round may exceed the total.
         self._seen.append(row[MEASURE])
