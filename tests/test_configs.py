@@ -42,12 +42,6 @@ from torchrl_l2c2 import (
 OURS = {
     ("loss", "smooth"): trainers.SmoothLossConfig,
     ("loss", "l2c2"): trainers.L2C2LossConfig,
-    ("loss", "caps"): trainers.CAPSLossConfig,
-    ("loss", "cats"): trainers.CATSLossConfig,
-    ("loss", "grad_caps"): trainers.GradCAPSLossConfig,
-    ("loss", "asap"): trainers.ASAPLossConfig,
-    ("loss", "sr2l"): trainers.SR2LLossConfig,
-    ("loss", "lcp"): trainers.LCPLossConfig,
     ("loss", "ppo_rpe"): trainers.PPORPELossConfig,
     ("transform", "neighbor"): trainers.NeighborTransformConfig,
     ("transform", "observation_noise"): trainers.ObservationNoiseConfig,
@@ -83,6 +77,7 @@ NETWORKS = {
 }
 NEAR = ["+neighborhood@loss.neighborhood=l2c2"]
 SAC = ["+loss@loss.base_loss=sac", "++loss.base_loss.target_entropy=-1.0"]
+CAPS = ["+loss=smooth", *SAC, "loss.method=caps"]
 
 
 @pytest.fixture(autouse=True)
@@ -152,7 +147,9 @@ def test_l2c2_over_sac_composes():
 
 def test_regularizers_nest():
     """A regularized loss can be the base of another."""
-    cfg = composed("+loss=l2c2", "+loss@loss.base_loss=caps", "+loss@loss.base_loss.base_loss=sac")
+    nested = "+loss@loss.base_loss=smooth", "+loss@loss.base_loss.base_loss=sac"
+    caps = "loss.base_loss.method=caps", "loss.base_loss.fold=false"
+    cfg = composed("+loss=l2c2", *nested, *caps)
     OmegaConf.set_struct(cfg, False)
     cfg.networks = NETWORKS
     cfg.loss.base_loss.base_loss.update(
@@ -196,19 +193,12 @@ def test_a_string_is_one_name():
         assert instantiate(cfg.transform).in_keys == ["position"]
 
 
-def test_caps_over_sac_composes():
-    """``loss: caps`` over ``loss: sac`` is a SAC loss regularized by CAPS."""
-    cfg = with_networks(composed("+loss=caps", *SAC, "loss.sigma=0.3", "loss.mean=action"))
-    loss = instantiate(cfg.loss)
-    assert isinstance(loss, CAPSLoss) and isinstance(loss, SACLoss)
-    assert (loss.caps_sigma, loss.caps_mean) == (0.3, "action")
-
-
 @pytest.mark.parametrize(("name", "loss_class"), [("grad_caps", GradCAPSLoss), ("asap", ASAPLoss)])
 def test_what_reads_frames_reads_nested_keys(name, loss_class):
     """With the settings given, over SAC."""
-    settings = ["loss.frames_key=[stack,frames]", "loss.epsilon=0.3"]
-    loss = instantiate(with_networks(composed(f"+loss={name}", *SAC, *settings)).loss)
+    settings = ["+loss.overrides.frames_key=[stack,frames]", "+loss.overrides.epsilon=0.3"]
+    cfg = composed("+loss=smooth", *SAC, f"loss.method={name}", *settings)
+    loss = instantiate(with_networks(cfg).loss)
     assert isinstance(loss, loss_class) and isinstance(loss, SACLoss)
     assert ("stack", "frames") in loss.in_keys and loss.grad_caps_epsilon == 0.3
 
@@ -461,8 +451,8 @@ def test_smooth_reads_methods_and_nested_keys():
         (["+loss=l2c2", *SAC, "loss.beta=-1.0"], "l2c2_beta must be finite and at least 0"),
         (["+loss=l2c2", *SAC, *NEAR, "loss.neighborhood.sigma=0.0"], "sigma must be finite"),
         (["+loss=l2c2", *SAC, "loss.num_samples=0"], "num_samples must be at least 1"),
-        (["+loss=caps", *SAC, "loss.sigma=-0.2"], "sigma must be finite and greater"),
-        (["+loss=caps", *SAC, "loss.mean=median"], "mean must be 'loc' or 'action'"),
+        ([*CAPS, "+loss.overrides.sigma=-0.2"], "sigma must be finite and greater"),
+        ([*CAPS, "+loss.overrides.mean=median"], "mean must be 'loc' or 'action'"),
         (["+loss=smooth", *SAC, "loss.method=l2c3"], "one of .*'l2c2', .* got 'l2c3'"),
         (["+loss=smooth", *SAC, "+loss.overrides.bett=1"], r"Expected settings of l2c2, .*'bett'"),
     ],

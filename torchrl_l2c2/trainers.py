@@ -23,17 +23,7 @@ from torchrl.trainers.algorithms.configs.objectives import LossConfig, TargetNet
 from torchrl.trainers.algorithms.configs.transforms import TransformConfig
 
 from torchrl_l2c2.neighborhood import Neighborhood
-from torchrl_l2c2.objectives import (
-    ASAPLoss,
-    CAPSLoss,
-    CATSLoss,
-    GradCAPSLoss,
-    L2C2Loss,
-    LCPLoss,
-    PPORPELoss,
-    RegularizedLoss,
-    SR2LLoss,
-)
+from torchrl_l2c2.objectives import L2C2Loss, PPORPELoss, RegularizedLoss
 from torchrl_l2c2.optim import AdaTerm
 from torchrl_l2c2.smoothing import smooth
 from torchrl_l2c2.transforms import NeighborTransform, ObservationNoise
@@ -65,26 +55,6 @@ def _make_l2c2_loss(
         moved_keys=_listed(moved_keys),
         **settings,
     )
-
-
-def _make_grad_caps_loss(
-    base_loss: LossModule, frames_key: Any, previous_key: Any, **settings: Any
-) -> GradCAPSLoss:
-    return _make_of_frames(GradCAPSLoss, base_loss, frames_key, previous_key, **settings)
-
-
-def _make_asap_loss(
-    base_loss: LossModule, frames_key: Any, previous_key: Any, **settings: Any
-) -> GradCAPSLoss:
-    return _make_of_frames(ASAPLoss, base_loss, frames_key, previous_key, **settings)
-
-
-def _make_of_frames(
-    kind: type[GradCAPSLoss], base_loss: LossModule, frames: Any, previous: Any, **settings: Any
-) -> GradCAPSLoss:
-    keys = {"frames_key": frames, "previous_key": previous}
-    named = {name: _normalize_hydra_key(key) for name, key in keys.items()}
-    return kind(base_loss, **named, **settings)
 
 
 def _make_neighbor_transform(
@@ -211,12 +181,6 @@ class SmoothLossConfig(LossConfig):
 
 NeighborhoodConfig = _node(Neighborhood, ConfigBase)
 L2C2LossConfig = _node(L2C2Loss, LossConfig, builder=_make_l2c2_loss)
-CAPSLossConfig = _node(CAPSLoss, LossConfig)
-CATSLossConfig = _node(CATSLoss, LossConfig)
-GradCAPSLossConfig = _node(GradCAPSLoss, LossConfig, builder=_make_grad_caps_loss)
-ASAPLossConfig = _node(ASAPLoss, LossConfig, builder=_make_asap_loss)
-SR2LLossConfig = _node(SR2LLoss, LossConfig)
-LCPLossConfig = _node(LCPLoss, LossConfig)
 PPORPELossConfig = _node(PPORPELoss, LossConfig)
 NeighborTransformConfig = _node(
     NeighborTransform, TransformConfig, builder=_make_neighbor_transform, without=("generator",)
@@ -238,20 +202,19 @@ def register() -> None:
     ====================== ===================================
     group                  names
     ====================== ===================================
-    ``loss``               ``smooth``; ``l2c2``, ``caps``,
-                           ``cats``, ``grad_caps``, ``asap``,
-                           ``sr2l``, ``lcp``, ``ppo_rpe``
+    ``loss``               ``smooth``, ``l2c2``, ``ppo_rpe``
     ``transform``          ``neighbor``, ``observation_noise``
     ``optimizer``          ``adaterm``
     ``target_net_updater`` ``tsoft``
     ``neighborhood``       ``l2c2``
     ====================== ===================================
 
-    ``loss: smooth`` is :func:`~torchrl_l2c2.smooth`, with its presets. The other configurations
-    have the parameters and defaults of their components. ``base_loss`` is the configuration of
-    another loss, such as TorchRL's ``loss: sac``. ``neighborhood`` is a configuration of the group
-    ``neighborhood``; without it, the paper's settings apply. With ``seed``, a transform has its own
-    generator on ``device``, the device of the batches (such as ``cuda:0``; default ``cpu``).
+    ``loss: smooth`` is :func:`~torchrl_l2c2.smooth`, with its methods and presets. The other
+    configurations have the parameters and defaults of their components. ``base_loss`` is the
+    configuration of another loss, such as TorchRL's ``loss: sac``. ``neighborhood`` is a
+    configuration of the group ``neighborhood``; without it, the paper's settings apply. With
+    ``seed``, a transform has its own generator on ``device``, the device of the batches (such as
+    ``cuda:0``; default ``cpu``).
 
     Examples:
         >>> from hydra import compose, initialize
@@ -272,12 +235,6 @@ def register() -> None:
     store = ConfigStore.instance()
     store.store(group="loss", name="smooth", node=SmoothLossConfig)
     store.store(group="loss", name="l2c2", node=L2C2LossConfig)
-    store.store(group="loss", name="caps", node=CAPSLossConfig)
-    store.store(group="loss", name="cats", node=CATSLossConfig)
-    store.store(group="loss", name="grad_caps", node=GradCAPSLossConfig)
-    store.store(group="loss", name="asap", node=ASAPLossConfig)
-    store.store(group="loss", name="sr2l", node=SR2LLossConfig)
-    store.store(group="loss", name="lcp", node=LCPLossConfig)
     store.store(group="loss", name="ppo_rpe", node=PPORPELossConfig)
     store.store(group="transform", name="neighbor", node=NeighborTransformConfig)
     store.store(group="transform", name="observation_noise", node=ObservationNoiseConfig)
