@@ -726,6 +726,18 @@ class TestRecording:
         with pytest.raises(UserError, match=r"must be finite, got \[nan\] in row 7"):
             diagnose_actions(broken)
 
+    def test_every_action_may_have_its_own_bounds(self):
+        """A knee that is at its narrow bounds, and a hip that uses half of its wide ones."""
+        jumps = 0.5 * SINE.sign()
+        found = diagnose_actions(
+            torch.cat((SINE, jumps), 1), action_names=["hip", "knee"], bounds=[(-2, 2), (-0.5, 0.5)]
+        )
+        assert (found.low.tolist(), found.high.tolist()) == ([-2.0, -0.5], [2.0, 0.5])
+        (finding,) = (each.text for each in findings(found) if "bang-bang" in each.text)
+        assert finding.startswith("knee is bang-bang")
+        with pytest.raises(UserError, match="a pair for each of the 1, got 2 pairs"):
+            diagnose_actions(SINE, bounds=[(-1, 1), (-1, 1)])
+
     def test_bounds_must_be_apart(self):
         with pytest.raises(UserError, match="the lower one first"):
             diagnose_actions(SINE, bounds=(1.0, 1.0))
@@ -843,6 +855,11 @@ class TestCommand:
         assert told.startswith("robot: action variation 2\n  - knee flips from step to step")
         assert "\n\nrun: return " in told and f"page: {robot.with_suffix('.html')}\n" in told
         assert "<!-- robot: action variation 2 -->" in picture.read_text()
+        each = table_file(tmp_path / "legs.csv", "hip,knee", *("1,3", "0,-3") * 10)
+        main([str(each), "--bounds", "-9", "9", "--bounds", "-3", "3"])
+        told = capsys.readouterr().out
+        assert "knee is bang-bang" in told and "19 times, nearly every step" in told
+        assert "hip is bang-bang" not in told
         with pytest.raises(SystemExit):
             main([str(run), "--bounds", "-2", "2"])
         assert "--bounds and --columns are of recorded actions: no CSV" in capsys.readouterr().err

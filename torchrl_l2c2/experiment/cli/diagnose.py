@@ -36,10 +36,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if chosen.actions:
             check_output(chosen.actions, ".svg")
         names = chosen.names or diagnosis.run_names(folders)
+        bounds = chosen.bounds
+        if bounds is not None and len(bounds) == 1:
+            (bounds,) = bounds  # of all actions
         diagnoses = [
-            diagnosis.diagnose_recording(
-                folder, name=name, columns=chosen.columns, bounds=chosen.bounds
-            )
+            diagnosis.diagnose_recording(folder, name=name, columns=chosen.columns, bounds=bounds)
             if _is_recording(folder)
             else diagnosis.diagnose_run(
                 folder,
@@ -86,9 +87,11 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--bounds",
         nargs=2,
+        action="append",
         type=float,
         metavar=("LOW", "HIGH"),
-        help="bounds of recorded actions (default: the smallest and largest of each action)",
+        help="bounds of all recorded actions, or repeated, of each action in the order of the "
+        "columns (default: the smallest and largest of each action)",
     )
     add("--actions", help="SVG file for the actions of all runs, row by row (default: none)")
     add("--columns", nargs="+", help="columns that are actions (default: all but time)")

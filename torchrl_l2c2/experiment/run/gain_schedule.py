@@ -92,9 +92,8 @@ class GainControl:
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the gain, the update of its last change, and the values measured since."""
-        target = {} if self._target is None else self._target.state_dict()
-        state = {"progress": self._progress, "target": target, "updates": self._updates}
-        return {**state, "seen": list(self._seen)}
+        gains = {"value": self._gain, "progress": self._progress}
+        return {**gains, "updates": self._updates, "seen": list(self._seen)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restores a state of :meth:`state_dict`, and sets the loss's gain."""
@@ -102,17 +101,18 @@ class GainControl:
             return
         self._progress = state["progress"]
         if self._target is not None:
-            self._target.load_state_dict(state["target"])
+            self._target.load_state_dict({"value": state["value"]})
         self._updates, self._seen = state["updates"], list(state["seen"])
         self._apply()
 
     @property
     def _gain(self) -> float:
         """Gain without the strength."""
-        assert self._config is not None
         if self._target is not None:
             return self._target.value
-        return min(1.0, self._progress / self._config.gain_length)
+        if self._config is not None:
+            return min(1.0, self._progress / self._config.gain_length)
+        return 1.0
 
     def _apply(self) -> None:
         assert self._config is not None

@@ -6,7 +6,9 @@ import csv
 import math
 import warnings
 from collections.abc import Sequence
+from numbers import Real
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,6 +23,7 @@ LEAST_STEPS = 20  # Shorter recordings do not show what shakes.
 TIME = "time"  # the column of seconds
 LIKELY = (1e-5, 1.0)  # seconds from one step to the next
 GAP = 2.5  # times the median time step: a longer one is a gap
+Bounds = tuple[float, float]
 BEYOND = 0.5  # share of an action that may lie beyond its bounds, where a task would clip it
 EVEN = 0.9  # share of the actions that are repeated equally often, if a logger repeats them
 
@@ -30,7 +33,7 @@ def diagnose_actions(
     *,
     name: str = "recording",
     action_names: Sequence[str] = (),
-    bounds: tuple[float, float] | None = None,
+    bounds: Bounds | Sequence[Bounds] | None = None,
     rate: float | None = None,
 ) -> Diagnosis:
     """Measures how recorded actions shake; why they do, only :func:`~.measured.diagnose` can tell.
@@ -45,9 +48,10 @@ def diagnose_actions(
     Keyword Args:
         name (str): name of the recording, for comparisons. Default ``"recording"``.
         action_names (sequence of str): name of each action. Default: ``action[0]`` and so on.
-        bounds (tuple of float, optional): lower and upper bound of all actions. Shares in the
-            findings are relative to their distance. Default: none; then every action's own span
-            takes its place, and no action is said to be at its bounds.
+        bounds (tuple of float, or sequence of them, optional): lower and upper bound of all
+            actions, or of each action. Shares in the findings are relative to their distance.
+            Default: none; then every action's own span takes its place, and no action is said to be
+            at its bounds.
         rate (float, optional): rows per second, greater than 0, for frequencies in hertz. Default:
             shares of the control rate.
 
@@ -76,8 +80,7 @@ def diagnose_actions(
             f"{name}: {actions.shape[1]} actions need as many action_names, got "
             f"{len(action_names)}."
         )
-    if bounds is not None and not -math.inf < bounds[0] < bounds[1] < math.inf:
-        raise UserError(f"bounds must be two finite numbers, the lower one first, got {bounds}.")
+    spec = _spec(actions.shape[1], bounds)
     if rate is not None and not 0.0 < rate < math.inf:
         raise UserError(f"rate must be a number of steps per second above 0, got {rate}.")
     actions = actions.detach().float().cpu()
@@ -95,8 +98,6 @@ def diagnose_actions(
             f"policy: one row of {repeated} is kept.",
             stacklevel=2,
         )
-    shape = actions.shape[1:]
-    spec: TensorSpec = Unbounded(shape) if bounds is None else Bounded(*bounds, shape)
     low, high, bounded = bounds_of(spec, actions)
     found = Diagnosis(
         name=name,
@@ -122,7 +123,7 @@ def diagnose_recording(
     *,
     name: str | None = None,
     columns: Sequence[str] | None = None,
-    bounds: tuple[float, float] | None = None,
+    bounds: Bounds | Sequence[Bounds] | None = None,
 ) -> Diagnosis:
     """Measures the actions in a CSV file: a column for each action, a row for each control step.
 
@@ -136,7 +137,7 @@ def diagnose_recording(
         name (str, optional): Name of the recording. Default: the file.
         columns (sequence of str, optional): The columns that are actions. Default: all but
             ``time``.
-        bounds (tuple of float, optional): As for :func:`diagnose_actions`.
+        bounds (tuple of float, or sequence of them, optional): As for :func:`diagnose_actions`.
 
     Raises:
         ValueError: the file is no such table; the message names the line.
@@ -177,6 +178,25 @@ def _without_repetitions(actions: Tensor) -> tuple[Tensor, int]:
     if often < 2 or len(starts) < LEAST_STEPS or even < EVEN:
         return actions, 1
     return actions[starts].repeat_interleave(held.long().clamp_min(1), 0), often
+
+
+def _spec(actions: int, bounds: Bounds | Sequence[Bounds] | None) -> TensorSpec:
+    """The space of this many actions."""
+    if bounds is None:
+        return Unbounded((actions,))
+    pairs: Any = [bounds] * actions if isinstance(bounds[0], Real) else bounds
+    if len(pairs) != actions:
+        raise UserError(
+            f"bounds must be one pair for all actions, or a pair for each of the {actions}, got "
+            f"{len(pairs)} pairs."
+        )
+    for pair in pairs:
+        if not -math.inf < pair[0] < pair[1] < math.inf:
+            raise UserError(
+                f"bounds must be two finite numbers, the lower one first, got {tuple(pair)}."
+            )
+    low, high = torch.tensor(pairs, dtype=torch.float32).T
+    return Bounded(low, high, (actions,))
 
 
 def _check_bounds(found: Diagnosis) -> None:

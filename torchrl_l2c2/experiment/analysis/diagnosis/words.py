@@ -260,10 +260,11 @@ def _at_bounds(name: str, action: Tensor, share: float) -> Finding:
     if not jumps.any():
         text = f"{name} is pinned at its bounds in {share:.0%} of the steps: wider bounds may help."
         return Finding("pinned", text)
+    every = round(len(action) / int(jumps.sum()))
+    often = "nearly every step" if every == 1 else f"one in {every} steps"
     text = (
         f"{name} is bang-bang: it is at its bounds in {share:.0%} of the steps and jumps over more "
-        f"than half of its range {int(jumps.sum())} times, one in "
-        f"{len(action) / int(jumps.sum()):.0f} steps, {_where(jumps.float())}."
+        f"than half of its range {int(jumps.sum())} times, {often}, {_where(jumps.float())}."
     )
     return Finding("bang-bang", text)
 
