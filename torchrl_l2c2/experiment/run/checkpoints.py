@@ -22,7 +22,7 @@ from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.run.files import write_atomically
 
 MAGIC = b"torchrl_l2c2\n"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 1
 HEADER = struct.Struct(f"<{len(MAGIC)}sI32s")
 PATTERN = "checkpoint_[0-9]*.pt"
 

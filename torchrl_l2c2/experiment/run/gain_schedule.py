@@ -26,11 +26,11 @@ class GainControl:
     """
 
     def __init__(self, config: ExperimentConfig, learner: Learner) -> None:
-        self._learner, self._loss = learner, learner.agent.loss
+        self._learner = learner
         self._updates = 0
         # Values since the last step: several episodes may end in a rollout.
         self._seen: list[float] = []
-        self._progress = 0.0
+        self._ramp = 0.0
         self._target: TargetGain | None = None
         regularizer = config.regularizer
         # None for a constant gain.
@@ -42,7 +42,6 @@ class GainControl:
         if self._config is None:
             return
         if self._config.gain == "ramp":
-            self._loss.ramp(self._config.gain_length, end=self._config.strength)
             learner.at_full_gain = self._at_full_gain
         else:
             assert self._config.gain_target is not None
@@ -84,7 +83,7 @@ class GainControl:
         if ends_round and self._learner.updates > self._updates:
             self._updates, self._seen = self._learner.updates, []
             if self._target is None:
-                self._progress = measured
+                self._ramp = min(1.0, measured / self._config.gain_length)
             else:
                 self._target.step(measured)
             self._apply()
@@ -92,38 +91,33 @@ class GainControl:
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the gain, the update of its last change, and the values measured since."""
-        gains = {"value": self._gain, "progress": self._progress}
-        return {**gains, "updates": self._updates, "seen": list(self._seen)}
+        gains = {} if self._config is None else {"all": {"value": self._gain}}
+        return {"gains": gains, "updates": self._updates, "seen": list(self._seen)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restores a state of :meth:`state_dict`, and sets the loss's gain."""
         if self._config is None:
             return
-        self._progress = state["progress"]
-        if self._target is not None:
-            self._target.load_state_dict({"value": state["value"]})
+        if self._target is None:
+            self._ramp = state["gains"]["all"]["value"]
+        else:
+            self._target.load_state_dict(state["gains"]["all"])
         self._updates, self._seen = state["updates"], list(state["seen"])
         self._apply()
 
     @property
     def _gain(self) -> float:
         """Gain without the strength."""
-        if self._target is not None:
-            return self._target.value
-        if self._config is not None:
-            return min(1.0, self._progress / self._config.gain_length)
-        return 1.0
+        return self._ramp if self._target is None else self._target.value
 
-    def _apply(self) -> None:
+    def _apply(self, gain: float | None = None) -> None:
         assert self._config is not None
-        if self._target is None:
-            self._loss.set_progress(self._progress)
-        else:
-            self._loss.regularizer_gain = self._config.strength * self._target.value
+        gain = self._gain if gain is None else gain
+        self._learner.agent.loss.regularizer_gain = self._config.strength * gain
 
     @contextmanager
     def _at_full_gain(self) -> Iterator[None]:
-        self._loss.set_progress(1.0)
+        self._apply(1.0)
         try:
             yield
         finally:

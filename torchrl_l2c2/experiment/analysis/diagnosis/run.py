@@ -154,9 +154,9 @@ def _trained(folder: Path, config: ExperimentConfig, env: EnvBase) -> Agent | No
         return None
     agent = make_agent(replace(config, device="cpu"), env)
     agent.load_networks(newest[1])
-    if isinstance(config.regularizer, GainConfig):
-        gain = newest[1]["gain"]["value"]
-        agent.loss.regularizer_gain = config.regularizer.strength * gain
+    gains = newest[1].get("gain", {}).get("gains", {})
+    if gains and isinstance(config.regularizer, GainConfig):
+        agent.loss.regularizer_gain = config.regularizer.strength * gains["all"]["value"]
     return agent
 
 
