@@ -853,7 +853,7 @@ class TestCommand:
         main([str(robot), str(run), *chosen, "--actions", str(picture), "--names", "robot", "run"])
         told = capsys.readouterr().out
         assert told.startswith("robot: action variation 2\n  - knee flips from step to step")
-        assert "\n\nrun: return " in told and f"page: {robot.with_suffix('.html')}\n" in told
+        assert "\n\nrun: return " in told and f"page: {tmp_path / 'robot_diagnosis.html'}\n" in told
         assert "<!-- robot: action variation 2 -->" in picture.read_text()
         each = table_file(tmp_path / "legs.csv", "hip,knee", *("1,3", "0,-3") * 10)
         main([str(each), "--bounds", "-9", "9", "--bounds", "-3", "3"])

@@ -28,7 +28,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if (chosen.bounds or chosen.columns) and not any(map(_is_recording, folders)):
             parser.error("--bounds and --columns are of recorded actions: no CSV file was given")
         first = Path(chosen.folders[0])
-        page = first.with_suffix(".html") if _is_recording(first) else first / "diagnosis.html"
+        page = (
+            first.with_name(f"{first.stem}_diagnosis.html")
+            if _is_recording(first)
+            else first / "diagnosis.html"
+        )
         path = Path(chosen.output or page)
         # Before the episodes, whose results could otherwise be lost.
         if chosen.output or page.parent.is_dir():  # Otherwise the missing run is reported below.
@@ -82,7 +86,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--names", nargs="+", help="names of the runs (default: the settings that differ)")
     add(
         "--output",
-        help="HTML file (default: diagnosis.html in the first folder, or FILE.html of a FILE.csv)",
+        help="HTML file (default: diagnosis.html in the first folder, or NAME_diagnosis.html next to "
+        "a NAME.csv)",
     )
     add(
         "--bounds",
