@@ -86,8 +86,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--names", nargs="+", help="names of the runs (default: the settings that differ)")
     add(
         "--output",
-        help="HTML file (default: diagnosis.html in the first folder, or NAME_diagnosis.html next to "
-        "a NAME.csv)",
+        help="HTML file (default: diagnosis.html in the first folder, or NAME_diagnosis.html next "
+        "to NAME.csv)",
     )
     add(
         "--bounds",
