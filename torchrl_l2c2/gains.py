@@ -1,4 +1,4 @@
-r"""A gain that meets a target, and the gradients of a regularizer relative to those of the loss.
+r"""A gain that meets a target, and the size of a regularizer's gradients.
 
 The gain is for the factor of a regularized loss. Assign it between updates, also if the loss is
 compiled::
