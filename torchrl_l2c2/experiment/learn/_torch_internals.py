@@ -14,20 +14,17 @@ import torch
 from torch import Tensor
 from torch._guards import TracingContext, tracing
 from torch._inductor import config as inductor_config
-from torch._inductor.custom_graph_pass import CustomGraphPass, get_hash_for_files
 from torch._subclasses import FakeTensor, FakeTensorMode
 from torch.fx import GraphModule
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 from torch.utils._pytree import tree_flatten, tree_map_only, tree_unflatten
 
 __all__ = [
-    "CustomGraphPass",  # Changes a graph before code generation.
     "FakeTensor",  # Tensor without data, for tracing.
     "FakeTensorMode",  # Creates fake tensors.
     "TorchDispatchMode",  # Intercepts every operation.
     "compile_graph",
     "disable_current_modes",
-    "get_hash_for_files",  # Identifies a pass in the compiler's cache.
     "marked_as_compiling",
     "tree_flatten",  # Arguments and results are nested.
     "tree_map_only",

@@ -18,19 +18,17 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.fx import Graph, GraphModule
+from torch.fx import GraphModule
 from torch.fx.experimental.proxy_tensor import get_proxy_mode, make_fx, track_tensor_tree
 from torch.fx.experimental.symbolic_shapes import ShapeEnv
 
 from torchrl_l2c2.experiment.errors import CompilerError
 from torchrl_l2c2.experiment.learn._torch_internals import (
-    CustomGraphPass,
     FakeTensor,
     FakeTensorMode,
     TorchDispatchMode,
     compile_graph,
     disable_current_modes,
-    get_hash_for_files,
     marked_as_compiling,
     tree_flatten,
     tree_map_only,
@@ -207,7 +205,6 @@ def _compile(
         "fallback_random": True,
         # compiled() has already checked the sizes to choose the program.
         "size_asserts": False,
-        "post_grad_custom_post_pass": _SeparateBiases(),
     }
     try:
         with torch.no_grad():
@@ -242,33 +239,6 @@ def _failure(lines: Sequence[str]) -> str:
         f"the compiler failed ({(errors or lines or ['no message'])[0]}): set compile=false to "
         "train without it, several times slower."
     )
-
-
-class _SeparateBiases(CustomGraphPass):
-    """Graph pass that moves biases from matrix products into the next kernels.
-
-    ``addmm`` first copies the bias to every row of its result. The next kernel reads the result
-    anyway and can add the bias without this extra call and memory pass. Torch's own pass of this
-    kind supports only GPUs.
-    """
-
-    def __call__(self, graph: Graph) -> None:
-        aten = torch.ops.aten
-        for node in graph.find_nodes(op="call_function", target=aten.addmm.default):
-            if node.kwargs:  # Factors other than 1.
-                continue
-            bias, left, right = node.args
-            with graph.inserting_before(node):
-                product = graph.call_function(aten.mm.default, (left, right))
-                total = graph.call_function(aten.add.Tensor, (product, bias))
-            for new in (product, total):
-                new.meta.update(node.meta)
-            node.replace_all_uses_with(total)
-            graph.erase_node(node)
-
-    def uuid(self) -> bytes:
-        """Identifies the pass in the compiler's cache by the contents of this file."""
-        return get_hash_for_files((__file__,))
 
 
 def compiler_available() -> bool:
