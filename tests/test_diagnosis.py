@@ -82,6 +82,7 @@ def made_up(actions=0.5 * SINE, **known):
             "distance": torch.full((len(actions),), 0.5),
             "neighborhood": Neighborhood(),
             "unmoved": torch.tensor([0.0, 1.0]),
+            "held": torch.tensor([0.9, 1.0]),
             "noise_scale": 0.01,
             "noise_action": 0.01,
             "noise_share": 0.1,
@@ -288,6 +289,17 @@ class TestWords:
         assert kind in kinds(made_up(fast, **known(threshold)))
         assert kind not in kinds(made_up(fast, **known(0.99 * threshold)))
 
+    def test_the_input_that_an_action_follows_is_named(self):
+        """If it moves much, from the threshold on."""
+        fast = 0.5 * torch.sin(2 * torch.pi * STEPS / 10).unsqueeze(-1)
+        follows = torch.tensor([1.1, THRESHOLDS["FOLLOWS"][0]])
+        finding = said(made_up(fast, held=follows), "input")
+        assert "one input, angle: " in finding.text and "change 50% less" in finding.text
+        assert not finding.fault
+        assert "input" not in kinds(made_up(fast, held=1.01 * follows))
+        assert "input" not in kinds(made_up(torch.zeros_like(fast), held=follows))
+        assert "input" not in kinds(made_up(fast, held=torch.full((2,), torch.nan)))
+
     def test_a_faint_regularizer_is_told_by_its_gradients(self):
         """Sizes count where there are no gradients; terms of the loss itself never do."""
         own = {"actor": TermShare(added=False, size=1e-5)}
@@ -369,6 +381,18 @@ class TestMeasured:
         assert found.measures["return"] == 20.0 and found.measures["length"] == 10.0
         assert found.measures["action_variation"] == pytest.approx(0.3, rel=1e-5)
         assert found.spread == 0.0 and found.low.tolist() == [-4.0] and found.bounded
+
+    def test_the_action_follows_the_coordinate_that_the_policy_reads(self):
+        """Held, it leaves no change; the other coordinate leaves all of it."""
+        found = diagnose(linear(3.0), GymWrapper(Walk()), episodes=1)
+        assert found.held.tolist() == pytest.approx([0.0, 1.0], abs=1e-6)
+        assert "observation[0]: 100%" in page([found]) and "Inputs that the action" in page([found])
+        assert "Inputs that the action" not in page([replace(found, held=torch.empty(0))])
+
+    def test_images_are_not_held_one_pixel_at_a_time(self, monkeypatch):
+        """It would take an evaluation of every pixel."""
+        monkeypatch.setattr("torchrl_l2c2.experiment.analysis.diagnosis.measured.MOST_INPUTS", 1)
+        assert not len(diagnose(linear(3.0), GymWrapper(Walk()), episodes=1).held)
 
     def test_an_action_value_sees_the_action_of_the_state(self):
         """At all of its neighbors: of the action times the state, the slope is the action."""

@@ -152,6 +152,7 @@ def test_the_pages_have_the_thresholds_of_diagnose() -> None:
         "pinned": [threshold("BANG_BANG")],
         "sensitive to noise": [threshold("NOISY")],
         "steep spots": [threshold("STEEP")],
+        "follows one input": [threshold("FOLLOWS")],
         "wide samples": [threshold("WIDE")],
         "small terms": [threshold("SMALL")],
         "stands still": [threshold("STILL")],

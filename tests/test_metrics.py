@@ -13,6 +13,7 @@ from torchrl_l2c2.metrics import (
     action_jerk,
     action_rate,
     amplitude_spectrum,
+    change_with_held_input,
     noise_sensitivity,
     previous_action_gain,
     roughness,
@@ -250,6 +251,23 @@ def test_of_a_range_that_is_open_only_the_bound_counts():
     assert saturation(actions, 0.0, math.inf).item() == pytest.approx(2 / 4)
     assert saturation(actions, -math.inf, 5.0).item() == pytest.approx(1 / 4)
     assert saturation(actions, -math.inf, math.inf).item() == 0.0
+
+
+def test_a_held_input_leaves_the_changes_of_the_others():
+    """Of a linear policy by hand: moves of 2 and -1 with weights 3 and 1 change it by 6 - 1."""
+    seen = torch.randn(7, 2, 1, generator=torch.Generator().manual_seed(0))
+    after = seen + torch.tensor([[2.0], [-1.0]])
+
+    def policy(observation):
+        return observation.flatten(1) @ torch.tensor([[3.0], [1.0]])
+
+    found = change_with_held_input(policy, seen, after)
+    torch.testing.assert_close(found, torch.tensor([[1 / 5], [6 / 5]]))
+    assert change_with_held_input(policy, seen, seen).isnan().all()
+    with pytest.raises(ValueError, match=r"one shape, \[N, \*F\], got \(7, 2, 1\) and \(6, 2, 1\)"):
+        change_with_held_input(policy, seen, after[1:])
+    with pytest.raises(ValueError, match=r"got \(2,\) and \(2,\)"):
+        change_with_held_input(policy, seen[0, :, 0], seen[0, :, 0])
 
 
 def test_noise_sensitivity_of_a_linear_policy():

@@ -8,7 +8,11 @@ from torchrl_l2c2.metrics.actions import (
     previous_action_gain,
     saturation,
 )
-from torchrl_l2c2.metrics.policy import local_lipschitz, noise_sensitivity
+from torchrl_l2c2.metrics.policy import (
+    change_with_held_input,
+    local_lipschitz,
+    noise_sensitivity,
+)
 from torchrl_l2c2.metrics.spectrum import amplitude_spectrum, roughness, spectral_smoothness
 
 __all__ = [
@@ -17,6 +21,7 @@ __all__ = [
     "action_rate",
     "action_variation",
     "amplitude_spectrum",
+    "change_with_held_input",
     "local_lipschitz",
     "noise_sensitivity",
     "previous_action_gain",

@@ -1,4 +1,4 @@
-"""Local steepness of a policy, and its sensitivity to noise on observations."""
+"""Local steepness of a policy, its sensitivity to noise, and the inputs that its actions follow."""
 
 from __future__ import annotations
 
@@ -146,6 +146,58 @@ def noise_sensitivity(
             "last dimension of 1, and a single observation a batch dimension."
         )
     return 0.5 * change.square().sum(-1).mean()
+
+
+@torch.no_grad()
+def change_with_held_input(
+    policy: Callable[[Tensor], Tensor], observations: Tensor, next_observations: Tensor
+) -> Tensor:
+    r"""Change of the action per step if one input is held, relative to the change as it is.
+
+    .. math::
+        \rho_i = \sqrt{\frac{\mathbb E\left[\lVert \mu(s'_{(i)}) - \mu(s) \rVert_2^2\right]}
+            {\mathbb E\left[\lVert \mu(s') - \mu(s) \rVert_2^2\right]}}
+
+    where :math:`s'_{(i)}` is :math:`s'` with the coordinate :math:`i` of :math:`s`. It shows which
+    inputs make an action shake, whatever their units are. Near 0 the action follows this input
+    alone, and at 1 it does not depend on the movement of this input. Above 1 the input opposes
+    others: held, it would make the action change more.
+
+    Args:
+        policy (callable): observations ``[N, *F]`` to mean actions ``[N, A]``.
+        observations (Tensor): observations :math:`s`, shape ``[N, *F]``.
+        next_observations (Tensor): their successors :math:`s'`, shape ``[N, *F]``.
+
+    Returns:
+        Tensor: a number for each coordinate, at least 0, shape ``[*F]``; NaN if the action does not
+        change at all. It takes an evaluation of ``N`` observations for each coordinate.
+
+    Raises:
+        ValueError: the shapes differ, or have no dimension of the coordinates.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_l2c2.metrics import change_with_held_input
+        >>> seen = torch.tensor([[0.0, 0.0], [1.0, 1.0]])
+        >>> policy = lambda observation: observation @ torch.tensor([[3.0], [1.0]])
+        >>> change_with_held_input(policy, seen[:1], seen[1:])  # a change of 4, of 3 and 1
+        tensor([0.2500, 0.7500])
+    """
+    if observations.shape != next_observations.shape or observations.ndim < 2:
+        raise ValueError(
+            "change_with_held_input: observations and next_observations must have one shape, "
+            f"[N, *F], got {tuple(observations.shape)} and {tuple(next_observations.shape)}."
+        )
+    before, after = observations.flatten(1), next_observations.flatten(1)
+    action = policy(observations)
+    whole = (policy(next_observations) - action).square().sum(-1).mean()
+    changes = []
+    for coordinate in range(before.shape[1]):
+        held = after.clone()
+        held[:, coordinate] = before[:, coordinate]
+        change = policy(held.view_as(next_observations)) - action
+        changes.append(change.square().sum(-1).mean())
+    return (torch.stack(changes) / whole).sqrt().view(observations.shape[1:])
 
 
 def _check_neighbors(name: str, point: Tensor, neighbors: Tensor) -> None:

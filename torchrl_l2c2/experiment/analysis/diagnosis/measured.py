@@ -21,7 +21,12 @@ from torchrl_l2c2.experiment.envs.frames import check_finite
 from torchrl_l2c2.experiment.envs.pictures import control_rate
 from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.run.evaluation import LEAST_STEPS, measure
-from torchrl_l2c2.metrics import action_variation, local_lipschitz, noise_sensitivity
+from torchrl_l2c2.metrics import (
+    action_variation,
+    change_with_held_input,
+    local_lipschitz,
+    noise_sensitivity,
+)
 from torchrl_l2c2.neighborhood import Neighborhood
 
 Value = Callable[[Tensor, Tensor], Tensor]
@@ -32,6 +37,7 @@ LOCKED = 1e-3  # of the largest span: smallest span that an action's change is r
 SAMPLES = 16  # actions drawn at a state to see how far they spread
 SAMPLED_STATES = 256
 SAME_PLACE = 0.25  # of the standard deviation of every coordinate within the episode
+MOST_INPUTS = 512  # of which each is held once: more would be pixels
 STEPS_AT_ONCE = 128  # whose neighbors are in memory together: they may be images
 
 
@@ -75,6 +81,9 @@ class Diagnosis:
         distance: distances of the neighbors, the largest :math:`|u_i|`, ``[T * K]``.
         neighborhood: neighborhood that the neighbors were drawn from.
         unmoved: share of the steps in which a coordinate does not change at all, ``[F]``.
+        held: root mean square change of the actions' relative positions per step if one coordinate
+            keeps its value of the step before, relative to the change as it is, ``[F]``; empty for
+            more than 512 coordinates.
         noise_scale: standard deviation of the noise on observations.
         noise_action: root mean square change of the action by this noise.
         noise_share: mean squared change of the action per step that this noise causes, divided by
@@ -102,6 +111,7 @@ class Diagnosis:
     distance: Tensor = UNKNOWN
     neighborhood: Neighborhood = field(default_factory=Neighborhood)
     unmoved: Tensor = UNKNOWN
+    held: Tensor = UNKNOWN
     noise_scale: float = math.nan
     noise_action: float = math.nan
     noise_share: float = math.nan
@@ -238,6 +248,10 @@ def diagnose(
     near = Neighborhood() if neighborhood is None else neighborhood
     steepness = _steepness(first, key, env.action_key, act, value, near, num_neighbors, generator)
     states, successors = first[key], first["next", key]
+    width = (high - low).clamp_min(torch.finfo(low.dtype).eps)
+    held = UNKNOWN
+    if _flat(states).shape[1] <= MOST_INPUTS:
+        held = change_with_held_input(lambda seen: act(seen) / width, states, successors).flatten()
     sensitivity = noise_sensitivity(act, states, noise_scale, generator=generator).item()
     change = actions.diff(dim=0).square().sum(-1).mean().item()
     return Diagnosis(
@@ -251,6 +265,7 @@ def diagnose(
         **steepness,
         neighborhood=near,
         unmoved=(_flat(states) == _flat(successors)).float().mean(0),
+        held=held,
         noise_scale=noise_scale,
         noise_action=math.sqrt(2 * sensitivity),
         # Two independent draws differ by twice the variance of one.

@@ -26,6 +26,7 @@ from torchrl_l2c2.experiment.analysis.document import data_uri, render
 from torchrl_l2c2.experiment.analysis.reports.table import Table
 from torchrl_l2c2.experiment.run.files import write_atomically
 
+SHOWN_INPUTS = 5
 # The measures in the order of their table, and their names.
 MEASURES = {
     "return": "return",
@@ -103,6 +104,7 @@ def page(diagnoses: Sequence[Diagnosis]) -> str:
         without_pictures=[one.name for one in played if films is not None and not one.pictures],
         measures=_measures(diagnoses),
         steepest_states=[_steepest(one) for one in played],
+        inputs=_inputs(played),
         unmoved=_unmoved(played),
         rules=_rules(),
     )
@@ -162,6 +164,23 @@ def _steepest(one: Diagnosis) -> Table:
         rows.append([str(place), str(step), *map(_number, numbers), *(f"({t})" for t in texts)])
     columns = ["", "step", "policy", "value", "action", "next action", "observation"]
     return Table(f"The steepest states: {one.name}", columns, rows)
+
+
+def _inputs(diagnoses: Sequence[Diagnosis]) -> Table:
+    columns = []
+    for one in diagnoses:
+        order = one.held.argsort().tolist() if one.held.isfinite().all() else []
+        cells = [f"{one.entries[i]}: {1 - one.held[i].item():.0%}" for i in order[:SHOWN_INPUTS]]
+        columns.append([*cells, *["-"] * (SHOWN_INPUTS - len(cells))])
+    rows = [[str(place), *cells] for place, cells in enumerate(zip(*columns, strict=True), 1)]
+    rows = [row for row in rows if set(row[1:]) != {"-"}]
+    note = (
+        "How much less the action would change from step to step (root mean square) if one input "
+        "kept its value of the step before; the inputs with the largest effect. If the action "
+        "shakes, look here for a sensor with noise, and for the previous action."
+    )
+    names = ["", *(one.name for one in diagnoses)]
+    return Table("Inputs that the action follows", names, rows, [note])
 
 
 def _unmoved(diagnoses: Sequence[Diagnosis]) -> Table:

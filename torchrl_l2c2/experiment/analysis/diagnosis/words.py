@@ -28,6 +28,11 @@ THRESHOLDS = {
         "smallest squared change by noise on observations, as a share of the whole squared change",
     ),
     "WIDE": (0.4, "smallest standard deviation of wide samples, of half the range; uniform: 0.58"),
+    "FOLLOWS": (
+        0.5,
+        "largest change with a held input, relative to the change as it is, of an action that "
+        "follows this input",
+    ),
     "STEEP": (10.0, "smallest ratio of the largest to the median local Lipschitz constant"),
     "SMALL": (0.001, "share of the gradient, or else of the loss, below which a term is small"),
     "UNLIKE": (
@@ -298,6 +303,15 @@ def _steepest(diagnosis: Diagnosis) -> Iterator[Finding]:
 def _reasons(diagnosis: Diagnosis) -> Iterator[Finding]:
     """Causes of the movement."""
     shaking = diagnosis.relative.diff(dim=0).abs().mean(0).max() > threshold("SMOOTH")
+    if shaking and len(diagnosis.held):
+        most = int(diagnosis.held.nan_to_num(1.0).argmin())
+        if (change := diagnosis.held[most].item()) <= threshold("FOLLOWS"):
+            text = (
+                f"Its changes follow one input, {diagnosis.entries[most]}: if this input kept its "
+                f"value of the step before, the action would change {1 - change:.0%} less (root "
+                "mean square)."
+            )
+            yield Finding("input", text, fault=False)
     if shaking and diagnosis.noise_share >= threshold("NOISY"):
         text = (
             f"It is sensitive to noise on its observations: noise of {diagnosis.noise_scale:.2g} "
