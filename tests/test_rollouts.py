@@ -304,7 +304,7 @@ def test_a_signal_is_heeded_after_a_rollout_that_no_episode_ended_in(tmp_path, m
     monkeypatch.setattr(first.learner, "learn_rollout", lambda epochs: (learn(epochs), end()))
     with pytest.raises(Interrupted, match="SIGTERM ended the training after episode 0"):
         first.train()
-    assert first.player.frames == 40 and 0.0 < first._gain.gain.value < 0.3
+    assert first.player.frames == 40 and 0.0 < first.agent.loss.regularizer_gain < 0.3
     first.close()
     again = Experiment(first.config, tmp_path / "first")
     again.train()

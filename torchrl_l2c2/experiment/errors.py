@@ -65,15 +65,6 @@ def is_one_line_error(error: BaseException) -> bool:
     return isinstance(error, (UserError, *OUTSIDE)) or is_lack_of_memory(error)
 
 
-def is_raised_by_component(error: BaseException) -> bool:
-    """Checks whether a component of this package raised the error, and not the experiment."""
-    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
-    module = frame.f_globals.get("__name__", "")
-    experiment = __name__.rpartition(".")[0]
-    package = experiment.partition(".")[0]
-    return module.startswith(f"{package}.") and not module.startswith(f"{experiment}.")
-
-
 def show_cause(error: Exception) -> None:
     """Prints the traceback of a user's own environment or policy. Ignores other errors."""
     if isinstance(error, SimulatorError) and error.__cause__ is not None:

@@ -159,8 +159,8 @@ def change_with_held_input(
             {\mathbb E\left[\lVert \mu(s') - \mu(s) \rVert_2^2\right]}}
 
     where :math:`s'_{(i)}` is :math:`s'` with the coordinate :math:`i` of :math:`s`. It shows which
-    inputs make an action shake, whatever their units are. Near 0 the action follows this input
-    alone, and at 1 it does not depend on the movement of this input. Above 1 the input opposes
+    inputs make an action shake, whatever their units are. Near 0 the action follows only this
+    input, and at 1 it does not depend on the movement of this input. Above 1 the input opposes
     others: held, it would make the action change more.
 
     Args:

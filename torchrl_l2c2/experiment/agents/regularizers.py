@@ -8,8 +8,6 @@ import torch
 from torchrl.objectives import LossModule
 
 from torchrl_l2c2.experiment.envs.frames import PREVIOUS
-from torchrl_l2c2.experiment.errors import is_raised_by_component
-from torchrl_l2c2.experiment.settings.fields import SettingError
 from torchrl_l2c2.experiment.settings.regularizers import (
     ASAPConfig,
     CAPSConfig,
@@ -41,16 +39,8 @@ def add_regularizer(loss: LossModule, config: RegularizerConfig) -> LossModule:
     Args:
         loss (LossModule): Loss of the algorithm.
         config (RegularizerConfig): Settings of the regularizer.
-
-    Raises:
-        SettingError: If the regularizer does not work with the loss.
     """
-    try:
-        loss = wrap(config, loss)
-    except TypeError as error:
-        if not is_raised_by_component(error):
-            raise
-        raise SettingError("", f"regularizer={config.name}: {error}") from error
+    loss = wrap(config, loss)
     if isinstance(config, GainConfig):
         loss.regularizer_gain = config.strength
     return loss
