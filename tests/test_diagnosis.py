@@ -157,6 +157,15 @@ class TestWords:
         assert "at step 7, where it observes speed = 7, angle = 49: " in found.text
         assert "is 6 there and 1 in the median" in found.text and not found.fault
 
+    def test_of_many_inputs_those_are_told_that_the_action_follows(self):
+        """Four of nine, the one with the largest effect first; without effects the first eight."""
+        known = {"observations": torch.arange(9.0).expand(100, 9), "entries": tuple("abcdefghi")}
+        held = torch.tensor([0.8, 1.0, 1.0, 0.9, 1.0, 1.0, 1.0, 0.7, 1.2])
+        found = said(made_up(0.5 * FLIPPING, held=held, **known), "steepest")
+        assert "where it observes h = 7, a = 0, d = 3, b = 1, ...: " in found.text
+        found = said(made_up(0.5 * FLIPPING, held=torch.empty(0), **known), "steepest")
+        assert "where it observes a = 0, b = 1, " in found.text and "h = 7, ...: " in found.text
+
     @pytest.mark.parametrize(
         ("ratio", "differs"), [(0.5, True), (0.6, False), (1.9, False), (2.0, True)]
     )

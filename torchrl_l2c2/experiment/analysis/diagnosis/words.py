@@ -51,6 +51,7 @@ def threshold(name: str) -> float:
 PARTS = 20  # of an episode in which an action may chatter
 PERIODS = 4  # of the slowest of the fast frequencies, at least, in an episode or a part of it
 FULL = 2  # findings of one kind that each have a sentence
+MOST_INPUTS = 8  # whose values are listed; of more, the four that the action follows most
 MOST_NAMES = 12  # of further actions with the same finding
 TAIL = 1.4  # times the peak's height: a higher spectrum just below it is of a slower movement
 
@@ -290,12 +291,15 @@ def _steepest(diagnosis: Diagnosis) -> Iterator[Finding]:
     """The observation at which the policy is steepest."""
     for step in diagnosis.worst(1):
         values = diagnosis.observations[step].tolist()
-        seen = [f"{e} = {v:.2g}" for e, v in zip(diagnosis.entries, values, strict=True)]
+        order, most = list(range(len(values))), MOST_INPUTS
+        if len(order) > most and len(diagnosis.held):
+            order, most = diagnosis.held.nan_to_num(1.0).argsort(stable=True).tolist(), most // 2
+        seen = [f"{diagnosis.entries[i]} = {values[i]:.2g}" for i in order]
         constants = diagnosis.policy_lipschitz
         text = (
-            f"It is steepest at step {step}, where it observes {listed(seen)}: its local Lipschitz "
-            f"constant is {constants[step]:.3g} there and {constants.nanmedian():.3g} in the "
-            "median."
+            f"It is steepest at step {step}, where it observes {listed(seen, most)}: its local "
+            f"Lipschitz constant is {constants[step]:.3g} there and {constants.nanmedian():.3g} in "
+            "the median."
         )
         yield Finding("steepest", text, fault=False)
 
