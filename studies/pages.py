@@ -114,7 +114,11 @@ def pages() -> dict[str, Page]:
         "results/paper.md": _paper_page(runs),
         **{f"results/{name}.md": _field_page(name, records(name)) for name in FIELD_PAGES},
         "results/one_setting.md": _field_page("one_setting", one_setting()),
-        "results/other_methods.md": _other_methods_page(),
+        "results/other_methods.md": _comparison_page(
+            other_methods(),
+            "![Return against Sm of Grad-CAPS, ASAP, SR2L and LCP](other_methods.svg)",
+            "sm_asap",
+        ),
         "results/new_tasks.md": _new_tasks_page(),
         "results/batch_mean.md": Page({"results": paper_table(averaged).markdown()}),
         "results/reacher_3000.md": Page({"results": paper_table(short).markdown()}),
@@ -221,11 +225,11 @@ def _paper_page(runs: pd.DataFrame) -> Page:
     return Page({"results": "\n\n".join(texts)}, groups, draw)
 
 
-def _other_methods_page() -> Page:
-    groups = group_records(other_methods())
-    picture = "![Return against Sm of Grad-CAPS, ASAP, SR2L and LCP](other_methods.svg)"
+def _comparison_page(found: pd.DataFrame, picture: str, measure: str) -> Page:
+    """A picture, and a table with every measure next to the baseline."""
+    groups = group_records(found)
     table = comparison_table(TEST, groups).markdown()
-    draw = partial(draw_plane, groups, TEST, measure="sm_asap", description=description(groups))
+    draw = partial(draw_plane, groups, TEST, measure=measure, description=description(groups))
     return Page({"results": f"{picture}\n\n{table}"}, groups, draw)
 
 
