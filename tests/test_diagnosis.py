@@ -398,6 +398,15 @@ class TestMeasured:
         assert "observation[0]: 100%" in page([found]) and "Inputs that the action" in page([found])
         assert "Inputs that the action" not in page([replace(found, held=torch.empty(0))])
 
+    def test_actions_and_inputs_may_have_names(self):
+        """Which the findings use; as many as there are."""
+        named = {"action_names": ["push"], "observation_names": ["place", "wall"]}
+        found = diagnose(linear(3.0), GymWrapper(Walk()), episodes=1, **named)
+        assert found.action_name(0) == "push" and "place: 100%" in page([found])
+        for argument in named:
+            with pytest.raises(UserError, match=f"{argument} must have a name for each of the .*3"):
+                diagnose(linear(3.0), GymWrapper(Walk()), episodes=1, **{argument: ["a", "b", "c"]})
+
     def test_images_are_not_held_one_pixel_at_a_time(self, monkeypatch):
         """It would take an evaluation of every pixel."""
         monkeypatch.setattr("torchrl_l2c2.experiment.analysis.diagnosis.measured.MOST_INPUTS", 1)
@@ -747,7 +756,7 @@ class TestRecording:
             ({"bounds": (0.0, float("inf"))}, "bounds must be two finite numbers"),
             ({"bounds": (-0.5, 0.5)}, r"lies beyond the bounds -0.5 and 0.5, as 1: give bounds in"),
             ({"rate": 0.0}, "rate must be a number of steps per second above 0"),
-            ({"action_names": ["a", "b"]}, "1 actions need as many action_names, got 2"),
+            ({"action_names": ["a", "b"]}, "a name for each of the 1 actions, got 2 names"),
         ],
     )
     def test_wrong_settings_are_refused(self, settings, message):

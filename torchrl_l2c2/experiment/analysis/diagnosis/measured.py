@@ -184,6 +184,8 @@ def diagnose(
     value: Value | None = None,
     noise_scale: float = 0.01,
     seed: int = 0,
+    action_names: Sequence[str] = (),
+    observation_names: Sequence[str] = (),
 ) -> Diagnosis:
     """Plays test episodes with any TorchRL actor, and measures how and why it shakes.
 
@@ -206,6 +208,10 @@ def diagnose(
         noise_scale (float): standard deviation of the noise on observations, greater than 0.
             Default 0.01.
         seed (int): random seed of neighbors, noise and samples. Default 0.
+        action_names (sequence of str): name of each action, for the findings. Default:
+            ``action[0]`` and so on.
+        observation_names (sequence of str): name of each coordinate of the observation. Default:
+            ``observation[0]`` and so on.
 
     Returns:
         Diagnosis: The input of :func:`~.words.findings` and :func:`~.page.write_page`.
@@ -213,7 +219,8 @@ def diagnose(
     Raises:
         TypeError: the environment is not an environment of TorchRL.
         ValueError: the environment is a batch of several, the policy reads more than one of its
-            observations, or an episode is shorter than four steps.
+            observations, an episode is shorter than four steps, or there are more or fewer names
+            than actions or coordinates.
         FloatingPointError: an observation, an action or a reward is not finite.
 
     Examples:
@@ -239,6 +246,9 @@ def diagnose(
         check_finite(episode, 0, test=True, observation=key, action=env.action_key)
     first = played[0]
     actions = _flat(first[env.action_key])
+    coordinates = _flat(first[key]).shape[1]
+    check_names("action_names", action_names, actions.shape[1], "actions")
+    check_names("observation_names", observation_names, coordinates, "coordinates")
     low, high, bounded = bounds_of(env.action_spec, actions)
     generator = torch.Generator().manual_seed(seed)
 
@@ -250,7 +260,7 @@ def diagnose(
     states, successors = first[key], first["next", key]
     width = (high - low).clamp_min(torch.finfo(low.dtype).eps)
     held = UNKNOWN
-    if _flat(states).shape[1] <= MOST_INPUTS:
+    if coordinates <= MOST_INPUTS:
         held = change_with_held_input(lambda seen: act(seen) / width, states, successors).flatten()
     sensitivity = noise_sensitivity(act, states, noise_scale, generator=generator).item()
     change = actions.diff(dim=0).square().sum(-1).mean().item()
@@ -261,6 +271,7 @@ def diagnose(
         low=low,
         high=high,
         bounded=bounded,
+        action_names=tuple(action_names),
         observations=_flat(states),
         **steepness,
         neighborhood=near,
@@ -272,8 +283,16 @@ def diagnose(
         noise_share=4 * sensitivity / change if change else 0.0,
         spread=_spread(policy, states, key, env, low, high, seed),
         rate=control_rate(env) if isinstance(untransformed(env), GymWrapper) else None,
-        entries=[f"{key}[{i}]" for i in range(_flat(states).shape[1])],
+        entries=list(observation_names) or [f"{key}[{i}]" for i in range(coordinates)],
     )
+
+
+def check_names(argument: str, names: Sequence[str], count: int, of: str) -> None:
+    """Checks that there are no names, or as many as there are actions or coordinates."""
+    if names and len(names) != count:
+        raise UserError(
+            f"{argument} must have a name for each of the {count} {of}, got {len(names)} names."
+        )
 
 
 def _observed(policy: TensorDictModule, env: EnvBase) -> NestedKey:

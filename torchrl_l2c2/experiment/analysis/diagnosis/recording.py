@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torchrl.data import Bounded, TensorSpec, Unbounded
 
-from torchrl_l2c2.experiment.analysis.diagnosis.measured import Diagnosis, bounds_of
+from torchrl_l2c2.experiment.analysis.diagnosis.measured import Diagnosis, bounds_of, check_names
 from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.run.evaluation import measure
 from torchrl_l2c2.metrics import action_variation
@@ -75,11 +75,7 @@ def diagnose_actions(
             f"{name}: actions must have the shape [T, A] with at least {LEAST_STEPS} steps and one "
             f"action, got {list(actions.shape)}."
         )
-    if action_names and len(action_names) != actions.shape[1]:
-        raise UserError(
-            f"{name}: {actions.shape[1]} actions need as many action_names, got "
-            f"{len(action_names)}."
-        )
+    check_names("action_names", action_names, actions.shape[1], "actions")
     spec = _spec(actions.shape[1], bounds)
     if rate is not None and not 0.0 < rate < math.inf:
         raise UserError(f"rate must be a number of steps per second above 0, got {rate}.")
@@ -219,7 +215,7 @@ def _read(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
             separator = max(",;\t", key=first.count)
             (header,) = csv.reader([first], delimiter=separator)
             names = [cell.strip().lstrip("# ") for cell in header]
-            _check_names(names, path)
+            _check_columns(names, path)
             rest = csv.reader(file, delimiter=separator)
             lines = [(rest.line_num + 1, cells) for cells in rest if cells]
         except (csv.Error, UnicodeDecodeError) as error:
@@ -233,7 +229,7 @@ def _read(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     return names, lines
 
 
-def _check_names(names: list[str], path: Path) -> None:
+def _check_columns(names: list[str], path: Path) -> None:
     if not any(names) or all(_number(name) is not None for name in names):
         raise UserError(
             f"{path}, line 1: expected the names of the columns, got {names[:4]}. For example, "
