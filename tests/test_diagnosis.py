@@ -398,6 +398,21 @@ class TestMeasured:
         assert "observation[0]: 100%" in page([found]) and "Inputs that the action" in page([found])
         assert "Inputs that the action" not in page([replace(found, held=torch.empty(0))])
 
+    def test_changes_of_several_actions_are_relative_to_their_ranges(self):
+        """An action with a hundredth of the range changes by a hundredth, which is as much."""
+
+        class Stroll(Walk):
+            action_space = gymnasium.spaces.Box(*np.float32([[-4, -0.04], [4, 0.04]]))
+
+            def _seen(self):
+                return np.array([0.1 * self.steps, -0.1 * self.steps], np.float32)
+
+        both = TensorDictModule(
+            lambda seen: seen * torch.tensor([1.0, 0.01]), ["observation"], ["action"]
+        )
+        found = diagnose(both, GymWrapper(Stroll()), episodes=1)
+        assert found.held.tolist() == pytest.approx([0.5**0.5] * 2, rel=1e-4)
+
     def test_actions_and_inputs_may_have_names(self):
         """Which the findings use; as many as there are."""
         named = {"action_names": ["push"], "observation_names": ["place", "wall"]}
