@@ -32,6 +32,8 @@ MEMORY_SETTINGS = (
     "threads"
 )
 
+MANY_JOBS = 50  # whose check takes seconds
+
 
 def is_multirun(argument: str) -> bool:
     """Checks for Hydra's option ``--multirun``, which may be abbreviated."""
@@ -109,6 +111,8 @@ class CheckSweep(Callback):
             jobs = list_jobs_to_check(overrides, config.hydra.sweeper.params or {})
         except HydraException:  # A glob: only Hydra knows its values.
             return
+        if len(jobs) > MANY_JOBS:
+            print(f"checking the settings of {len(jobs)} jobs", flush=True)
         wrong = [message for job in jobs if (message := _check_job(overrides, job))]
         for message in dict.fromkeys(wrong):
             print(f"error: {message}", file=sys.stderr)
