@@ -86,6 +86,7 @@ def made_up(actions=0.5 * SINE, **known):
             "noise_scale": 0.01,
             "noise_action": 0.01,
             "noise_share": 0.1,
+            "noise_inputs": torch.tensor([0.5, 0.5]),
             "spread": 0.1,
             "entries": ("speed", "angle"),
             **known,
@@ -298,6 +299,18 @@ class TestWords:
         assert kind in kinds(made_up(fast, **known(threshold)))
         assert kind not in kinds(made_up(fast, **known(0.99 * threshold)))
 
+    def test_the_input_with_most_of_the_effect_of_noise_is_named(self):
+        """If it has the threshold's share; a policy has no other input than its only one."""
+        fast = 0.5 * torch.sin(2 * torch.pi * STEPS / 10).unsqueeze(-1)
+        known = {"noise_share": 0.6}
+        most = torch.tensor([0.4, 0.6])
+        text = said(made_up(fast, noise_inputs=most, **known), "noise").text
+        assert text.endswith("change from step to step. Noise on angle has 60% of the effect.")
+        third = torch.full((3,), 1 / 3)
+        for unknown in (third, torch.ones(1), torch.empty(0), torch.full((2,), torch.nan)):
+            text = said(made_up(fast, noise_inputs=unknown, **known), "noise").text
+            assert text.endswith("of the squared change from step to step.")
+
     def test_the_input_that_an_action_follows_is_named(self):
         """If it moves much, from the threshold on."""
         fast = 0.5 * torch.sin(2 * torch.pi * STEPS / 10).unsqueeze(-1)
@@ -412,6 +425,17 @@ class TestMeasured:
         )
         found = diagnose(both, GymWrapper(Stroll()), episodes=1)
         assert found.held.tolist() == pytest.approx([0.5**0.5] * 2, rel=1e-4)
+
+    def test_noise_passes_through_the_inputs_by_their_squared_slopes(self):
+        """Of 2 and 1: four fifths and one fifth."""
+        both = TensorDictModule(
+            lambda seen: seen @ torch.tensor([[2.0], [1.0]]), ["observation"], ["action"]
+        )
+        walk = Walk()
+        walk.length = 2000
+        found = diagnose(both, GymWrapper(walk), episodes=1, max_steps=2000)
+        assert found.noise_inputs.tolist() == pytest.approx([0.8, 0.2], abs=0.02)
+        assert "Inputs that pass on noise" in page([found])
 
     def test_actions_and_inputs_may_have_names(self):
         """Which the findings use; as many as there are."""

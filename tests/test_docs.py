@@ -150,7 +150,7 @@ def test_the_pages_have_the_thresholds_of_diagnose() -> None:
         "moves like noise": [threshold("ROUGH"), threshold("SMOOTH")],
         "bang-bang": [threshold("BANG_BANG"), threshold("EITHER_BOUND")],
         "pinned": [threshold("BANG_BANG")],
-        "sensitive to noise": [threshold("NOISY")],
+        "sensitive to noise": [threshold("NOISY"), threshold("MOSTLY")],
         "steep spots": [threshold("STEEP")],
         "follows one input": [threshold("FOLLOWS")],
         "wide samples": [threshold("WIDE")],

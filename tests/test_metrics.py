@@ -278,6 +278,25 @@ def test_noise_sensitivity_of_a_linear_policy():
     assert found.item() == pytest.approx(0.5 * 0.04 * weight.square().sum().item(), rel=0.03)
 
 
+def test_every_coordinate_may_have_noise_of_its_own():
+    """Half of (3 * .1)^2 + (1 * .2)^2; the scale of one size is that of each coordinate."""
+    observations, weight = torch.zeros(50_000, 2), torch.tensor([[3.0], [1.0]])
+    generator = torch.Generator().manual_seed(0)
+
+    def found(scale):
+        return noise_sensitivity(lambda s: s @ weight, observations, scale, generator=generator)
+
+    assert found(torch.tensor([0.1, 0.2])).item() == pytest.approx(0.5 * (0.09 + 0.04), rel=0.02)
+    assert found(torch.zeros(2)) == 0.0
+    for scale, told in (
+        (torch.ones(3), r"each coordinate of observations \(50000, 2\), got the shape \(3,\)"),
+        (torch.tensor([0.1, -0.1]), "finite and at least 0, got"),
+        (torch.tensor([0.1, torch.nan]), "finite and at least 0, got"),
+    ):
+        with pytest.raises(ValueError, match=told):
+            found(scale)
+
+
 def test_noise_sensitivity_refuses_what_is_no_action():
     """A TorchRL actor returns more than its action."""
     with pytest.raises(TypeError, match="only the mean actions, got a tuple"):

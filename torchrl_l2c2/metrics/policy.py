@@ -77,7 +77,7 @@ def local_lipschitz(
 def noise_sensitivity(
     policy: Callable[[Tensor], Tensor],
     observations: Tensor,
-    scale: float,
+    scale: float | Tensor,
     *,
     generator: torch.Generator | None = None,
 ) -> Tensor:
@@ -93,7 +93,8 @@ def noise_sensitivity(
     Args:
         policy (callable): observations ``[*B, *F]`` to mean actions ``[*B, A]``.
         observations (Tensor): observations to measure at, shape ``[*B, *F]``.
-        scale (float): standard deviation of the noise, in the observation's unit, greater than 0.
+        scale (float or Tensor): standard deviation of the noise, in the observation's unit, greater
+            than 0; or of each coordinate, at least 0, shape ``[*F]``.
 
     Keyword Args:
         generator (torch.Generator, optional): source of the noise. Default: PyTorch's global
@@ -105,8 +106,8 @@ def noise_sensitivity(
     Raises:
         TypeError: the observations are not floating point, the policy returns no tensor, or the
             scale is no number.
-        ValueError: the scale is not a finite number greater than 0, or actions lack their
-            dimension.
+        ValueError: the scale is not a finite number greater than 0, it has no value for each
+            coordinate, or actions lack their dimension.
 
     Examples:
         >>> import torch
@@ -117,7 +118,17 @@ def noise_sensitivity(
         >>> noise_sensitivity(twice, observations, 0.1, generator=generator).round(decimals=3)
         tensor(0.0600)
     """
-    check_real("noise_sensitivity: scale", scale, above=0)
+    if not isinstance(scale, Tensor):
+        check_real("noise_sensitivity: scale", scale, above=0)
+    elif not (scale.isfinite() & (scale >= 0.0)).all():
+        raise ValueError(
+            f"noise_sensitivity: scale must be finite and at least 0, got {scale.tolist()}."
+        )
+    elif scale.shape != observations.shape[observations.ndim - scale.ndim :]:
+        raise ValueError(
+            "noise_sensitivity: scale must have a value for each coordinate of observations "
+            f"{tuple(observations.shape)}, got the shape {tuple(scale.shape)}."
+        )
     if not isinstance(observations, Tensor) or not observations.is_floating_point():
         given = getattr(observations, "dtype", type(observations).__name__)
         raise TypeError(

@@ -88,6 +88,8 @@ class Diagnosis:
         noise_action: root mean square change of the action by this noise.
         noise_share: mean squared change of the action per step that this noise causes, divided by
             the whole mean squared change.
+        noise_inputs: share of each coordinate in this squared change, if only it has noise,
+            ``[F]``; the shares have the sum 1; empty for more than 512 coordinates.
         spread: standard deviation of the policy's samples, clipped into their bounds, relative to
             half the actions' range; 0 for a deterministic policy, NaN for discrete actions.
         shares: shares of the loss's terms.
@@ -115,6 +117,7 @@ class Diagnosis:
     noise_scale: float = math.nan
     noise_action: float = math.nan
     noise_share: float = math.nan
+    noise_inputs: Tensor = UNKNOWN
     spread: float = math.nan
     shares: Mapping[str, TermShare] = field(default_factory=dict)
     entries: Sequence[str] = ()
@@ -258,12 +261,13 @@ def diagnose(
     near = Neighborhood() if neighborhood is None else neighborhood
     steepness = _steepness(first, key, env.action_key, act, value, near, num_neighbors, generator)
     states, successors = first[key], first["next", key]
-    width = (high - low).clamp_min(torch.finfo(low.dtype).eps)
-    held = UNKNOWN
-    if coordinates <= MOST_INPUTS:
-        held = change_with_held_input(lambda seen: act(seen) / width, states, successors).flatten()
     sensitivity = noise_sensitivity(act, states, noise_scale, generator=generator).item()
     change = actions.diff(dim=0).square().sum(-1).mean().item()
+    held, noise_inputs = UNKNOWN, UNKNOWN
+    if coordinates <= MOST_INPUTS:
+        width = (high - low).clamp_min(torch.finfo(low.dtype).eps)
+        held = change_with_held_input(lambda seen: act(seen) / width, states, successors).flatten()
+        noise_inputs = _noise_by_input(act, states, noise_scale, generator)
     return Diagnosis(
         name=name,
         measures=_means(played, env),
@@ -281,10 +285,21 @@ def diagnose(
         noise_action=math.sqrt(2 * sensitivity),
         # Two independent draws differ by twice the variance of one.
         noise_share=4 * sensitivity / change if change else 0.0,
+        noise_inputs=noise_inputs,
         spread=_spread(policy, states, key, env, low, high, seed),
         rate=control_rate(env) if isinstance(untransformed(env), GymWrapper) else None,
         entries=list(observation_names) or [f"{key}[{i}]" for i in range(coordinates)],
     )
+
+
+def _noise_by_input(
+    act: Callable[[Tensor], Tensor], states: Tensor, scale: float, generator: torch.Generator
+) -> Tensor:
+    """Shares of the coordinates ``[F]`` in the sensitivity to noise."""
+    alone = scale * torch.eye(states[0].numel()).view(-1, *states.shape[1:])
+    each = [noise_sensitivity(act, states, one, generator=generator) for one in alone]
+    found = torch.stack(each)
+    return found / found.sum()
 
 
 def check_names(argument: str, names: Sequence[str], count: int, of: str) -> None:

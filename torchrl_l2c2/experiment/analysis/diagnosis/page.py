@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
+
+from torch import Tensor
 
 from torchrl_l2c2.experiment.analysis.diagnosis.film import film
 from torchrl_l2c2.experiment.analysis.diagnosis.measured import Diagnosis
@@ -166,21 +168,42 @@ def _steepest(one: Diagnosis) -> Table:
     return Table(f"The steepest states: {one.name}", columns, rows)
 
 
-def _inputs(diagnoses: Sequence[Diagnosis]) -> Table:
+def _inputs(diagnoses: Sequence[Diagnosis]) -> list[Table]:
+    follows = _ranked(
+        "Inputs that the action follows",
+        "How much less the action would change from step to step (root mean square) if one input "
+        "kept its value of the step before; the inputs with the largest effect. If the action "
+        "shakes, look here for a sensor with noise, and for the previous action.",
+        diagnoses,
+        lambda one: 1.0 - one.held,
+    )
+    noise = _ranked(
+        "Inputs that pass on noise",
+        "Shares of the inputs in the squared change of the action by noise, if each input has "
+        "noise of the same standard deviation.",
+        diagnoses,
+        lambda one: one.noise_inputs,
+    )
+    return [table for table in (follows, noise) if table.rows]
+
+
+def _ranked(
+    title: str,
+    note: str,
+    diagnoses: Sequence[Diagnosis],
+    measure: Callable[[Diagnosis], Tensor],
+) -> Table:
+    """The inputs with the largest values of each policy."""
     columns = []
     for one in diagnoses:
-        order = one.held.argsort().tolist() if one.held.isfinite().all() else []
-        cells = [f"{one.entries[i]}: {1 - one.held[i].item():.0%}" for i in order[:SHOWN_INPUTS]]
+        values = measure(one)
+        known = values.isfinite().all()
+        order = values.argsort(descending=True).tolist()[:SHOWN_INPUTS] if known else []
+        cells = [f"{one.entries[i]}: {values[i].item():.0%}" for i in order]
         columns.append([*cells, *["-"] * (SHOWN_INPUTS - len(cells))])
     rows = [[str(place), *cells] for place, cells in enumerate(zip(*columns, strict=True), 1)]
     rows = [row for row in rows if set(row[1:]) != {"-"}]
-    note = (
-        "How much less the action would change from step to step (root mean square) if one input "
-        "kept its value of the step before; the inputs with the largest effect. If the action "
-        "shakes, look here for a sensor with noise, and for the previous action."
-    )
-    names = ["", *(one.name for one in diagnoses)]
-    return Table("Inputs that the action follows", names, rows, [note])
+    return Table(title, ["", *(one.name for one in diagnoses)], rows, [note])
 
 
 def _unmoved(diagnoses: Sequence[Diagnosis]) -> Table:

@@ -27,6 +27,7 @@ THRESHOLDS = {
         0.5,
         "smallest squared change by noise on observations, as a share of the whole squared change",
     ),
+    "MOSTLY": (0.5, "smallest share of one input in the effect of noise, to be named"),
     "WIDE": (0.4, "smallest standard deviation of wide samples, of half the range; uniform: 0.58"),
     "FOLLOWS": (
         0.5,
@@ -322,6 +323,9 @@ def _reasons(diagnosis: Diagnosis) -> Iterator[Finding]:
             f"moves the action by {diagnosis.noise_action:.2g}; squared, this is "
             f"{min(1.0, diagnosis.noise_share):.0%} of the squared change from step to step."
         )
+        if len(shares := diagnosis.noise_inputs) > 1 and shares.max() >= threshold("MOSTLY"):
+            most = int(shares.argmax())
+            text += f" Noise on {diagnosis.entries[most]} has {shares[most]:.0%} of the effect."
         yield Finding("noise", text)
     constants = diagnosis.policy_lipschitz
     median = constants.nanmedian().item()
