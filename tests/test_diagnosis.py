@@ -119,6 +119,30 @@ class TestWords:
         for words in ("10 Hz", "100% of the steps", "50.0% of its range", "throughout"):
             assert words in found.text
 
+    @pytest.mark.parametrize(("period", "hertz"), [(2.5, 12.0), (2.8, 10.7)])
+    def test_what_turns_back_nearly_every_step_has_its_own_frequency(self, period, hertz):
+        """A gain of -0.5 or less may be an oscillation of three steps, and no flip."""
+        action = 0.5 * torch.sin(2 * torch.pi * STEPS / period + 0.1).unsqueeze(-1)
+        text = said(made_up(action, rate=30.0), "flips").text
+        found = re.search(r"turns back nearly every step, which is shaking at ([\d.]+) Hz, 0", text)
+        assert found is not None and float(found[1]) == pytest.approx(hertz, rel=0.03)
+
+    def test_a_fast_oscillation_is_no_noise(self):
+        """Of 3.3 steps, with the roughness of noise; half of white noise added to it hides it."""
+        noise = torch.randn(100, 1, generator=torch.Generator().manual_seed(0))
+        action = 0.5 * torch.sin(2 * torch.pi * STEPS / 3.3).unsqueeze(-1)
+        text = said(made_up(action, rate=33.0), "rough").text
+        assert "action[0] oscillates, which is shaking at 9.9 Hz, 0.3 of the control rate" in text
+        assert "moves like noise" in said(made_up(0.1 * action + 0.1 * noise), "rough").text
+
+    def test_what_has_no_frequency_of_its_own_flips(self):
+        """The changes of white noise have a gain of -0.5, and a beat is none either."""
+        noise = torch.randn(1001, 1, generator=torch.Generator().manual_seed(0))
+        beat = torch.sin(2 * torch.pi * torch.arange(1000.0) / 2.1).unsqueeze(-1)
+        for action in (0.1 * noise.diff(dim=0), 0.5 * beat):
+            text = said(made_up(action, rate=30.0), "flips").text
+            assert "flips from step to step, which is shaking at 15 Hz, half the control" in text
+
     def test_flipping_in_one_place_is_said_to_be_there(self):
         """A tenth of the episode; the rest is at rest."""
         actions = torch.zeros(100, 1)

@@ -51,6 +51,7 @@ def threshold(name: str) -> float:
 
 PARTS = 20  # of an episode in which an action may chatter
 PERIODS = 4  # of the slowest of the fast frequencies, at least, in an episode or a part of it
+ALTERNATES = 0.45  # lowest frequency of an action that flips at every step, of the control rate
 FULL = 2  # findings of one kind that each have a sentence
 MOST_INPUTS = 8  # whose values are listed; of more, the four that the action follows most
 MOST_NAMES = 12  # of further actions with the same finding
@@ -197,9 +198,15 @@ def _actions(diagnosis: Diagnosis) -> Iterator[tuple[str, Finding]]:
         if gain <= threshold("FLIPS"):
             yield name, _flips(name, action, gain, diagnosis.rate)
         elif rough >= threshold("ROUGH") and change > threshold("SMOOTH"):
+            if (tone := _tone(action.squeeze(1))) is not None:
+                moves = f"oscillates, which is shaking at {_speed(tone, diagnosis.rate)}"
+            else:
+                moves = (
+                    f"moves like noise: its roughness is {rough:.2f} of the control rate (white "
+                    "noise has 0.25)"
+                )
             text = (
-                f"{name} moves like noise: its roughness is {rough:.2f} of the control rate (white "
-                f"noise has 0.25); it changes by {change:.1%} of its range per step, "
+                f"{name} {moves}; it changes by {change:.1%} of its range per step, "
                 f"{_where(action.diff(dim=0).abs())}."
             )
             yield name, Finding("rough", text)
@@ -279,13 +286,37 @@ def _at_bounds(name: str, action: Tensor, share: float) -> Finding:
 def _flips(name: str, action: Tensor, gain: float, rate: float | None) -> Finding:
     change = action.diff(dim=0)
     back = (change[1:] * change[:-1] < 0).float()
-    speed = "half the control rate" if rate is None else f"{rate / 2:.3g} Hz, half the control rate"
+    speed, does = 0.5, "flips from step to step"
+    # A gain near -0.5 may also be an oscillation of three steps.
+    if (tone := _tone(action.squeeze(1))) is not None and tone < ALTERNATES:
+        speed, does = tone, "turns back nearly every step"
     text = (
-        f"{name} flips from step to step, which is shaking at {speed}: its gain on the previous "
+        f"{name} {does}, which is shaking at {_speed(speed, rate)}: its gain on the previous "
         f"action is {gain:.2f}, and it turns back in {back.mean():.0%} of the steps, by "
         f"{_change(action):.1%} of its range on average; {_where(back * change[1:].abs())}."
     )
     return Finding("flips", text)
+
+
+def _speed(share: float, rate: float | None) -> str:
+    """A frequency in cycles per step, in words.
+
+    Examples:
+        >>> _speed(0.5, 20.0), _speed(0.31, None)
+        ('10 Hz, half the control rate', '0.31 of the control rate')
+    """
+    of_rate = "half the control rate" if share == 0.5 else f"{share:.2g} of the control rate"
+    return of_rate if rate is None else f"{share * rate:.3g} Hz, {of_rate}"
+
+
+def _tone(action: Tensor) -> float | None:
+    """The frequency with most of the power, in cycles per step; ``None`` if there is none."""
+    window = torch.hann_window(len(action), dtype=action.dtype)
+    power = torch.fft.rfft((action - action.mean()) * window).abs().square()
+    peak = int(power.argmax())
+    if power[max(0, peak - 2) : peak + 3].sum() < 0.5 * power.sum():
+        return None
+    return peak / len(action)
 
 
 def _steepest(diagnosis: Diagnosis) -> Iterator[Finding]:
