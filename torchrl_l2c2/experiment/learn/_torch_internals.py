@@ -26,6 +26,7 @@ __all__ = [
     "compile_graph",
     "disable_current_modes",
     "marked_as_compiling",
+    "onednn_linear",
     "tree_flatten",  # Arguments and results are nested.
     "tree_map_only",
     "tree_unflatten",
@@ -56,3 +57,9 @@ def compile_graph(
     with tracing(TracingContext(mode)), inductor_config.patch(dict(options)):
         program: Any = compile_fx(module, inputs)
     return program
+
+
+def onednn_linear(rows: Tensor, weight: Tensor) -> Tensor:
+    """Product ``rows @ weight.T`` of float32 matrices by oneDNN; torch has no public function."""
+    product: Tensor = torch.ops.mkldnn._linear_pointwise(rows, weight, None, "none", [], "")
+    return product

@@ -34,6 +34,7 @@ from torchrl_l2c2.experiment.learn._torch_internals import (
     tree_map_only,
     tree_unflatten,
 )
+from torchrl_l2c2.experiment.learn.products import onednn_is_faster, use_onednn
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -200,6 +201,8 @@ def _compile(
         # Profiler marks of torch's optimizers cannot be compiled.
         if getattr(node.target, "namespace", None) == "profiler":
             graph.erase_node(node)
+    if onednn_is_faster():
+        use_onednn(graph)
     module.recompile()
     options = {
         "fallback_random": True,
