@@ -140,6 +140,11 @@ def pages() -> dict[str, Page]:
                 "choice": td3.first_choice_table(),
             }
         ),
+        "results/td3_mujoco.md": _comparison_page(
+            records("td3_mujoco"),
+            "![Return against action variation of TD3 on InvertedDoublePendulum](td3_mujoco.svg)",
+            "action_variation",
+        ),
         "results/field_gains.md": Page(dict(zip(("rivals", "one", "caps"), chosen, strict=True))),
         "results/targets.md": Page(dict(zip(("all", "swingup", "hopper"), targets, strict=True))),
         "studies/protocol.md": Page({"reacher": reacher_by_seed(runs)}),
