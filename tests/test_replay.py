@@ -145,6 +145,14 @@ def test_a_batch_of_one_transition_has_a_weight_and_gets_a_priority(name):
     assert (learned(experiment)["priorities"] != before).sum() == 1
 
 
+def test_the_stored_entries_are_sorted_by_name():
+    """Their order in the storage differs between processes, and the compiler's cache missed."""
+    update = trained(PAPER).learner.update
+    draw = update.draw()
+    names = list(map(str, update._names))
+    assert names == sorted(names) and len(names) == len(draw.stored) > 3
+
+
 def test_the_batch_has_the_entries_and_neighbors_that_the_buffer_gives():
     """Whatever the buffer's transform writes, at its own random numbers."""
     experiment = trained(PAPER)

@@ -173,7 +173,9 @@ class ReplayUpdate:
         source = stored_tensors(self._storage)
         if source is not None and source is not self._source:
             self._source = source
-            self._names, self._stored = zip(*self._source.items(True, True), strict=True)
+            # Their order differs between processes, and the compiler's cache is by the order.
+            items = sorted(self._source.items(True, True), key=lambda item: str(item[0]))
+            self._names, self._stored = zip(*items, strict=True)
         rows, weight = self._rows()
         rows = rows.to(self._device)
         weight = None if weight is None else weight.to(self._device)
