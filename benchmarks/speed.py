@@ -27,6 +27,7 @@ ROWS = {
     "ppo_update": "update_rows.ppo_update_rows",
     "regularizers": "regularizer_rows.regularizer_rows",
     "update_4096": "update_rows.large_update_rows",
+    "products": "update_rows.product_rows",
     "collection": "collection_rows.collection_rows",
     "run": "run_rows.run_rows",
     "start": "run_rows.start_rows",

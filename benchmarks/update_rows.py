@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
+from unittest.mock import patch
 
 import torch
 
 from benchmarks.regularizer_rows import ppo_update
 from benchmarks.setups import REGULARIZERS, Effort, matrix_products, updates
 from benchmarks.timing import Row, alternate
+from torchrl_l2c2.experiment import Experiment, ExperimentConfig, SACConfig, TaskConfig
+from torchrl_l2c2.experiment.learn import compilation
+from torchrl_l2c2.experiment.learn.products import onednn_is_faster
+from torchrl_l2c2.experiment.learn.update import ReplayUpdate
+from torchrl_l2c2.experiment.settings.regularizers import REGULARIZERS as REGULARIZER_CONFIGS
 
 
 def update_rows(effort: Effort) -> Iterable[Row]:
@@ -73,6 +80,36 @@ def large_update_rows(effort: Effort) -> Iterable[Row]:
     yield _smoothing_row("update_4096", 4096, us, 1.9)
     quarter = {**us, "l2c2": us["quarter"]}
     yield _smoothing_row("update_4096", 4096, quarter, 1.3, " with fraction .25")
+
+
+def product_rows(effort: Effort) -> Iterable[Row]:
+    """SAC's update with two layers of 256: large products by torch's own library, and by oneDNN."""
+    name = "SAC update with torch's products / with oneDNN's, layers of 256, batch 256"
+    if not onednn_is_faster():
+        yield Row("products", name, note="not measured: no processor of AMD with AVX-512")
+        return
+    actions = {}
+    for library in ("torch", "onednn"):
+        with patch.object(compilation, "onednn_is_faster", return_value=library == "onednn"):
+            actions[library] = sac_update(effort.compile)
+            actions[library]()  # Compiles it.
+    times = alternate(actions, repeats=effort.rounds, calls=20, warm_up=5)
+    us = {f"{library} us": 1e6 * seconds for library, seconds in times.items()}
+    yield Row("products", name, us["torch us"] / us["onednn us"], parts=us)
+
+
+def sac_update(compiled: bool) -> Callable[[], object]:
+    """An update of SAC without a regularizer, with its default networks, on one batch."""
+    config = ExperimentConfig(
+        TaskConfig("pendulum", "Pendulum-v1", episodes=1), SACConfig(), REGULARIZER_CONFIGS["none"]
+    )
+    experiment = Experiment(replace(config, compile=False))
+    learner = experiment.learner
+    while len(learner.replay) < learner.replay.batch_size:
+        learner.remember(experiment.player.collector.rollout())
+    update = ReplayUpdate(experiment.agent, learner.replay, compile=compiled)
+    draw = update.draw()
+    return lambda: update.update(True, *draw)
 
 
 def _smoothing_row(

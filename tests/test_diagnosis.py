@@ -840,6 +840,8 @@ class TestRecording:
         assert (found.low.tolist(), found.high.tolist()) == ([-2.0, -0.5], [2.0, 0.5])
         (finding,) = (each.text for each in findings(found) if "bang-bang" in each.text)
         assert finding.startswith("knee is bang-bang")
+        one = diagnose_actions(torch.cat((SINE, jumps), 1), bounds=[(-2, 2)])  # of both
+        assert one.low.tolist() == [-2.0, -2.0]
         with pytest.raises(UserError, match="a pair for each of the 1, got 2 pairs"):
             diagnose_actions(SINE, bounds=[(-1, 1), (-1, 1)])
 

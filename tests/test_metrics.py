@@ -288,6 +288,8 @@ def test_every_coordinate_may_have_noise_of_its_own():
 
     assert found(torch.tensor([0.1, 0.2])).item() == pytest.approx(0.5 * (0.09 + 0.04), rel=0.02)
     assert found(torch.zeros(2)) == 0.0
+    with pytest.raises(TypeError, match="observations must be a floating-point tensor, got list"):
+        noise_sensitivity(lambda s: s, [0.0, 0.0], torch.ones(2))
     for scale, told in (
         (torch.ones(3), r"each coordinate of observations \(50000, 2\), got the shape \(3,\)"),
         (torch.tensor([0.1, -0.1]), "finite and at least 0, got"),

@@ -45,6 +45,21 @@ def test_large_products_are_replaced_and_stay_equal(function, shapes):
     torch.testing.assert_close(module(*args), function(*args), rtol=1e-4, atol=1e-4)
 
 
+def test_products_of_products_are_replaced():
+    """Also behind a bias, as in two linear layers without an activation between them."""
+    torch.manual_seed(0)
+    x, weight, bias = torch.randn(LARGE, LARGE), torch.randn(LARGE, LARGE), torch.randn(LARGE)
+
+    def layers(x, weight, bias):
+        return torch.addmm(bias, torch.mm(torch.addmm(bias, x, weight), weight), weight) / LARGE
+
+    module = traced(layers, x, weight, bias)
+    assert use_onednn(module.graph) == 3
+    module.recompile()
+    expected = layers(x, weight, bias)
+    torch.testing.assert_close(module(x, weight, bias), expected, rtol=1e-4, atol=1e-3)
+
+
 @pytest.mark.parametrize(
     ("function", "args"),
     [
@@ -81,18 +96,19 @@ def test_a_compiled_function_has_them_where_they_are_faster(monkeypatch, faster)
     assert len(calls) == 2 * faster
 
 
-def test_the_choice_is_by_the_processor(monkeypatch, tmp_path):
+@pytest.mark.parametrize(
+    ("capability", "content", "expected"),
+    [
+        ("AVX512", "vendor_id : AuthenticAMD", True),
+        ("AVX2", "vendor_id : AuthenticAMD", False),
+        ("AVX512", "vendor_id : GenuineIntel", False),
+        ("AVX512", None, False),
+    ],
+)
+def test_the_choice_is_by_the_processor(monkeypatch, tmp_path, capability, content, expected):
     """AMD's with AVX-512; without Linux the maker is unknown."""
-    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX2")
-    onednn_is_faster.cache_clear()
-    assert not onednn_is_faster()
-    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX512")
-    for content, expected in (("vendor_id : AuthenticAMD", True), ("GenuineIntel", False)):
-        (tmp_path / "cpuinfo").write_text(content)
-        monkeypatch.setattr(products, "CPU", tmp_path / "cpuinfo")
-        onednn_is_faster.cache_clear()
-        assert onednn_is_faster() == expected
-    monkeypatch.setattr(products, "CPU", tmp_path / "nothing")
-    onednn_is_faster.cache_clear()
-    assert not onednn_is_faster()
-    onednn_is_faster.cache_clear()
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: capability)
+    monkeypatch.setattr(products, "CPU", tmp_path / "cpuinfo")
+    if content is not None:
+        products.CPU.write_text(content)
+    assert onednn_is_faster.__wrapped__() == expected

@@ -118,6 +118,12 @@ def noise_sensitivity(
         >>> noise_sensitivity(twice, observations, 0.1, generator=generator).round(decimals=3)
         tensor(0.0600)
     """
+    if not isinstance(observations, Tensor) or not observations.is_floating_point():
+        given = getattr(observations, "dtype", type(observations).__name__)
+        raise TypeError(
+            f"noise_sensitivity: observations must be a floating-point tensor, got {given}: noise "
+            "on integers would be rounded away. Cast them as the policy does."
+        )
     if not isinstance(scale, Tensor):
         check_real("noise_sensitivity: scale", scale, above=0)
     elif not (scale.isfinite() & (scale >= 0.0)).all():
@@ -128,12 +134,6 @@ def noise_sensitivity(
         raise ValueError(
             "noise_sensitivity: scale must have a value for each coordinate of observations "
             f"{tuple(observations.shape)}, got the shape {tuple(scale.shape)}."
-        )
-    if not isinstance(observations, Tensor) or not observations.is_floating_point():
-        given = getattr(observations, "dtype", type(observations).__name__)
-        raise TypeError(
-            f"noise_sensitivity: observations must be a floating-point tensor, got {given}: noise "
-            "on integers would be rounded away. Cast them as the policy does."
         )
     noise = torch.randn(
         observations.shape,

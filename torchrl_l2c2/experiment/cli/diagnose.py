@@ -40,11 +40,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if chosen.actions:
             check_output(chosen.actions, ".svg")
         names = chosen.names or diagnosis.run_names(folders)
-        bounds = chosen.bounds
-        if bounds is not None and len(bounds) == 1:
-            (bounds,) = bounds  # of all actions
         diagnoses = [
-            diagnosis.diagnose_recording(folder, name=name, columns=chosen.columns, bounds=bounds)
+            diagnosis.diagnose_recording(
+                folder, name=name, columns=chosen.columns, bounds=chosen.bounds
+            )
             if _is_recording(folder)
             else diagnosis.diagnose_run(
                 folder,

@@ -1,7 +1,7 @@
 """Products of large matrices by oneDNN, where torch's own use half of the processor.
 
 For float32, torch calls MKL, which uses only AVX2 on AMD's processors. With AVX-512, oneDNN is
-about twice as fast there, for all but small matrices.
+faster there for all but small matrices: ``python -m benchmarks.speed --rows products``.
 """
 
 from __future__ import annotations
@@ -17,7 +17,9 @@ from torch.fx import Graph, Node
 from torchrl_l2c2.experiment.learn._torch_internals import onednn_linear
 
 CPU = Path("/proc/cpuinfo")
-LEAST_SIDE, LEAST_PRODUCTS = 16, 2**21  # of smaller matrices MKL's products are as fast or faster
+# Of smaller matrices, MKL's products are as fast or faster.
+LEAST_SIDE = 16
+LEAST_MULTIPLICATIONS = 2**21
 
 
 @cache
@@ -46,8 +48,10 @@ def use_onednn(graph: Graph) -> int:
                 continue
             with graph.inserting_before(node):
                 found = graph.call_function(product, (left, right))
+                found.meta.update(node.meta)  # The next product may read it.
                 if target is aten.addmm.default:
                     found = graph.call_function(aten.add.Tensor, (found, node.args[0]))
+                    found.meta.update(node.meta)
             node.replace_all_uses_with(found)
             graph.erase_node(node)
             replaced += 1
@@ -59,7 +63,7 @@ def _is_large(left: Node, right: Node) -> bool:
     sides = (*a.shape[-2:], b.shape[-1])
     size = sides[0] * sides[1] * sides[2]
     on_cpu = a.device.type == "cpu" and a.dtype == torch.float32
-    return on_cpu and min(sides) >= LEAST_SIDE and size >= LEAST_PRODUCTS
+    return on_cpu and min(sides) >= LEAST_SIDE and size >= LEAST_MULTIPLICATIONS
 
 
 def _operator() -> Any:

@@ -37,7 +37,7 @@ LOCKED = 1e-3  # of the largest span: smallest span that an action's change is r
 SAMPLES = 16  # actions drawn at a state to see how far they spread
 SAMPLED_STATES = 256
 SAME_PLACE = 0.25  # of the standard deviation of every coordinate within the episode
-MOST_INPUTS = 512  # of which each is held once: more would be pixels
+MOST_INPUTS = 512  # that are held, and get noise, one at a time: more would be pixels
 STEPS_AT_ONCE = 128  # whose neighbors are in memory together: they may be images
 
 
@@ -296,7 +296,7 @@ def _noise_by_input(
     act: Callable[[Tensor], Tensor], states: Tensor, scale: float, generator: torch.Generator
 ) -> Tensor:
     """Shares of the coordinates ``[F]`` in the sensitivity to noise."""
-    alone = scale * torch.eye(states[0].numel()).view(-1, *states.shape[1:])
+    alone = scale * torch.eye(states[0].numel(), device=states.device).view(-1, *states.shape[1:])
     each = [noise_sensitivity(act, states, one, generator=generator) for one in alone]
     found = torch.stack(each)
     return found / found.sum()

@@ -180,7 +180,8 @@ def _spec(actions: int, bounds: Bounds | Sequence[Bounds] | None) -> TensorSpec:
     """The space of this many actions."""
     if bounds is None:
         return Unbounded((actions,))
-    pairs: Any = [bounds] * actions if isinstance(bounds[0], Real) else bounds
+    pairs: Any = [bounds] if isinstance(bounds[0], Real) else bounds
+    pairs = pairs * actions if len(pairs) == 1 else pairs
     if len(pairs) != actions:
         raise UserError(
             f"bounds must be one pair for all actions, or a pair for each of the {actions}, got "

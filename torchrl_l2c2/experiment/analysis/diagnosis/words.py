@@ -53,7 +53,8 @@ PARTS = 20  # of an episode in which an action may chatter
 PERIODS = 4  # of the slowest of the fast frequencies, at least, in an episode or a part of it
 ALTERNATES = 0.45  # lowest frequency of an action that flips at every step, of the control rate
 FULL = 2  # findings of one kind that each have a sentence
-MOST_INPUTS = 8  # whose values are listed; of more, the four that the action follows most
+LISTED_INPUTS = 8  # whose values are listed, in their order; of more, only some
+SELECTED_INPUTS = 4  # of more inputs: those that the action follows most
 MOST_NAMES = 12  # of further actions with the same finding
 TAIL = 1.4  # times the peak's height: a higher spectrum just below it is of a slower movement
 
@@ -323,9 +324,10 @@ def _steepest(diagnosis: Diagnosis) -> Iterator[Finding]:
     """The observation at which the policy is steepest."""
     for step in diagnosis.worst(1):
         values = diagnosis.observations[step].tolist()
-        order, most = list(range(len(values))), MOST_INPUTS
+        order, most = list(range(len(values))), LISTED_INPUTS
         if len(order) > most and len(diagnosis.held):
-            order, most = diagnosis.held.nan_to_num(1.0).argsort(stable=True).tolist(), most // 2
+            order = diagnosis.held.nan_to_num(1.0).argsort(stable=True).tolist()
+            most = SELECTED_INPUTS
         seen = [f"{diagnosis.entries[i]} = {values[i]:.2g}" for i in order]
         constants = diagnosis.policy_lipschitz
         text = (
