@@ -567,7 +567,7 @@ class TestProse:
         rough = [
             side.scores("last_mean", "action_variation").mean() for _, side in benchmarks().values()
         ]
-        assert rough == sorted(rough, reverse=True) and len(rough) == 17
+        assert rough == sorted(rough, reverse=True) and len(rough) == 18
 
     def test_the_readmes_sentences(self):
         """The changes of rough and of smooth baselines, the losses of return, and untuned tasks."""
@@ -585,14 +585,17 @@ class TestProse:
                 group.scores("last_mean", "return").mean() for group in (ours, baseline)
             )
             higher.append(total > other)
-        assert len(rough) == 12 and len(smooth) == 5 and sum(higher) == 6 and len(higher) == 17
-        assert f"fell by {-max(rough)} to {-min(rough)}%, in ten of them beyond" in readme
+        *fell, rose = sorted(rough)
+        assert len(fell) == 12 and len(smooth) == 5 and sum(higher) == 6 and len(higher) == 18
+        assert f"In {len(fell)} of the {len(rough)} roughest of" in readme
+        assert f"fell by {-max(fell)} to {-min(fell)}%, in ten of them beyond" in readme
+        assert f"TD3 on InvertedDoublePendulum it rose by {rose}%, within" in readme
         assert f"the other five it changed by {min(smooth)} to {max(smooth):+}%" in readme
         # Eleven with LunarLander, which is among the other five.
         assert beyond["action_variation", True, False] == 11
         assert beyond["action_variation", False, True] == 0
         assert (
-            "was higher in six and lower in eleven. Beyond seed noise, runs return more" in readme
+            "was higher in six and lower in twelve. Beyond seed noise, runs return more" in readme
         )
         assert "more in four benchmarks and less in one" in readme
         assert beyond["return", True, False] == 4 and beyond["return", False, True] == 1
@@ -608,10 +611,10 @@ class TestProse:
         means = [[g.scores("last_mean", "action_variation").mean() for g in pair] for pair in pairs]
         smoother = sum(cats < ours for cats, ours in means)
         table = (ROOT / "docs" / "results.md").read_text().split("### CATS against L2C2")[1]
-        assert (smoother, len(pairs)) == (7, 11)
-        assert "7 of 11 |\n" in table
+        assert (smoother, len(pairs)) == (8, 12)
+        assert "8 of 12 |\n" in table
         for path in ("README.md", "docs/methods.md", "docs/limitations.md"):
-            assert "7 of 11 benchmarks" in " ".join((ROOT / path).read_text().split())
+            assert "8 of 12 benchmarks" in " ".join((ROOT / path).read_text().split())
         sides = [list(side) for side in zip(*pairs, strict=True)]
         for quantity in ("action_variation", "return", "sm_asap"):
             assert improvement(*sides, "last_mean", quantity).text() in table
@@ -801,6 +804,30 @@ class TestProse:
             kept, before = (shown[method, s].scores("last_mean", "return") for s in (0.1, 1.0))
             assert f"({kept.mean():.1f} and {before.mean():.1f})" in page
             assert kept.mean() < before.mean()
+
+    def test_td3_on_a_mujoco_task(self):
+        """How many runs shake with each method, and what this costs."""
+        page = (ROOT / "results" / "td3_mujoco.md").read_text()
+        start = " ".join(page.partition("<!-- results: start -->")[0].split())
+        runs = records("td3_mujoco").query("seed < 10")
+        shakes = runs["last_mean_action_variation"] > 0.2
+        found = runs.groupby("method")["last_mean_action_variation"]
+        assert shakes.groupby(runs["method"]).agg(["sum", "count"]).to_dict("index") == {
+            "none": {"sum": 3, "count": 5},
+            "l2c2": {"sum": 4, "count": 5},
+            "cats": {"sum": 0, "count": 5},
+        }
+        assert f"change their action by {found.mean()['l2c2']:.2f} per step" in start
+        assert f"the baseline's by {found.mean()['none']:.2f}." in start
+        assert (
+            f"With CATS it changes by at most {math.ceil(100 * found.max()['cats']) / 100}."
+            in start
+        )
+        returned = runs["last_mean_return"]
+        assert (
+            f"costs at most {1 - returned[shakes].min() / returned.max():.1%} of the return"
+            in start
+        )
 
     def test_td3s_strengths_are_relative_to_fixed_gains(self):
         """A run with the present preset has the strength of the same run before it changed."""
