@@ -831,6 +831,12 @@ class TestRecording:
         with pytest.raises(UserError, match=r"must be finite, got \[nan\] in row 7"):
             diagnose_actions(broken)
 
+    def test_a_slow_action_does_not_change_by_nothing(self):
+        """A ramp over a fiftieth of the range."""
+        ramp = torch.linspace(0.0, 0.04, len(SINE)).unsqueeze(-1)
+        (only,) = findings(diagnose_actions(ramp, bounds=(-1.0, 1.0)))
+        assert "changes by less than 0.1% of its range per step" in only.text
+
     def test_every_action_may_have_its_own_bounds(self):
         """A knee that is at its narrow bounds, and a hip that uses half of its wide ones."""
         jumps = 0.5 * SINE.sign()

@@ -411,8 +411,9 @@ def _movement(diagnosis: Diagnosis) -> Finding:
     place = "" if diagnosis.is_recording else "in the first episode "
     several = changes.shape[1] > 1
     moves = f"{diagnosis.action_name(most)} changes most," if several else "the action changes"
+    size = f"{change:.1%}" if change >= 0.0005 else "less than 0.1%"
     numbers = (
-        f"{place}{moves} by {change:.1%} of its range per step, and its gain on the previous "
+        f"{place}{moves} by {size} of its range per step, and its gain on the previous "
         f"action is {diagnosis.measures['previous_action_gain']:.2f}"
     )
     if change <= threshold("SMOOTH"):
