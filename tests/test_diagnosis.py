@@ -461,6 +461,25 @@ class TestMeasured:
         assert found.noise_inputs.tolist() == pytest.approx([0.8, 0.2], abs=0.02)
         assert "Inputs that pass on noise" in page([found])
 
+    def test_each_input_may_have_noise_of_its_own(self):
+        """Slopes of 2 and 1 with deviations of 0.1 and 0.4: one fifth and four fifths."""
+        both = TensorDictModule(
+            lambda seen: seen @ torch.tensor([[2.0], [1.0]]), ["observation"], ["action"]
+        )
+        walk = Walk()
+        walk.length = 2000
+        env, played = GymWrapper(walk), {"episodes": 1, "max_steps": 2000}
+        scale = torch.tensor([0.1, 0.4])
+        found = diagnose(both, env, noise_scale=scale, **played)
+        assert found.noise_inputs.tolist() == pytest.approx([0.2, 0.8], abs=0.02)
+        assert found.noise_action == pytest.approx((0.2**2 + 0.4**2) ** 0.5, rel=0.05)
+        shaking = replace(found, actions=0.5 * FLIPPING, noise_share=0.9)
+        assert "the given noise moves the action by 0.4" in said(shaking, "noise").text
+        assert "(of each input)" in page([found])
+        for wrong in (torch.ones(3), torch.zeros(2), torch.tensor([0.1, -0.1])):
+            with pytest.raises(UserError, match=r"noise_scale must have .* each coordinate, \[2\]"):
+                diagnose(both, env, noise_scale=wrong, **played)
+
     def test_actions_and_inputs_may_have_names(self):
         """Which the findings use; as many as there are."""
         named = {"action_names": ["push"], "observation_names": ["place", "wall"]}

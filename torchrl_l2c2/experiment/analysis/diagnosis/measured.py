@@ -84,7 +84,8 @@ class Diagnosis:
         held: root mean square change of the actions' relative positions per step if one coordinate
             keeps its value of the step before, relative to the change as it is, ``[F]``; empty for
             more than 512 coordinates.
-        noise_scale: standard deviation of the noise on observations.
+        noise_scale: standard deviation of the noise on observations, of all coordinates or of each,
+            ``[*F]``.
         noise_action: root mean square change of the action by this noise.
         noise_share: mean squared change of the action per step that this noise causes, divided by
             the whole mean squared change.
@@ -114,7 +115,7 @@ class Diagnosis:
     neighborhood: Neighborhood = field(default_factory=Neighborhood)
     unmoved: Tensor = UNKNOWN
     held: Tensor = UNKNOWN
-    noise_scale: float = math.nan
+    noise_scale: float | Tensor = math.nan
     noise_action: float = math.nan
     noise_share: float = math.nan
     noise_inputs: Tensor = UNKNOWN
@@ -185,7 +186,7 @@ def diagnose(
     neighborhood: Neighborhood | None = None,
     num_neighbors: int = 16,
     value: Value | None = None,
-    noise_scale: float = 0.01,
+    noise_scale: float | Tensor = 0.01,
     seed: int = 0,
     action_names: Sequence[str] = (),
     observation_names: Sequence[str] = (),
@@ -208,8 +209,9 @@ def diagnose(
         num_neighbors (int): neighbors per state, at least 1; more find steeper places. Default 16.
         value (callable, optional): observations ``[N, *F]`` and actions ``[N, *A]`` to values, to
             measure the value function, too. Default: none.
-        noise_scale (float): standard deviation of the noise on observations, greater than 0.
-            Default 0.01.
+        noise_scale (float or Tensor): standard deviation of the noise on observations, greater
+            than 0. A tensor ``[*F]`` has one for each coordinate, as sensors differ; some of them
+            may be 0. Default 0.01.
         seed (int): random seed of neighbors, noise and samples. Default 0.
         action_names (sequence of str): name of each action, for the findings. Default:
             ``action[0]`` and so on.
@@ -222,8 +224,8 @@ def diagnose(
     Raises:
         TypeError: the environment is not an environment of TorchRL.
         ValueError: the environment is a batch of several, the policy reads more than one of its
-            observations, an episode is shorter than four steps, or there are more or fewer names
-            than actions or coordinates.
+            observations, an episode is shorter than four steps, there are more or fewer names
+            than actions or coordinates, or ``noise_scale`` is out of its range.
         FloatingPointError: an observation, an action or a reward is not finite.
 
     Examples:
@@ -235,7 +237,8 @@ def diagnose(
         (torch.Size([20, 1]), torch.Size([20]), 20.0)
     """
     check_positive_int("episodes", episodes)
-    check_real("noise_scale", noise_scale, above=0)
+    if not isinstance(noise_scale, Tensor):
+        check_real("noise_scale", noise_scale, above=0)
     key = _observed(policy, env)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         played = [env.rollout(max_steps, policy).detach() for _ in range(episodes)]
@@ -250,6 +253,7 @@ def diagnose(
     first = played[0]
     actions = _flat(first[env.action_key])
     coordinates = _flat(first[key]).shape[1]
+    _check_noise(noise_scale, first[key])
     check_names("action_names", action_names, actions.shape[1], "actions")
     check_names("observation_names", observation_names, coordinates, "coordinates")
     low, high, bounded = bounds_of(env.action_spec, actions)
@@ -293,13 +297,34 @@ def diagnose(
 
 
 def _noise_by_input(
-    act: Callable[[Tensor], Tensor], states: Tensor, scale: float, generator: torch.Generator
+    act: Callable[[Tensor], Tensor],
+    states: Tensor,
+    scale: float | Tensor,
+    generator: torch.Generator,
 ) -> Tensor:
     """Shares of the coordinates ``[F]`` in the sensitivity to noise."""
-    alone = scale * torch.eye(states[0].numel(), device=states.device).view(-1, *states.shape[1:])
+    one_each = torch.eye(states[0].numel(), device=states.device)
+    alone = scale * one_each.view(-1, *states.shape[1:])
     each = [noise_sensitivity(act, states, one, generator=generator) for one in alone]
     found = torch.stack(each)
     return found / found.sum()
+
+
+def _check_noise(scale: float | Tensor, states: Tensor) -> None:
+    """Refuses a tensor that is not a standard deviation for each coordinate."""
+    if not isinstance(scale, Tensor):
+        return
+    expected = states.shape[1:]
+    if (
+        scale.shape != expected
+        or not scale.isfinite().all()
+        or (scale < 0).any()
+        or not scale.any()
+    ):
+        raise UserError(
+            f"noise_scale must have a standard deviation for each coordinate, {list(expected)}, "
+            f"finite, at least 0, and one above 0, got {scale.tolist()}."
+        )
 
 
 def check_names(argument: str, names: Sequence[str], count: int, of: str) -> None:

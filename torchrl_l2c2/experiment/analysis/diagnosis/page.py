@@ -128,7 +128,7 @@ def _measures(diagnoses: Sequence[Diagnosis]) -> Table:
             ("-", "-", "-")
             if one.is_recording
             else (
-                f"{_number(one.noise_action)} ({one.noise_scale:g})",
+                f"{_number(one.noise_action)} ({_noise(one.noise_scale)})",
                 f"{one.noise_share:.1%}",
                 _number(one.spread),
             )
@@ -147,6 +147,10 @@ def _measures(diagnoses: Sequence[Diagnosis]) -> Table:
             "squared change per step. Deviation of samples: in units of half the action's range."
         )
     return Table("Measures", ["", *(one.name for one in diagnoses)], rows, [note])
+
+
+def _noise(scale: float | Tensor) -> str:
+    return "of each input" if isinstance(scale, Tensor) else f"{scale:g}"
 
 
 def _largest_change(one: Diagnosis) -> str:
@@ -179,8 +183,8 @@ def _inputs(diagnoses: Sequence[Diagnosis]) -> list[Table]:
     )
     noise = _ranked(
         "Inputs that pass on noise",
-        "Shares of the inputs in the squared change of the action by noise, if each input has "
-        "noise of the same standard deviation.",
+        "Shares of the inputs in the squared change of the action by noise, if only this "
+        "input has noise.",
         diagnoses,
         lambda one: one.noise_inputs,
     )

@@ -351,9 +351,11 @@ def _reasons(diagnosis: Diagnosis) -> Iterator[Finding]:
             )
             yield Finding("input", text, fault=False)
     if shaking and diagnosis.noise_share >= threshold("NOISY"):
+        scale = diagnosis.noise_scale
+        noise = "the given noise" if isinstance(scale, Tensor) else f"noise of {scale:.2g}"
         text = (
-            f"It is sensitive to noise on its observations: noise of {diagnosis.noise_scale:.2g} "
-            f"moves the action by {diagnosis.noise_action:.2g}; squared, this is "
+            f"It is sensitive to noise on its observations: {noise} moves the action by "
+            f"{diagnosis.noise_action:.2g}; squared, this is "
             f"{min(1.0, diagnosis.noise_share):.0%} of the squared change from step to step."
         )
         if len(shares := diagnosis.noise_inputs) > 1 and shares.max() >= threshold("MOSTLY"):
