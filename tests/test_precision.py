@@ -14,7 +14,7 @@ from tests.losses import (
     qvalue,
 )
 from torchrl_l2c2 import ASAPLoss, CATSLoss, L2C2Loss, LCPLoss, PPORPELoss, SR2LLoss
-from torchrl_l2c2.objectives import _networks
+from torchrl_l2c2.objectives import _evaluation
 
 
 def ppo():
@@ -63,7 +63,7 @@ def test_the_terms_and_gradients_are_those_without_autocast(make, compiling, bat
     added, gradients, own = evaluate(loss, batch, autocast=False)
     if isinstance(loss, PPORPELoss):
         loss.delta.fill_(0.5)  # The adaptive threshold is a state that every forward pass moves.
-    monkeypatch.setattr(_networks, "is_compiling", lambda: compiling)
+    monkeypatch.setattr(_evaluation, "is_compiling", lambda: compiling)
     found, its_gradients, its_own = evaluate(loss, batch, autocast=True)
     # Relative to themselves: of states so near the terms are far below 1e-5.
     torch.testing.assert_close(found, added, rtol=0.05, atol=0.0)

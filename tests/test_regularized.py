@@ -83,8 +83,8 @@ from torchrl_l2c2 import (
     make_actor,
     make_critic,
 )
-from torchrl_l2c2.objectives import _networks
-from torchrl_l2c2.objectives._networks import SharedEvaluation
+from torchrl_l2c2.objectives import _evaluation
+from torchrl_l2c2.objectives._evaluation import SharedEvaluation
 
 NEAR = Neighborhood(sigma=1.0, lambda_min=0.1, lambda_max=1.0)
 
@@ -1060,7 +1060,7 @@ class TestOnePass:
         found = []
         for compiling in (False, True):
             rows.clear()
-            monkeypatch.setattr(_networks, "is_compiling", lambda c=compiling: c)
+            monkeypatch.setattr(_evaluation, "is_compiling", lambda c=compiling: c)
             torch.manual_seed(0)
             # The adaptive threshold is a state that every forward pass moves.
             loss.delta.fill_(0.5)
@@ -1122,7 +1122,7 @@ class TestOnePass:
     def test_not_where_it_would_cut_a_gradient(self, monkeypatch):
         """The action that a value is of may be the policy's own."""
         torch.manual_seed(0)
-        monkeypatch.setattr(_networks, "is_compiling", lambda: True)
+        monkeypatch.setattr(_evaluation, "is_compiling", lambda: True)
         loss = L2C2Loss(Cooperating(deterministic_actor(), qvalue()), NEAR)
         batch = with_neighbors(transitions(6))
         batch["action"].requires_grad_()

@@ -1,6 +1,6 @@
 """Losses: L2C2 and other regularizers, their base class, and PPO-RPE."""
 
-from torchrl_l2c2.objectives._networks import SharedEvaluation
+from torchrl_l2c2.objectives._evaluation import SharedEvaluation
 from torchrl_l2c2.objectives.asap import ASAPLoss
 from torchrl_l2c2.objectives.caps import CAPSLoss
 from torchrl_l2c2.objectives.cats import CATSLoss

@@ -19,7 +19,7 @@ from torchrl.objectives.utils import dispatch_value_estimator
 
 from torchrl_l2c2._checks import check_choice, check_real
 from torchrl_l2c2.objectives._batch import next_key, read_taken
-from torchrl_l2c2.objectives._networks import SharedEvaluation
+from torchrl_l2c2.objectives._evaluation import SharedEvaluation
 
 
 def relative_density_ratio(

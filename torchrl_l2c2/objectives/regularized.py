@@ -29,6 +29,7 @@ from torchrl_l2c2.objectives._batch import (
     next_key,
     spread_rows,
 )
+from torchrl_l2c2.objectives._evaluation import EvaluatedNetworks, Policy, SharedEvaluation
 from torchrl_l2c2.objectives._fold import (
     PARTS,
     TermWatch,
@@ -40,10 +41,7 @@ from torchrl_l2c2.objectives._fold import (
 from torchrl_l2c2.objectives._networks import (
     POLICY_NETWORK,
     VALUE_NETWORKS,
-    EvaluatedNetworks,
     NetworkSpec,
-    Policy,
-    SharedEvaluation,
     is_ensemble,
 )
 from torchrl_l2c2.objectives._specialize import SpecializedLoss, find_selections

@@ -14,7 +14,7 @@ from torchrl.objectives import LossModule
 from torchrl_l2c2._checks import check_positive_int, check_real, check_takes_gradients
 from torchrl_l2c2.divergences import kl_divergence
 from torchrl_l2c2.objectives._batch import at_rows
-from torchrl_l2c2.objectives._networks import Policy, in_full_precision
+from torchrl_l2c2.objectives._evaluation import Policy, in_full_precision
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
 from torchrl_l2c2.policy_distances import (
     PolicyDistance,

@@ -42,7 +42,8 @@ from torchrl_l2c2.experiment.settings.config import ExperimentConfig
 from torchrl_l2c2.experiment.settings.regularizers import GainConfig
 from torchrl_l2c2.gains import gradient_shares
 from torchrl_l2c2.neighborhood import Neighborhood
-from torchrl_l2c2.objectives._networks import VALUE_NETWORKS, EvaluatedNetworks, is_ensemble
+from torchrl_l2c2.objectives._evaluation import EvaluatedNetworks
+from torchrl_l2c2.objectives._networks import VALUE_NETWORKS, is_ensemble
 
 # The film of the page. Without a graphics card, drawing takes most of the time.
 DRAWING = Drawing(rate=30.0, seconds=10.0, quick=True)
