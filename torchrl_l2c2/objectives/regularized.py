@@ -32,7 +32,6 @@ from torchrl_l2c2.objectives._batch import (
 from torchrl_l2c2.objectives._evaluation import EvaluatedNetworks, Policy, SharedEvaluation
 from torchrl_l2c2.objectives._fold import (
     PARTS,
-    TermWatch,
     add_penalty,
     fold_targets,
     make_part,
@@ -45,6 +44,7 @@ from torchrl_l2c2.objectives._networks import (
     is_ensemble,
 )
 from torchrl_l2c2.objectives._specialize import SpecializedLoss, find_selections
+from torchrl_l2c2.objectives._watch import TermWatch
 from torchrl_l2c2.presets import NEIGHBORHOOD_FIELDS
 
 Made = TypeVar("Made")

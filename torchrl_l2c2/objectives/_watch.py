@@ -1,0 +1,227 @@
+"""Warnings of mistakes in a training loop, such as terms that it does not add."""
+
+from __future__ import annotations
+
+import functools
+import warnings
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.compiler import is_compiling
+
+from torchrl_l2c2.neighborhood import Neighborhood
+from torchrl_l2c2.objectives._batch import next_key
+
+PATIENCE = 50
+"""Calls of a loss before it warns of mistakes in the training loop."""
+
+STANDSTILL = 1000
+"""Calls of a loss at progress 0 before it warns; a first rollout has fewer."""
+
+
+class TermWatch:
+    """Warns, once each and in eager calls, of mistakes in a training loop.
+
+    Attributes:
+        progress_set: whether the progress of a ramp was set.
+        pending: added terms that were never differentiated; ``None`` before the first call.
+    """
+
+    def __init__(self) -> None:
+        self.progress_set = False
+        self.pending: set[str] | None = None
+        self._calls = 0
+        self._forwards = 0
+        self._parts = 0
+        self._counted = 0
+        self._warned: set[str] = set()
+
+    def see_call(self, loss: Any, batch: TensorDictBase) -> None:
+        """Counts a call of a loss, or of its ``actor_loss``, in training."""
+        self._calls += 1
+        if self._calls == 1 and loss._followed:
+            _warn_of_several_steps(batch)
+        if self._calls == PATIENCE and loss._ramp is not None and not self.progress_set:
+            warnings.warn(
+                f"the gain of {type(loss).__name__} follows the progress of training, and "
+                f"set_progress was not called in {PATIENCE} updates: it stays at "
+                f"{loss.regularizer_gain.item():g}. Call "
+                "loss.set_progress(frames / total_frames) before the updates on every rollout, "
+                "first with 0, or choose ramp=None.",
+                stacklevel=4,
+            )
+        stands = self._calls == STANDSTILL and self.progress_set and loss.strength > 0
+        if stands and not loss.regularizer_gain:
+            warnings.warn(
+                f"the penalty of {type(loss).__name__} was 0 until now, because the progress of "
+                f"training is still 0 after {STANDSTILL} updates. Call "
+                "loss.set_progress(frames / total_frames) before the updates on every rollout, "
+                "with / and not //.",
+                stacklevel=4,
+            )
+
+    def see_forward(self, loss: Any, terms: TensorDictBase) -> None:
+        """Counts a call of a loss in training, and follows the gradients of its added terms."""
+        self._forwards += 1
+        if loss.folded:
+            return
+        if self.pending is None:
+            self.pending = set(loss.added_terms)
+        for key in tuple(self.pending):
+            term = terms.get(key, None)
+            if isinstance(term, Tensor) and term.requires_grad:
+                term.register_hook(functools.partial(_forget, self.pending, key))
+        if self._forwards == PATIENCE and self.pending:
+            warnings.warn(
+                f"{sorted(self.pending)} of {type(loss).__name__} were not differentiated in "
+                f"{PATIENCE} calls: the training loop does not add them, so the regularizer has no "
+                "effect. Add them to the loss that is minimized, or call loss.fold() after making "
+                "it (as smooth(loss) does), which adds them to the loss's own terms.",
+                stacklevel=4,
+            )
+
+    def unused(self) -> set[str]:
+        """Terms that were not differentiated in several calls."""
+        return self.pending or set() if self._forwards > 1 else set()
+
+    def see_regularizer(self, loss: Any) -> None:
+        """Records that a loop computes the terms itself."""
+        if not is_compiling() and loss._evaluation.forward_pass is None:
+            self._warned.add("parts")
+
+    def see_part(self, loss: Any, kind: str) -> None:
+        """Counts a call of ``actor_loss`` or ``value_loss`` without the added terms."""
+        policy = bool(loss.policy_terms)
+        has_terms = policy if kind == "policy" else bool(loss.added_terms - loss._policy_side)
+        if is_compiling() or not has_terms or "parts" in self._warned:
+            return
+        self._parts += 1
+        if self._parts == PATIENCE:
+            self._warned.add("parts")
+            warnings.warn(
+                f"actor_loss and value_loss of {type(loss).__name__} were called {PATIENCE} times "
+                "without its terms: add policy_regularizer(batch) and value_regularizer(batch), or "
+                "call loss.fold() after making it (as smooth(loss) does).",
+                stacklevel=4,
+            )
+
+    def see_counts(self, loss: Any, counts: Tensor, max_step: float | None = None) -> None:
+        """Warns of observations that are not finite, or of a ``max_step`` that is too small."""
+        if is_compiling():
+            return
+        self._counted += 1
+        if "counts" in self._warned or (counts.is_cuda and self._counted % 100 != 1):
+            return
+        if max_step is not None:
+            if not bool(counts.any()):
+                self._warned.add("counts")
+                warnings.warn(
+                    f"all transitions of the batch are longer than max_step={max_step:g} or not "
+                    f"finite, so the penalty of {type(loss).__name__} is 0: raise max_step, or "
+                    "choose max_step=None.",
+                    stacklevel=4,
+                )
+        elif not bool(counts.all()):
+            self._warned.add("counts")
+            share = 1.0 - counts.float().mean().item()
+            warnings.warn(
+                f"{share:.2%} of the transitions in the batch have an observation or a next "
+                "observation without a finite entry, as some environments give at resets: the "
+                f"terms of {type(loss).__name__} that compare the two leave these transitions out, "
+                "and have no effect if all are left out: keep the true next observations.",
+                stacklevel=5,
+            )
+
+    def see_neighbors(
+        self, loss: Any, neighbors: TensorDictBase, batch: TensorDictBase, near: Neighborhood
+    ) -> None:
+        """Warns of neighbors that were drawn before a transform changed the observations.
+
+        On a line, also of neighbors of another neighborhood. Observations with neighbors are
+        floating point.
+        """
+        if (
+            is_compiling()
+            or "neighbors" in self._warned
+            or not isinstance(neighbors, TensorDictBase)
+        ):
+            return
+        self._warned.add("neighbors")
+        for key, there in neighbors.items(include_nested=True, leaves_only=True):
+            here, successor = batch.get(key, None), batch.get(next_key(key), None)
+            if here is None or successor is None or here.shape != successor.shape:
+                continue
+            # [*B, K, *F] and [*B, *F]
+            there = there.movedim(neighbors.batch_dims, 0)
+            span = near.radius * (successor - here).abs()
+            rounding = 16 * torch.finfo(here.dtype).eps * (here.abs() + successor.abs())
+            if bool(((there - here).abs() > 1.01 * span + rounding).any()):
+                warnings.warn(
+                    f"the neighbors in the batch are not near its {key!r}, so the penalty of "
+                    f"{type(loss).__name__} is wrong: append neighbor_transform() after all "
+                    "transforms that change observations, such as ObservationNorm.",
+                    stacklevel=5,
+                )
+                return
+            distance = neighbors.get("distance", None)
+            if distance is None or not near.on_line:
+                continue
+            if _is_elsewhere(here, successor, there, distance.movedim(-1, 0), near):
+                warnings.warn(
+                    "the neighbors in the batch are of another neighborhood than "
+                    f"{type(loss).__name__}'s, which changes its penalty: append the "
+                    "transform that loss.neighbor_transform() returns.",
+                    stacklevel=5,
+                )
+                return
+
+
+def _is_elsewhere(
+    here: Tensor, successor: Tensor, there: Tensor, distance: Tensor, near: Neighborhood
+) -> bool:
+    """Checks if neighbors are off the line to the successor, or have distances of another one.
+
+    Args:
+        here: observations, ``[*B, *F]``.
+        successor: their successors.
+        there: their neighbors, ``[K, *B, *F]``.
+        distance: the neighbors' distances, ``[K, *B]``.
+        near: a neighborhood on a line.
+    """
+    rows, size = distance[0].numel(), here.shape[distance.ndim - 1 :].numel()
+    here, successor = here.reshape(rows, size), successor.reshape(rows, size)
+    there = there.reshape(len(distance), rows, size)
+    distance = distance.reshape(len(distance), rows)
+    step = successor - here
+    # Coordinates that hardly move do not tell the place on the line.
+    moved = step.abs() > 0.1 * step.abs().amax(-1, keepdim=True)
+    rounding = 16 * torch.finfo(here.dtype).eps * (here.abs() + successor.abs()) / step.abs()
+    allowed = 0.02 * near.radius + torch.where(moved, rounding, 0.0).amax(-1)
+    place = ((there - here) / step).abs()
+    low, high = (torch.where(moved, place, end) for end in (torch.inf, -torch.inf))
+    low, high = low.amin(-1), high.amax(-1)
+    off_line = high - low > allowed
+    # A distance is rounded relative to its size.
+    allowed = allowed + 16 * torch.finfo(distance.dtype).eps * distance
+    wrong = off_line | ((distance - near.epsilon - high).abs() > allowed)
+    return bool((wrong & moved.any(-1) & distance.isfinite()).any())
+
+
+def _warn_of_several_steps(batch: TensorDictBase) -> None:
+    """Warns if next observations are several steps ahead, as after ``MultiStepTransform``."""
+    steps = batch.get("steps_to_next_obs", None)
+    most = 1 if steps is None or not steps.numel() else int(steps.max())
+    if most > 1:
+        warnings.warn(
+            f"the next observations of the batch are up to {most} steps ahead of their states "
+            "(n-step returns): the neighborhoods are larger than with single transitions, and so "
+            "is the penalty. The presets were found with single transitions: choose a smaller "
+            "strength.",
+            stacklevel=5,
+        )
+
+
+def _forget(pending: set[str], key: str, gradient: Tensor) -> None:
+    pending.discard(key)
