@@ -140,11 +140,7 @@ def pages() -> dict[str, Page]:
                 "choice": td3.first_choice_table(),
             }
         ),
-        "results/td3_mujoco.md": _comparison_page(
-            records("td3_mujoco"),
-            "![Return against action variation of TD3 on InvertedDoublePendulum](td3_mujoco.svg)",
-            "action_variation",
-        ),
+        "results/td3_mujoco.md": _td3_mujoco_page(),
         "results/field_gains.md": Page(dict(zip(("rivals", "one", "caps"), chosen, strict=True))),
         "results/targets.md": Page(dict(zip(("all", "swingup", "hopper"), targets, strict=True))),
         "studies/protocol.md": Page({"reacher": reacher_by_seed(runs)}),
@@ -236,6 +232,15 @@ def _comparison_page(found: pd.DataFrame, picture: str, measure: str) -> Page:
     table = comparison_table(TEST, groups).markdown()
     draw = partial(draw_plane, groups, TEST, measure=measure, description=description(groups))
     return Page({"results": f"{picture}\n\n{table}"}, groups, draw)
+
+
+def _td3_mujoco_page() -> Page:
+    page = _comparison_page(
+        records("td3_mujoco"),
+        "![Return against action variation of TD3 on InvertedDoublePendulum](td3_mujoco.svg)",
+        "action_variation",
+    )
+    return page._replace(parts={**page.parts, "strength": td3.mujoco_strengths_table()})
 
 
 def _new_tasks_page() -> Page:

@@ -133,10 +133,19 @@ def last_policy_table() -> str:
 
 def first_choice_table() -> str:
     """The candidates of the first choice by seed, of the policies of the last 10% of training."""
+    return _by_seed(records("td3").query("100 <= seed < 110"), "late_mean")
+
+
+def mujoco_strengths_table() -> str:
+    """The strengths on InvertedDoublePendulum by seed, by the last policy."""
+    return _by_seed(records("td3_mujoco_strength"), TEST)
+
+
+def _by_seed(runs: pd.DataFrame, policy: str) -> str:
     found = {}
-    for group in group_records(records("td3").query("100 <= seed < 110")):
+    for group in group_records(runs):
         returns, variations = (
-            group.scores("late_mean", quantity).ravel().tolist()
+            group.scores(policy, quantity).ravel().tolist()
             for quantity in ("return", "action_variation")
         )
         found[group.name] = returns, variations

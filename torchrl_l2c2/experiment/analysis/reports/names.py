@@ -42,7 +42,8 @@ def name_with_settings(method: str, settings: Mapping[str, str]) -> tuple[str, s
     """Name of a method with its own settings, and the settings that the name contains.
 
     The name of L2C2 contains its distance and its gain, or the target of the gain. "L2C2" without
-    them has the Hellinger distance and the gains of the paper.
+    them has the Hellinger distance and the gains of the paper. Every name contains a strength other
+    than 1.
 
     Args:
         method (str): The method's name.
@@ -57,9 +58,20 @@ def name_with_settings(method: str, settings: Mapping[str, str]) -> tuple[str, s
         >>> own |= {"regularizer.gain": "target", "regularizer.gain_target": "0.1"}
         >>> name_with_settings("l2c2", own)[0]
         'L2C2, mse, target 0.1'
+        >>> name_with_settings("cats", {"regularizer.strength": "0.25"})[0]
+        'CATS, strength=0.25'
     """
-    usual = REGULARIZERS.get(method)
     own = {name.removeprefix("regularizer."): value for name, value in settings.items()}
+    name, contained = _name_with_gains(method, own)
+    strength = float(own.get("strength", 1.0))
+    if strength != 1.0:
+        name += f", strength={strength:g}"
+        contained.add("strength")
+    return name, {f"regularizer.{setting}" for setting in contained}
+
+
+def _name_with_gains(method: str, own: Mapping[str, str]) -> tuple[str, set[str]]:
+    usual = REGULARIZERS.get(method)
     if not isinstance(usual, L2C2Config) or not {"policy_distance", "lambda_min"} & own.keys():
         return method_name(method), set()
     distance = DISTANCES[own.get("policy_distance", usual.policy_distance)]
@@ -75,4 +87,4 @@ def name_with_settings(method: str, settings: Mapping[str, str]) -> tuple[str, s
         # The paper's ratio is not part of a name.
         if math.isclose(ratio, usual.lambda_max / usual.lambda_min):
             contained.add("lambda_max")
-    return f"L2C2, {name}", {f"regularizer.{setting}" for setting in contained}
+    return f"L2C2, {name}", contained
