@@ -829,6 +829,20 @@ class TestProse:
             in start
         )
 
+    def test_td3_on_a_mujoco_task_at_four_times_the_strength(self):
+        """How many runs shake on these seeds, and on all seeds at the preset."""
+        page = " ".join((ROOT / "results" / "td3_mujoco.md").read_text().split())
+        runs = records("td3_mujoco_strength").query("method == 'l2c2'")
+        strong = runs["differences"].str.contains("strength=4")
+        shakes = runs["last_mean_action_variation"] > 0.2
+        assert [(int(shakes[s].sum()), int(s.sum())) for s in (~strong, strong)] == [(2, 5), (0, 5)]
+        assert "two of five runs shake at strength 1, and none at strength 4, at a higher" in page
+        returned = runs["last_mean_return"]
+        assert returned[strong].mean() > returned[~strong].mean()
+        first = records("td3_mujoco").query("method == 'l2c2' and seed < 10")
+        assert int((first["last_mean_action_variation"] > 0.2).sum()) + 2 == 6
+        assert "six of ten shake at strength 1" in page
+
     def test_td3s_strengths_are_relative_to_fixed_gains(self):
         """A run with the present preset has the strength of the same run before it changed."""
         runs = records("td3").query("seed < 10 and method == 'l2c2'").copy()
