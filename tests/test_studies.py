@@ -841,7 +841,10 @@ class TestProse:
         assert returned[strong].mean() > returned[~strong].mean()
         first = records("td3_mujoco").query("method == 'l2c2' and seed < 10")
         assert int((first["last_mean_action_variation"] > 0.2).sum()) + 2 == 6
-        assert "six of ten shake at strength 1" in page
+        assert "six of ten shake at strength 1, and five of ten baselines" in page
+        baselines = pd.concat([records("td3_mujoco"), records("td3_mujoco_strength")])
+        baselines = baselines.query("method == 'none'")["last_mean_action_variation"]
+        assert (int((baselines > 0.2).sum()), len(baselines)) == (5, 10)
 
     def test_td3s_strengths_are_relative_to_fixed_gains(self):
         """A run with the present preset has the strength of the same run before it changed."""
