@@ -1,4 +1,4 @@
-"""What the networks of a loss read and write, and which of them cannot be regularized."""
+"""Inspection of a loss's networks: their inputs, their outputs, and refusals of unsuitable ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Products of large matrices by oneDNN, where torch's own use half of the processor.
+"""Products of large matrices by oneDNN, where torch's own are slower.
 
 For float32, torch calls MKL, which uses only AVX2 on AMD's processors. With AVX-512, oneDNN is
 faster there for all but small matrices: ``python -m benchmarks.speed --rows products``.
@@ -17,7 +17,7 @@ from torch.fx import Graph, Node
 from torchrl_l2c2.experiment.learn._torch_internals import onednn_linear
 
 CPU = Path("/proc/cpuinfo")
-# Of smaller matrices, MKL's products are as fast or faster.
+# MKL is as fast or faster for smaller matrices.
 LEAST_SIDE = 16
 LEAST_MULTIPLICATIONS = 2**21
 

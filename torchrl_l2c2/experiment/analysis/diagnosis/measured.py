@@ -253,7 +253,6 @@ def diagnose(
     first = played[0]
     actions = _flat(first[env.action_key])
     coordinates = _flat(first[key]).shape[1]
-    _check_noise(noise_scale, first[key])
     check_names("action_names", action_names, actions.shape[1], "actions")
     check_names("observation_names", observation_names, coordinates, "coordinates")
     low, high, bounded = bounds_of(env.action_spec, actions)
@@ -308,23 +307,6 @@ def _noise_by_input(
     each = [noise_sensitivity(act, states, one, generator=generator) for one in alone]
     found = torch.stack(each)
     return found / found.sum()
-
-
-def _check_noise(scale: float | Tensor, states: Tensor) -> None:
-    """Refuses a tensor that is not a standard deviation for each coordinate."""
-    if not isinstance(scale, Tensor):
-        return
-    expected = states.shape[1:]
-    if (
-        scale.shape != expected
-        or not scale.isfinite().all()
-        or (scale < 0).any()
-        or not scale.any()
-    ):
-        raise UserError(
-            f"noise_scale must have a standard deviation for each coordinate, {list(expected)}, "
-            f"finite, at least 0, and one above 0, got {scale.tolist()}."
-        )
 
 
 def check_names(argument: str, names: Sequence[str], count: int, of: str) -> None:

@@ -54,7 +54,7 @@ PERIODS = 4  # of the slowest of the fast frequencies, at least, in an episode o
 ALTERNATES = 0.45  # lowest frequency of an action that flips at every step, of the control rate
 FULL = 2  # findings of one kind that each have a sentence
 LISTED_INPUTS = 8  # whose values are listed, in their order; of more, only some
-SELECTED_INPUTS = 4  # of more inputs: those that the action follows most
+SELECTED_INPUTS = 4  # listed of more inputs: the action follows these most
 MOST_NAMES = 12  # of further actions with the same finding
 TAIL = 1.4  # times the peak's height: a higher spectrum just below it is of a slower movement
 
