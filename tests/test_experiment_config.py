@@ -375,6 +375,15 @@ def test_a_deterministic_policy_is_no_distribution(method, setting, value):
         ExperimentConfig(algorithm=GROUPS["algorithm"]["td3"], regularizer=regularizer)
 
 
+@pytest.mark.parametrize("name", ["ppo", "ppo_rpe"])
+def test_a_relative_penalty_needs_action_values(name):
+    regularizer = replace(REGULARIZERS["l2c2"], relative=True)
+    for by_value in ("sac", "td3"):
+        ExperimentConfig(algorithm=GROUPS["algorithm"][by_value], regularizer=regularizer)
+    with pytest.raises(SettingError, match=f"relative must be false with algorithm={name}, which"):
+        ExperimentConfig(algorithm=GROUPS["algorithm"][name], regularizer=regularizer)
+
+
 def test_swingup_may_have_another_name():
     """If it is said that it is meant."""
     assert TaskConfig("quiet", TaskConfig().env_id, 0.0).env_id == TaskConfig("swingup").env_id

@@ -713,7 +713,7 @@ def test_print_starts_with_the_settings(kind):
     assert lines[0] == f"{type(loss).__name__}("
     assert lines[1].startswith(f"    {type(loss).__name__.split('[')[0]}: ")
     assert lines[2].startswith("    regularizer_gain=1, ") and len(lines[2]) < 150
-    assert lines[3] == "    folded=False, skip_ends=False, ramp=None"
+    assert lines[3] == "    folded=False, skip_ends=False, ramp=None, relative=False"
     assert lines[4].startswith("    actor_network_params=")
     assert str(loss).count("skip_ends") == 1
     if kind == "l2c2":

@@ -149,6 +149,20 @@ def test_those_of_a_regularizer(config, attributes):
         assert loss.l2c2_neighborhood.max_step == 2.0
 
 
+def test_relative_makes_penalties_follow_the_action_values():
+    """By the size of the loss's own term, which is minus the action value."""
+    batch, penalties = transitions(6), []
+    for relative in (False, True):
+        torch.manual_seed(0)
+        loss = TD3Loss(deterministic_actor(), qvalue(), action_spec=BOUNDS)
+        loss = add_regularizer(loss, CATSConfig(relative=relative))
+        torch.manual_seed(1)
+        terms = loss(batch.copy())
+        penalties.append(terms["loss_cats"])
+    size = terms["state_action_value_actor"][0].abs().mean()  # The first of two is maximized.
+    torch.testing.assert_close(penalties[1], penalties[0] * size)
+
+
 @pytest.mark.parametrize(
     "config",
     [config for config in REGULARIZERS.values() if isinstance(config, GainConfig)],

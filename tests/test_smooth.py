@@ -736,6 +736,10 @@ class TestPresets:
         assert smooth(sac(), neighborhood=near).l2c2_neighborhood is near
         assert smooth(ppo(), ramp=None)._ramp is None
         assert smooth(sac(), ramp=0.5)._ramp == (1.0, 0.5)
+        batch = seeded(transitions, 12, seed=1)
+        plain = seeded(smooth(seeded(sac), fold=False), batch.copy(), seed=2)
+        relative = seeded(smooth(seeded(sac), fold=False, relative=True), batch.copy(), seed=2)
+        assert relative["loss_l2c2_actor"] < plain["loss_l2c2_actor"]  # The values are small.
 
     @pytest.mark.parametrize(
         ("arguments", "error", "message"),
@@ -764,6 +768,7 @@ class TestPresets:
             ),
             ({"strength": -1.0}, ValueError, "strength must be .*at least 0"),
             ({"strength": "2"}, TypeError, "strength must be a real number"),
+            ({"relative": 1}, TypeError, "relative must be True or False, got 1"),
             ({"ramp": 2.0}, ValueError, r"ramp must be in \(0, 1\], got 2.0"),
         ],
     )
@@ -804,6 +809,105 @@ class TestPresets:
             "loss_qvalue",
             "loss_alpha",
         }
+
+
+def by_value():
+    """The losses that train a policy by an action value."""
+    names = ("SAC", "SAC-v1", "TQC", "DiscreteSAC", "DDPG", "TD3", "TD3BC", "REDQ", "CQL", "CrossQ")
+    return [case for case in CASES if case.name in names]
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("case", by_value(), ids=str)
+class TestRelative:
+    """Penalties relative to the size of the action values."""
+
+    def run(self, loss, case, seed=2):
+        return seeded(loss, seeded(case.batch, 6, seed=1), seed=seed)
+
+    def size(self, case, reduction="mean"):
+        """The absolute value of the baseline's own term, per value or, of a sum, per transition."""
+        own = self.run(seeded(case.make, reduction="none"), case)["loss_actor"].abs()
+        return own.mean() if reduction == "mean" else own.sum() / 6
+
+    @pytest.mark.parametrize("reduction", ["mean", "sum"])
+    def test_the_penalty_of_the_policy_is_multiplied_by_the_size(self, case, reduction):
+        if reduction not in case.reductions:
+            pytest.skip("the baseline has no such reduction")
+        separate, plain = (
+            smooth(seeded(case.make, reduction=reduction), fold=False, **WIDE) for _ in range(2)
+        )
+        separate.relative()
+        found, expected = self.run(separate, case), self.run(plain, case)
+        size = self.size(case, reduction)
+        assert 0 < size != 1
+        for key, value in expected.items():
+            factor = size if key in separate.policy_terms else 1.0
+            torch.testing.assert_close(found[key], value * factor)
+
+    def test_it_is_folded(self, case):
+        """The own term is the baseline's plus the penalty that is reported."""
+        folded = self.run(smooth(seeded(case.make), **WIDE).relative(), case)
+        separate = self.run(smooth(seeded(case.make), fold=False, **WIDE).relative(), case)
+        penalty = separate["loss_l2c2_actor"]
+        assert torch.equal(folded["penalty_l2c2_actor"], penalty)
+        assert torch.equal(folded["loss_actor"], separate["loss_actor"] + penalty)
+
+    def test_the_size_has_no_gradient(self, case):
+        """The penalty's gradient is the plain penalty's, as often as the size."""
+        relative, plain = (smooth(seeded(case.make), fold=False, **WIDE) for _ in range(2))
+        size = self.size(case)
+        ours = gradients(relative, self.run(relative.relative(), case)["loss_l2c2_actor"])
+        theirs = gradients(plain, self.run(plain, case)["loss_l2c2_actor"])
+        for name, gradient in theirs.items():
+            torch.testing.assert_close(ours[name], gradient * size, rtol=1e-4, atol=1e-6)
+
+
+class TestRelativeParts:
+    @pytest.mark.parametrize(("make", "method"), [(td3, "actor_loss"), (ddpg, "loss_actor")])
+    def test_methods_of_the_loss_have_it(self, make, method):
+        """Loops that call ``actor_loss`` train with the penalty of ``forward``."""
+        batch = seeded(transitions, 12, seed=1)
+        loss = smooth(seeded(make), **GIVEN).relative()
+        batch = loss.neighbor_transform()(batch)
+        whole = seeded(loss, batch.copy(), seed=2)
+        value, metadata = seeded(getattr(loss, method), batch.copy(), seed=2)
+        torch.testing.assert_close(value, whole["loss_actor"])
+        torch.testing.assert_close(metadata["penalty_l2c2_actor"], whole["penalty_l2c2_actor"])
+        plain = seeded(smooth(seeded(make), **GIVEN, fold=False), batch.copy(), seed=2)
+        assert metadata["penalty_l2c2_actor"] != plain["loss_l2c2_actor"]
+
+    @pytest.mark.parametrize("make", [sac, td3, ddpg])
+    def test_it_compiles_into_one_graph(self, make):
+        torch._dynamo.reset()
+        loss = smooth(seeded(make), **GIVEN).relative()
+        batch = loss.neighbor_transform()(seeded(transitions, 12, seed=1))
+        expected = seeded(loss, batch.copy(), seed=2)
+        compiled = torch.compile(loss, fullgraph=True, backend=lambda graph, _: graph)
+        found = seeded(compiled, batch.copy(), seed=2)
+        torch.testing.assert_close(found["penalty_l2c2_actor"], expected["penalty_l2c2_actor"])
+
+    def test_the_strength_suits_rewards_of_any_size(self):
+        """Values and rewards ten times as large: ten times the penalty's gradient, too."""
+        found = []
+        for scale in (1.0, 10.0):
+            loss = smooth(seeded(ddpg), **GIVEN, fold=False).relative()
+            with torch.no_grad():
+                for parameter in loss.value_network_params.flatten_keys().values():
+                    last = parameter.shape[0] == 1  # the output's weight and bias
+                    parameter.mul_(scale if last else 1.0)
+            batch = loss.neighbor_transform(torch.Generator().manual_seed(0))(
+                seeded(transitions, 12, seed=1)
+            )
+            terms = loss(batch)
+            ratio = terms["loss_l2c2_actor"] / terms["loss_actor"]
+            found.append(ratio.detach())
+        torch.testing.assert_close(*found)
+
+    @pytest.mark.parametrize("make", [ppo, lambda: PPORPELoss(gaussian_actor(), heads_critic())])
+    def test_it_needs_an_action_value(self, make):
+        with pytest.raises(TypeError, match="trains no policy by an action value, as SAC"):
+            smooth(make()).relative()
 
 
 class TestProgress:

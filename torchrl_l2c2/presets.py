@@ -21,6 +21,7 @@ class Preset:
     Attributes:
         settings: keyword arguments of the regularizer, and of its ``Neighborhood``.
         ramp: share of training over which the gain rises from 0; ``None`` for a constant gain.
+        relative: whether the penalty is relative to the size of the action values.
         evidence: page with the runs of these settings; ``None`` for settings without recorded runs
             with this kind of loss.
         tasks: tasks of the runs.
@@ -28,22 +29,30 @@ class Preset:
 
     settings: Mapping[str, Any] = field(default_factory=dict)
     ramp: float | None = None
+    relative: bool = False
     evidence: str | None = None
     tasks: str = ""
 
+    @property
+    def shown(self) -> dict[str, Any]:
+        """The settings as arguments of ``smooth``, with ``ramp`` and ``relative`` if set."""
+        schedule = {} if self.ramp is None else {"ramp": self.ramp}
+        return {**self.settings, **schedule, **({"relative": True} if self.relative else {})}
+
     def overridden(self, overrides: Mapping[str, Any]) -> Preset:
-        """Replaces settings, including ``ramp``.
+        """Replaces settings, including ``ramp`` and ``relative``.
 
         Raises:
             TypeError: both a neighborhood and its fields are given.
         """
         settings, overrides = dict(self.settings), dict(overrides)
         ramp = overrides.pop("ramp", self.ramp)
+        relative = overrides.pop("relative", self.relative)
         if "neighborhood" in overrides:
             if both := sorted(overrides.keys() & NEIGHBORHOOD_FIELDS):
                 raise TypeError(f"Expected a neighborhood or its fields, got both it and {both}.")
             settings = {k: v for k, v in settings.items() if k not in NEIGHBORHOOD_FIELDS}
-        return Preset({**settings, **overrides}, ramp, self.evidence, self.tasks)
+        return Preset({**settings, **overrides}, ramp, relative, self.evidence, self.tasks)
 
 
 METHODS = {
@@ -258,8 +267,7 @@ def presets_table() -> str:
     for kind, (exact, _) in KINDS.items():
         for method, kinds in PRESETS.items():
             chosen = kinds[kind]
-            settings = {**chosen.settings, **({} if chosen.ramp is None else {"ramp": chosen.ramp})}
-            shown = ", ".join(f"`{name}={value!r}`" for name, value in settings.items())
+            shown = ", ".join(f"`{name}={value!r}`" for name, value in chosen.shown.items())
             page = f"[{chosen.tasks}](../{chosen.evidence})" if chosen.evidence else "no runs"
             lines.append(f"| {exact[0]} | {method} | {shown} | {page} |")
     return "\n".join(lines) + "\n"

@@ -58,8 +58,10 @@ def smooth(
             ``loss_*`` terms, for loops that weigh or log them; the loss's own terms are then
             unchanged, bit for bit. Defaults to ``True``.
         **overrides: settings that replace the preset: keyword arguments of the regularizer's
-            class, fields of its :class:`~torchrl_l2c2.Neighborhood`, and ``ramp``, the share of
-            training over which the gain rises, or ``None`` for a constant gain.
+            class, fields of its :class:`~torchrl_l2c2.Neighborhood`, ``ramp``, the share of
+            training over which the gain rises, or ``None`` for a constant gain, and ``relative``,
+            whether the penalty is relative to the size of the action values
+            (:meth:`RegularizedLoss.relative`).
 
     Returns:
         RegularizedLoss: an instance of the regularizer and of the loss's class.
@@ -99,6 +101,8 @@ def smooth(
     check_bool("fold", fold)
     if overrides.get("ramp") is not None:
         check_real("ramp", overrides["ramp"], above=0, at_most=1, hint="None: no ramp.")
+    if "relative" in overrides:
+        check_bool("relative", overrides["relative"])
     check_evaluates_states(loss)
     chosen = _chosen(loss, method, overrides)
     make = getattr(objectives, METHODS[method])
@@ -106,6 +110,8 @@ def smooth(
     regularized.regularizer_gain = strength
     if chosen.ramp is not None:
         regularized.ramp(chosen.ramp, end=strength)
+    if chosen.relative:
+        regularized.relative()
     return regularized.fold() if fold else regularized
 
 
@@ -119,7 +125,7 @@ def _chosen(loss: LossModule, method: str, overrides: Mapping[str, Any]) -> Pres
     found_with = KINDS[kind][0][0]
     if chosen.evidence is None and GAIN_SETTING[method] not in overrides:
         warnings.warn(
-            f"{method} takes settings that were not tuned, {_shown(chosen.settings)}: there are no "
+            f"{method} takes settings that were not tuned, {_shown(chosen.shown)}: there are no "
             f"recorded runs of it with losses like {found_with}.",
             stacklevel=3,
         )
@@ -151,7 +157,7 @@ def _of_nearest(loss: LossModule, method: str, overrides: Mapping[str, Any]) -> 
         )
     kind = _nearest_kind(loss)
     nearest = preset(method, kind)
-    settings = dict(nearest.settings) | ({} if nearest.ramp is None else {"ramp": nearest.ramp})
+    settings = nearest.shown
     found_with = KINDS[kind][0][0]
     if GAIN_SETTING[method] not in overrides and "neighborhood" not in overrides:
         raise TypeError(
@@ -159,7 +165,7 @@ def _of_nearest(loss: LossModule, method: str, overrides: Mapping[str, Any]) -> 
             f"pass its settings: smooth(loss, {method!r}, {_shown(settings)})."
         )
     chosen = nearest.overridden(overrides)
-    kept = chosen.settings.keys() | {"ramp"}
+    kept = chosen.settings.keys() | {"ramp", "relative"}
     if taken := {k: v for k, v in settings.items() if k in kept and k not in overrides}:
         warnings.warn(
             f"{name} has no preset: settings that are not given come from the preset of "
@@ -192,7 +198,7 @@ def _arguments(method: str, make: type, settings: Mapping[str, Any]) -> dict[str
         known += sorted(NEIGHBORHOOD_FIELDS)
     unknown = sorted(arguments.keys() - set(known))
     if unknown:
-        known += ["ramp", "method", "strength", "fold"]
+        known += ["ramp", "relative", "method", "strength", "fold"]
         near = get_close_matches(unknown[0], known, 1)
         hint = f" Did you mean {near[0]!r}?" if near else ""
         raise TypeError(f"Expected settings of {method}, {known}, got {unknown}.{hint}")

@@ -49,6 +49,8 @@ class ForwardPass:
     """Other states, ``[K, *B]``, and outputs there, by network."""
     made: dict[str, Any] = field(default_factory=dict)
     """Results that the terms of a regularizer share, by name."""
+    policy_size: Tensor | None = None
+    """Mean absolute value of the loss's own policy term, if it was measured."""
 
 
 class EvaluatedNetworks:
@@ -64,6 +66,7 @@ class EvaluatedNetworks:
     def __init__(self, specs: dict[str, NetworkSpec] | None = None) -> None:
         self.specs = {} if specs is None else dict(specs)
         self._forward_passes: dict[int, ForwardPass] = {}
+        self._sizes: dict[int, list[Tensor]] = {}
         self._repeatable: set[str] = set()
 
     @property
@@ -83,6 +86,20 @@ class EvaluatedNetworks:
             del self._forward_passes[_thread()]
         else:
             self._forward_passes[_thread()] = outer
+
+    @property
+    def sizes(self) -> list[Tensor] | None:
+        """The sizes of the terms that this thread reduces; ``None`` outside of a measurement."""
+        return self._sizes.get(_thread())
+
+    def measure(self, call: Callable[[], Any]) -> tuple[Any, Tensor | None]:
+        """Calls a method of the loss; returns its result and the size of the last reduced term."""
+        sizes = self._sizes[_thread()] = []
+        try:
+            result = call()
+        finally:
+            del self._sizes[_thread()]
+        return result, sizes[-1] if sizes else None
 
     def inspect(self, loss: LossModule, networks: Iterable[str]) -> None:
         """Inspects these networks; refuses networks that cannot be evaluated at other states."""

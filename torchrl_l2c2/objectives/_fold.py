@@ -108,12 +108,20 @@ def make_part(
         targets: possible keys of the term that the method returns; the first key that the loss has
             is used.
     """
+    is_measured = targets is POLICY_LOSSES  # Dynamo would compare copies.
 
     @functools.wraps(method)
     def part(self: Any, tensordict: TensorDictBase, *args: Any, **kwargs: Any) -> Any:
-        out = method(self, tensordict, *args, **kwargs)
+        size = None
+        if self._relative and is_measured:
+            out, size = self._evaluation.measure(lambda: method(self, tensordict, *args, **kwargs))
+        else:
+            out = method(self, tensordict, *args, **kwargs)
         # Within forward, the penalty is added there.
-        if self._evaluation.forward_pass is not None or not torch.is_grad_enabled():
+        if (shared := self._evaluation.forward_pass) is not None:
+            shared.policy_size = shared.policy_size if size is None else size
+            return out
+        if not torch.is_grad_enabled():
             return out
         if kind == "policy" and not is_compiling() and self.training:
             self._watch.see_call(self, tensordict)
@@ -126,7 +134,10 @@ def make_part(
         metadata = rest[0] if rest and hasattr(rest[0], "update") else {}
         own = [key for key in self.out_keys_source if key.startswith("loss")] or list(targets)
         returned = next((key for key in targets if key in own), None)
-        for key, term in list(regularize(tensordict).items()):
+        added = regularize(tensordict)
+        if self._relative and kind == "policy":
+            self._make_relative(added, size, value, tensordict)
+        for key, term in list(added.items()):
             if key not in self.added_terms:
                 metadata[key] = term
             elif returned in fold_targets(key, kind == "policy", own):

@@ -52,7 +52,10 @@ Made = TypeVar("Made")
 GAIN = "regularizer_gain"
 """Name of the coefficient that multiplies all added terms but the auxiliary ones."""
 
-NOT_SETTINGS = ("fold", "ramp", "set_progress", "unfold")
+RELATIVE_TO = "loss_actor"
+"""The term whose size multiplies penalties of the policy after :meth:`RegularizedLoss.relative`."""
+
+NOT_SETTINGS = ("fold", "ramp", "relative", "set_progress", "unfold")
 """Methods that could be taken for settings."""
 
 PROGRESS = "regularizer_progress"
@@ -157,6 +160,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
     _diagnostics: tuple[str, ...] = ()
     _folded: bool = False
     _ramp: tuple[float, float] | None = None  # last gain, length
+    _relative: bool = False
     _watch: TermWatch = TermWatch()
     _settings: ClassVar[tuple[str, ...]] = ()  # attributes that print() shows
 
@@ -216,6 +220,10 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             # The base loss draws its random numbers first: with one seed its terms stay the same.
             terms = super().forward(tensordict)
             added = self.policy_regularizer(tensordict)
+            if self._relative:
+                assert self._evaluation.forward_pass is not None
+                size = self._evaluation.forward_pass.policy_size
+                self._make_relative(added, size, terms.get(RELATIVE_TO), tensordict)
             added.update(self.value_regularizer(tensordict))
         finally:
             self._evaluation.end_forward_pass(outer)
@@ -330,6 +338,57 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         self.register_buffer(PROGRESS, progress)
         self.regularizer_gain = end
         return self
+
+    def relative(self) -> RegularizedLoss:
+        r"""Makes the policy terms relative to the size of the loss's own policy term.
+
+        .. math::
+            \ell_\mathrm{added} \cdot \frac1B \sum_b \lvert \ell_{\mathrm{actor}, b} \rvert
+
+        The second factor is detached. For SAC, TD3 and DDPG it is about the mean size of the action
+        values. The same gains then suit rewards of any size, and the penalty is small while the
+        action values are. Without it, rewards that are ten times as large need gains ten times as
+        large. TD3+BC (Fujimoto and Gu 2021, equation 5) divides the values by the same mean.
+
+        While all values are 0, as before the first reward, so is the penalty. Terms of value
+        functions and predictors stay as they are: the loss of a value function grows with the
+        values, too. A direct call of :meth:`policy_regularizer` returns its terms before the
+        multiplication.
+
+        Returns:
+            The loss itself.
+
+        Raises:
+            TypeError: the loss has no action value that trains a policy, as in PPO.
+
+        Examples:
+            >>> import torch
+            >>> from torchrl.modules import Actor, ValueOperator
+            >>> from torchrl.objectives import DDPGLoss
+            >>> from torchrl_l2c2 import CATSLoss
+            >>> value = ValueOperator(torch.nn.Bilinear(3, 1, 1), in_keys=["observation", "action"])
+            >>> loss = DDPGLoss(Actor(torch.nn.Linear(3, 1)), value)
+            >>> loss = CATSLoss(loss, lambda_temporal=0.04).relative()
+        """
+        values = set(self.value_networks()) - {"critic_network"}
+        if not self.policy_networks() or not values:
+            raise TypeError(
+                f"{type(self).__name__} trains no policy by an action value, as SAC, TD3 and DDPG "
+                "do: its penalty cannot be relative to one."
+            )
+        self._relative = True
+        return self
+
+    def _make_relative(
+        self, added: TensorDictBase, size: Tensor | None, own: Tensor, tensordict: TensorDictBase
+    ) -> None:
+        """Multiplies policy terms by the size of the loss's own policy term."""
+        if size is None:  # REDQLoss has no method for this term.
+            size = own.detach().abs().mean()
+            size = size / tensordict.numel() if self._term_reduction == "sum" else size
+        for key in self.policy_terms:
+            if key in added.keys():
+                added.set(key, added.get(key) * size)
 
     @property
     def strength(self) -> float:
@@ -498,7 +557,10 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             lines.append(f"{part.__name__}: {shown}")
         gains = {name: self._buffers[name] for name in self._coefficients if name in self._buffers}
         lines.append(", ".join(f"{name}={gain.item():g}" for name, gain in gains.items()))
-        lines.append(f"folded={self._folded}, skip_ends={self.skip_ends}, ramp={self._ramp}")
+        lines.append(
+            f"folded={self._folded}, skip_ends={self.skip_ends}, ramp={self._ramp}, "
+            f"relative={self._relative}"
+        )
         return "\n".join(lines)
 
     # Declarations, for the __init__ of a regularizer.
@@ -920,6 +982,15 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         if pad is None:
             return None
         return ~(pad if pad.ndim <= ndim else pad.flatten(ndim).all(-1))
+
+    def _reduce_loss(
+        self, loss: Tensor, tensordict: TensorDictBase | None = None, **kwargs: Any
+    ) -> Tensor:
+        """As for the base loss; measures the term's size if this is asked for."""
+        if (sizes := self._evaluation.sizes) is not None:
+            mean = {**kwargs, "reduction": "mean"}
+            sizes.append(super()._reduce_loss(loss.detach().abs(), tensordict, **mean))
+        return super()._reduce_loss(loss, tensordict, **kwargs)
 
     def evaluate_at_batch(self, network: str, tensordict: TensorDictBase) -> TensorDictBase:
         """Evaluates a network as the loss does, and caches the result for the forward pass."""

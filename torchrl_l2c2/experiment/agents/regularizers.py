@@ -43,6 +43,8 @@ def add_regularizer(loss: LossModule, config: RegularizerConfig) -> LossModule:
     loss = wrap(config, loss)
     if isinstance(config, GainConfig):
         loss.regularizer_gain = config.strength
+        if config.relative:
+            loss.relative()
     return loss
 
 

@@ -13,6 +13,7 @@ from pydantic import Field
 from torchrl_l2c2.experiment.settings.algorithms import (
     ALGORITHMS,
     AlgorithmConfig,
+    PerStepConfig,
     PPORPEConfig,
     TD3Config,
 )
@@ -168,6 +169,7 @@ class ExperimentConfig:
         self._check_device()
         self._check_replay()
         self._check_distribution()
+        self._check_relative()
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> ExperimentConfig:
@@ -228,6 +230,16 @@ class ExperimentConfig:
                     f"must not be {value} with algorithm={self.algorithm.name}, whose policy is "
                     "deterministic and no distribution: choose mean.",
                 )
+
+    def _check_relative(self) -> None:
+        """Checks that a relative penalty has action values that it is relative to."""
+        by_value = isinstance(self.algorithm, PerStepConfig)
+        if not by_value and getattr(self.regularizer, "relative", False):
+            raise SettingError(
+                "regularizer.relative",
+                f"must be false with algorithm={self.algorithm.name}, which trains no policy by an "
+                "action value: sac and td3 do.",
+            )
 
 
 def _read_group(group: str, values: Mapping[str, Any]) -> Any:

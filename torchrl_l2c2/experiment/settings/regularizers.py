@@ -86,6 +86,12 @@ class GainConfig(RegularizerConfig):
         description="share of training after which gain=ramp reaches its full value",
         json_schema_extra=neutral(1.0),
     )
+    relative: bool = Field(
+        default=False,
+        description="penalty of the policy relative to the mean size of the action values, for sac "
+        "and td3; gains then suit rewards of any size",
+        json_schema_extra=neutral(False),
+    )
 
     def __post_init__(self) -> None:
         if self.gain in USED_WITH_GAIN["gain_target"] and self.gain_target is None:
@@ -332,6 +338,8 @@ def preset_settings(regularizer: str, algorithm: str) -> dict[str, Any]:
     gain: dict[str, Any] = {"gain": "constant" if chosen.ramp is None else "ramp"}
     if chosen.ramp not in (None, 1.0):
         gain["gain_length"] = chosen.ramp
+    if chosen.relative:
+        gain["relative"] = True
     return {**chosen.settings, **gain, **own}
 
 
