@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from studies import field, front_door, half_cheetah, paper, rsl_rl, summary, td3
+from studies import field, front_door, half_cheetah, paper, relative, rsl_rl, summary, td3
 from studies.cells import (
     digest,
     improvements_over_tasks,
@@ -141,6 +141,7 @@ def pages() -> dict[str, Page]:
             }
         ),
         "results/td3_mujoco.md": _td3_mujoco_page(),
+        "results/relative.md": Page({"results": relative.table()}),
         "results/field_gains.md": Page(dict(zip(("rivals", "one", "caps"), chosen, strict=True))),
         "results/targets.md": Page(dict(zip(("all", "swingup", "hopper"), targets, strict=True))),
         "studies/protocol.md": Page({"reacher": reacher_by_seed(runs)}),

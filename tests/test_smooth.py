@@ -877,6 +877,14 @@ class TestRelativeParts:
         plain = seeded(smooth(seeded(make), **GIVEN, fold=False), batch.copy(), seed=2)
         assert metadata["penalty_l2c2_actor"] != plain["loss_l2c2_actor"]
 
+    def test_separate_penalties_need_forward(self):
+        """A loop of methods would add the penalty without its size."""
+        loss = smooth(td3(), **GIVEN, fold=False).relative()
+        batch = seeded(transitions, 12, seed=1)
+        loss(batch.copy())
+        with pytest.raises(RuntimeError, match=r"actor_loss leaves out .* call loss\.fold\(\)"):
+            loss.actor_loss(batch.copy())
+
     @pytest.mark.parametrize("make", [sac, td3, ddpg])
     def test_it_compiles_into_one_graph(self, make):
         torch._dynamo.reset()
@@ -906,7 +914,7 @@ class TestRelativeParts:
 
     @pytest.mark.parametrize("make", [ppo, lambda: PPORPELoss(gaussian_actor(), heads_critic())])
     def test_it_needs_an_action_value(self, make):
-        with pytest.raises(TypeError, match="trains no policy by an action value, as SAC"):
+        with pytest.raises(TypeError, match=r"in SAC, TD3 and DDPG, and L2C2Loss\[.* leave rel"):
             smooth(make()).relative()
 
 

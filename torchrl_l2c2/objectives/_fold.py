@@ -127,6 +127,11 @@ def make_part(
             self._watch.see_call(self, tensordict)
             self._warn_of_changed_base()
         if not self.folded:
+            if size is not None:
+                raise RuntimeError(
+                    f"{method.__name__} leaves out the penalty, and policy_regularizer would not "
+                    "make it relative to this term: call loss.fold() first."
+                )
             self._watch.see_part(self, kind)
             return out
         regularize = self.policy_regularizer if kind == "policy" else self.value_regularizer

@@ -360,6 +360,8 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
 
         Raises:
             TypeError: the loss has no action value that trains a policy, as in PPO.
+            RuntimeError: in use, a method such as ``actor_loss`` is called by itself, and the
+                penalty is not folded.
 
         Examples:
             >>> import torch
@@ -373,8 +375,8 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         values = set(self.value_networks()) - {"critic_network"}
         if not self.policy_networks() or not values:
             raise TypeError(
-                f"{type(self).__name__} trains no policy by an action value, as SAC, TD3 and DDPG "
-                "do: its penalty cannot be relative to one."
+                "a penalty can be relative to action values that train a policy, as in SAC, TD3 "
+                f"and DDPG, and {type(self).__name__} has none: leave relative out."
             )
         self._relative = True
         return self

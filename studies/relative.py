@@ -1,0 +1,57 @@
+"""The table of ``results/relative.md``: presets with and without ``relative=True``."""
+
+from __future__ import annotations
+
+from studies.cells import number_range
+from studies.field import TEST
+from studies.files import records
+from studies.td3 import failures
+from torchrl_l2c2.experiment.analysis.reports.groups import Group, group_records
+from torchrl_l2c2.experiment.analysis.reports.statistics import mean
+from torchrl_l2c2.experiment.analysis.reports.table import Estimate, improvement_cell, pipe_table
+
+SHAKES = 0.2
+"""Action variation above which a policy of InvertedDoublePendulum shakes."""
+
+
+def table() -> str:
+    """Every setting by the last policy, with mean actions, compared with the preset."""
+    columns = ["task", "algorithm", "setting", "seeds", "return", "P(returns more)", "failed"]
+    rows = [[*columns, "action variation", "P(smoother)", "Sm"]]
+    groups = group_records(records("relative"))
+    presets = {_method(group): group for group in groups if is_preset(group)}
+    for group in groups:
+        task, algorithm, _ = _method(group)
+        preset = presets[_method(group)]
+        better = [""] * 2
+        if group is not preset:
+            quantities = ("return", "action_variation")
+            better = [improvement_cell([group], [preset], TEST, each) for each in quantities]
+        cells = [task, algorithm, group.name + (" (the preset)" if group is preset else "")]
+        cells += [number_range(group.seeds), _estimate(group, "return", "{:.1f}"), better[0]]
+        cells += [f"{failed(group)} of {len(group.seeds)}"]
+        cells += [_estimate(group, "action_variation", "{:.3f}"), better[1]]
+        rows.append([*cells, _estimate(group, "sm_asap", "{:.3f}")])
+    return pipe_table(rows)
+
+
+def is_preset(group: Group) -> bool:
+    """Checks whether a group has the settings of the preset before these runs."""
+    return group.first.method != "l2c2_ramp" and "regularizer.relative" not in group.settings
+
+
+def _method(group: Group) -> tuple[str, str, str]:
+    """The task, the algorithm and the method, without its settings."""
+    return group.first.task, group.first.algorithm, group.first.method.removesuffix("_ramp")
+
+
+def failed(group: Group) -> int:
+    """The number of runs that fail or, on InvertedDoublePendulum, shake."""
+    if group.first.task == "InvertedDoublePendulum-v5":
+        return int((group.scores(TEST, "action_variation") > SHAKES).sum())
+    return failures(group)
+
+
+def _estimate(group: Group, quantity: str, form: str) -> str:
+    found = Estimate.of(mean, group.scores(TEST, quantity))
+    return "" if found is None else found.text(form.format)
