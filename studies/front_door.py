@@ -2,8 +2,8 @@
 
 ``python -m studies.front_door FILE.csv`` makes 10 seeds of each on Pendulum, and adds a line to the
 file after each run; runs that the file has are skipped. The loops are like TorchRL's own scripts,
-which sum the losses by name. With the regularizer they have two lines more: ``smooth`` and
-``set_progress``.
+which sum the losses by name. With the regularizer they have a line more, ``smooth``, and with PPO
+a second one, ``set_progress``.
 """
 
 from __future__ import annotations
@@ -59,9 +59,7 @@ def train_sac(
     collector = Collector(
         env, actor, frames_per_batch=50, total_frames=frames, init_random_frames=500
     )
-    for number, collected in enumerate(collector):
-        if strength is not None:
-            loss.set_progress(50 * number / frames)
+    for collected in collector:
         replay.extend(collected)
         for _ in range(25 if len(replay) >= 500 else 0):
             terms = loss(replay.sample())
@@ -97,9 +95,7 @@ def train_td3(
         total_frames=frames,
         init_random_frames=500,
     )
-    for number, collected in enumerate(collector):
-        if strength is not None:
-            loss.set_progress(50 * number / frames)
+    for collected in collector:
         replay.extend(collected)
         for update in range(50 if len(replay) >= 500 else 0):
             batch = replay.sample()

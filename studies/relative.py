@@ -18,7 +18,7 @@ def table() -> str:
     """Every setting by the last policy, with mean actions, compared with the preset."""
     columns = ["task", "algorithm", "setting", "seeds", "return", "P(returns more)", "failed"]
     rows = [[*columns, "action variation", "P(smoother)", "Sm"]]
-    groups = group_records(records("relative"))
+    groups = group_records(records("relative").query("seed >= 100"))
     presets = {_method(group): group for group in groups if is_preset(group)}
     for group in groups:
         task, algorithm, _ = _method(group)
@@ -27,7 +27,7 @@ def table() -> str:
         if group is not preset:
             quantities = ("return", "action_variation")
             better = [improvement_cell([group], [preset], TEST, each) for each in quantities]
-        cells = [task, algorithm, group.name + (" (the preset)" if group is preset else "")]
+        cells = [task, algorithm, group.name + (" (the preset before)" if group is preset else "")]
         cells += [number_range(group.seeds), _estimate(group, "return", "{:.1f}"), better[0]]
         cells += [f"{failed(group)} of {len(group.seeds)}"]
         cells += [_estimate(group, "action_variation", "{:.3f}"), better[1]]

@@ -19,16 +19,23 @@ FAILED = -300.0
 STRENGTHS = (1.0, 0.3, 0.1)
 METHODS = {"l2c2": "L2C2", "l2c2_ramp": "L2C2", "cats": "CATS", "caps": "CAPS"}
 FIRST_GAIN = {"L2C2": "lambda_min", "CATS": "lambda_temporal", "CAPS": "lambda_temporal"}
+RELATIVE = ", relative"
+"""Ends the names of methods whose penalty is relative to the action values."""
+
 SETTINGS = {
     "L2C2": "`lambda_min={:g}`, ramp",
     "CATS": "`lambda_temporal={:g}`, ramp",
     "CAPS": "`lambda_temporal={:g}`, `lambda_spatial={:g}`",
+    "L2C2, relative": "`lambda_min={:g}`",
 }
 GAINS = {"L2C2": (10.0,), "CATS": (3.0,), "CAPS": (1.0, 5.0)}
-"""Gains at strength 1."""
+"""Gains at strength 1 of the methods that the rule chooses for."""
 
-PRESETS = {"L2C2": 0.3, "CATS": 1.0, "CAPS": 1.0}
-"""Strengths of the presets, relative to these gains."""
+RELATIVE_GAINS = {"L2C2, relative": (0.04,)}
+"""Gains at strength 1 of the methods that :mod:`studies.relative` compares."""
+
+PRESETS = {"L2C2": ("L2C2, relative", 1.0), "CATS": ("CATS", 1.0), "CAPS": ("CAPS", 1.0)}
+"""The settings of the presets: a method above and its strength."""
 
 Setting = tuple[str, float]
 """A method and its strength; ``("baseline", 0.0)`` for the baseline."""
@@ -46,7 +53,12 @@ def name(setting: Setting) -> str:
     method, strength = setting
     if setting == BASELINE:
         return method
-    return f"{method}, {SETTINGS[method].format(*(strength * gain for gain in GAINS[method]))}"
+    gains = (strength * gain for gain in _gains(method))
+    return f"{method}, {SETTINGS[method].format(*gains)}"
+
+
+def _gains(method: str) -> tuple[float, ...]:
+    return (GAINS | RELATIVE_GAINS)[method]
 
 
 def by_setting(runs: pd.DataFrame) -> dict[Setting, Group]:
@@ -58,8 +70,10 @@ def by_setting(runs: pd.DataFrame) -> dict[Setting, Group]:
             method = METHODS[group.first.method]
             gain = float(group.settings[f"regularizer.{FIRST_GAIN[method]}"])
             gain *= float(group.settings.get("regularizer.strength", 1.0))
+            if "regularizer.relative" in group.settings:
+                method += RELATIVE
             # Relative to a constant: the preset, whose strength is 1, has changed.
-            setting = method, round(gain / GAINS[method][0], 6)
+            setting = method, round(gain / _gains(method)[0], 6)
         if setting in found:
             raise ValueError(f"Expected one setting of {name(setting)}, got two.")
         found[setting] = group
@@ -71,13 +85,14 @@ def test_table() -> str:
     groups = by_setting(records("td3").query("seed < 10"))
     columns = ["setting", "return", "failed", "action variation", "P(returns more)", "P(smoother)"]
     rows = [columns]
-    for setting in (BASELINE, *((m, s) for m in GAINS for s in STRENGTHS if (m, s) in groups)):
+    tried = ((m, s) for m in GAINS | RELATIVE_GAINS for s in STRENGTHS)
+    for setting in (BASELINE, *(each for each in tried if each in groups)):
         shown = name(setting)
-        if setting[0] in PRESETS and setting[1] == PRESETS[setting[0]]:
+        if setting in PRESETS.values():
             shown = f"**{shown}** (the preset)"
         rows.append([shown, *_cells(groups[setting], groups[BASELINE])])
     (again,) = group_records(records("td3_again"))
-    rows.append(["L2C2, the preset again, as `regularizer=l2c2`", *_cells(again, groups[BASELINE])])
+    rows.append(["L2C2, `lambda_min=3`, ramp, again", *_cells(again, groups[BASELINE])])
     return pipe_table(rows)
 
 

@@ -610,13 +610,13 @@ class TestTermsThatAreLeftOut:
         assert not told_by(lambda: self.parts(L2C2Loss(self.td3(), NEAR), ("policy", "value")))
         loss = L2C2Loss(self.td3(), NEAR, beta=0)
         assert not told_by(lambda: self.parts(loss, ("policy",), delay=1))
-        assert not told_by(lambda: self.parts(smooth(self.td3(), ramp=None), delay=1))
+        assert not told_by(lambda: self.parts(smooth(self.td3()), delay=1))
 
     def test_loops_that_call_parts_get_the_warnings_of_other_loops(self):
         """Once each: a ramp without progress, n-step returns, a changed base loss."""
         base, batch = self.td3(), batch_of(4)
         batch["steps_to_next_obs"] = torch.full((4,), 3)
-        loss = smooth(base)
+        loss = smooth(base, ramp=1.0)
         base.make_value_estimator(gamma=0.5)
 
         def loop(steps):
@@ -631,7 +631,7 @@ class TestTermsThatAreLeftOut:
 
     def test_parts_within_a_forward_are_not_counted_again(self):
         """TD3's forward calls both."""
-        loss, batch = smooth(self.td3()), batch_of(4)
+        loss, batch = smooth(self.td3(), ramp=1.0), batch_of(4)
         assert not told_by(lambda: [loss(batch) for _ in range(49)])
         assert len(told_by(lambda: loss(batch))) == 1
 

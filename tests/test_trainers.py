@@ -372,7 +372,7 @@ def td3_trained(strength: float) -> list[torch.Tensor]:
 
 def test_td3_trainer_trains_with_the_penalty():
     """The actor's gradient has the penalty's, by its strength; the critic's has not."""
-    (plain, critic), (once, same), (twice, _) = map(td3_trained, (0.0, 1.0, 2.0))
+    (plain, critic), (once, same), (twice, _) = map(td3_trained, (0.0, 10.0, 20.0))
     assert torch.equal(critic, same)
     assert (once - plain).norm() > 1e-3
     torch.testing.assert_close(twice - plain, 2 * (once - plain), rtol=1e-3, atol=1e-6)

@@ -117,13 +117,13 @@ PRESETS: dict[str, dict[str, Preset]] = {
             {
                 "policy_distance": "mean",
                 "neighbors": "line",
-                "lambda_min": 3.0,
-                "lambda_max": 300.0,
+                "lambda_min": 0.04,
+                "lambda_max": 4.0,
                 "beta": 0.0,
             },
-            ramp=1.0,
-            evidence="results/td3.md",
-            tasks="Pendulum",
+            relative=True,
+            evidence="results/relative.md",
+            tasks="Pendulum and InvertedDoublePendulum",
         ),
         "ppo_rpe": Preset(
             {"lambda_min": 0.01, "lambda_max": 1.0, "beta": 0.1},

@@ -41,10 +41,11 @@ def smooth(
     that sum terms by name, or all ``loss_*`` keys, need no change. The penalty is reported as
     ``penalty_*``.
 
-    The presets are in ``torchrl_l2c2.presets.PRESETS``. The gain of ``"l2c2"`` with PPO and
-    TD3, and of ``"cats"`` with every loss, rises with the progress of training: call
+    The presets are in ``torchrl_l2c2.presets.PRESETS``. The gain of ``"l2c2"`` with PPO, and
+    of ``"cats"`` with every loss, rises with the progress of training: call
     ``loss.set_progress(frames / total_frames)`` before the updates on every rollout. Without this
-    call the gain stays at its final value.
+    call the gain stays at its final value. The penalty of ``"l2c2"`` with TD3 is relative to the
+    size of the action values (:meth:`RegularizedLoss.relative`).
 
     Args:
         loss (LossModule): a loss with a policy that is trained on transitions.

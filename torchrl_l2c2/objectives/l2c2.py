@@ -285,8 +285,8 @@ class L2C2Loss(RegularizedLoss):
         if without_effect(type(base_loss), neighborhood.lambda_max):
             warnings.warn(
                 f"gains up to {neighborhood.lambda_max:g}, such as the paper's gains, had no "
-                f"measurable effect with losses like {type(base_loss).__name__}. Use smooth(loss), "
-                "or raise lambda_min and lambda_max.",
+                f"measurable effect with losses like {type(base_loss).__name__}, unless they were "
+                "relative to action values. Use smooth(loss), or raise lambda_min and lambda_max.",
                 stacklevel=2,
             )
 
