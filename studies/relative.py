@@ -15,7 +15,7 @@ SHAKES = 0.2
 
 
 def table() -> str:
-    """Every setting by the last policy, with mean actions, compared with the preset."""
+    """Every setting on the seeds that decide, by the last policy, compared with the preset."""
     columns = ["task", "algorithm", "setting", "seeds", "return", "P(returns more)", "failed"]
     rows = [[*columns, "action variation", "P(smoother)", "Sm"]]
     groups = group_records(records("relative").query("seed >= 100"))

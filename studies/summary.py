@@ -40,6 +40,7 @@ class Benchmark(NamedTuple):
         recorded (str): Name of the task in the records.
         method (str): Name of L2C2's settings in tables.
         length (str): Length of training in the records.
+        cats (str): Name of CATS with its preset in tables.
     """
 
     task: str
@@ -48,6 +49,7 @@ class Benchmark(NamedTuple):
     recorded: str
     method: str
     length: str
+    cats: str = "CATS"
 
 
 BENCHMARKS = (
@@ -71,6 +73,7 @@ BENCHMARKS = (
         "InvertedDoublePendulum-v5",
         "L2C2, means 0.04, relative",
         "50000 frames",
+        "CATS, relative, lambda_temporal=0.04",
     ),
     Benchmark("noisy Swingup", "PPO-RPE", "runs", "swingup", "L2C2", "350 episodes"),
     Benchmark("noisy Reacher", "PPO-RPE", "runs", "reacher", "L2C2", "4500 episodes"),
@@ -101,8 +104,8 @@ def with_cats() -> list[Pair]:
     found = []
     for each in BENCHMARKS:
         named = {group.name: group for group in group_records(_records(each))}
-        if "CATS" in named:
-            found.append((named["CATS"], named[each.method]))
+        if each.cats in named:
+            found.append((named[each.cats], named[each.method]))
     of_td3 = td3.by_setting(records("td3").query("seed < 10"))
     cats, ours = (of_td3[td3.PRESETS[method]] for method in ("CATS", "L2C2"))
     return [*found, (cats, ours)]

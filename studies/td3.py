@@ -27,14 +27,19 @@ SETTINGS = {
     "CATS": "`lambda_temporal={:g}`, ramp",
     "CAPS": "`lambda_temporal={:g}`, `lambda_spatial={:g}`",
     "L2C2, relative": "`lambda_min={:g}`",
+    "CATS, relative": "`lambda_temporal={:g}`",
 }
 GAINS = {"L2C2": (10.0,), "CATS": (3.0,), "CAPS": (1.0, 5.0)}
 """Gains at strength 1 of the methods that the rule chooses for."""
 
-RELATIVE_GAINS = {"L2C2, relative": (0.04,)}
+RELATIVE_GAINS = {"L2C2, relative": (0.04,), "CATS, relative": (0.04,)}
 """Gains at strength 1 of the methods that :mod:`studies.relative` compares."""
 
-PRESETS = {"L2C2": ("L2C2, relative", 1.0), "CATS": ("CATS", 1.0), "CAPS": ("CAPS", 1.0)}
+PRESETS = {
+    "L2C2": ("L2C2, relative", 1.0),
+    "CATS": ("CATS, relative", 1.0),
+    "CAPS": ("CAPS", 1.0),
+}
 """The settings of the presets: a method above and its strength."""
 
 Setting = tuple[str, float]

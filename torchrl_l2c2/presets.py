@@ -167,7 +167,10 @@ PRESETS: dict[str, dict[str, Preset]] = {
             tasks="Pendulum",
         ),
         "td3": Preset(
-            {"lambda_temporal": 3.0}, ramp=1.0, evidence="results/td3.md", tasks="Pendulum"
+            {"lambda_temporal": 0.04},
+            relative=True,
+            evidence="results/relative.md",
+            tasks="Pendulum and InvertedDoublePendulum",
         ),
         "ppo_rpe": Preset({"lambda_temporal": 0.1}, ramp=1.0),
     },

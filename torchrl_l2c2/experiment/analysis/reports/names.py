@@ -43,7 +43,8 @@ def name_with_settings(method: str, settings: Mapping[str, str]) -> tuple[str, s
 
     The name of L2C2 contains its distance and its gain, or the target of the gain. "L2C2" without
     them has the Hellinger distance and the gains of the paper. Every name contains a strength other
-    than 1, and whether the penalty is relative.
+    than 1, and whether the penalty is relative. The constant gain of a relative penalty is not in
+    the name.
 
     Args:
         method (str): The method's name.
@@ -60,7 +61,8 @@ def name_with_settings(method: str, settings: Mapping[str, str]) -> tuple[str, s
         'L2C2, mse, target 0.1'
         >>> name_with_settings("cats", {"regularizer.strength": "0.25"})[0]
         'CATS, strength=0.25'
-        >>> name_with_settings("cats", {"regularizer.relative": "true"})[0]
+        >>> own = {"regularizer.relative": "true", "regularizer.gain": "constant"}
+        >>> name_with_settings("cats", own)[0]
         'CATS, relative'
     """
     own = {name.removeprefix("regularizer."): value for name, value in settings.items()}
@@ -68,6 +70,8 @@ def name_with_settings(method: str, settings: Mapping[str, str]) -> tuple[str, s
     if own.get("relative") == "true":
         name += ", relative"
         contained.add("relative")
+        if own.get("gain") == "constant":
+            contained.add("gain")
     strength = float(own.get("strength", 1.0))
     if strength != 1.0:
         name += f", strength={strength:g}"
