@@ -46,6 +46,7 @@ PAPERS = [
     "regularizer.beta=0.1",
     "regularizer.neighbors=line",
     "regularizer.gain=constant",
+    "regularizer.relative=false",
 ]
 RUNS = {
     "ppo_rpe": [*SWINGUP, "regularizer=none"],
