@@ -790,7 +790,9 @@ class TestProse:
             shown[each].scores("last_mean", "action_variation").mean()
             for each in (td3.PRESETS["L2C2"], td3.BASELINE)
         )
-        assert td3.failures(shown[td3.PRESETS["L2C2"]]) == 2
+        ours = shown[td3.PRESETS["L2C2"]].runs.set_index("seed")
+        poor = ours[ours["last_mean_return"] < td3.FAILED]["late_mean_return"].round()
+        assert poor.to_dict() == {4: -166, 8: -143}
         assert f"by {1 - smooth / rough:.0%}, from {rough:.3f} to {smooth:.3f}" in page
         (again,) = group_records(records("td3_again"))
         assert again.seeds == list(range(10)) and td3.failures(again) == 1
