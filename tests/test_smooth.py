@@ -25,7 +25,7 @@ from losses import (
     transitions,
 )
 from torch import nn
-from torchrl.modules import ValueOperator
+from torchrl.modules import Actor, ValueOperator
 from torchrl.objectives import (
     BCLoss,
     ClipPPOLoss,
@@ -869,6 +869,16 @@ class TestRelative:
             torch.testing.assert_close(ours[name], gradient * size, rtol=1e-4, atol=1e-6)
 
 
+class BreaksGraphs(nn.Linear):
+    """A network at whose condition on values ``torch.compile`` breaks the graph."""
+
+    def __init__(self):
+        super().__init__(3, 2)
+
+    def forward(self, states):
+        return super().forward(2 * states if states.abs().max() > 1e6 else states)
+
+
 class TestRelativeParts:
     @pytest.mark.parametrize(("make", "method"), [(td3, "actor_loss"), (ddpg, "loss_actor")])
     def test_methods_of_the_loss_have_it(self, make, method):
@@ -891,6 +901,32 @@ class TestRelativeParts:
         loss(batch.copy())
         with pytest.raises(RuntimeError, match=r"actor_loss leaves out .* call loss\.fold\(\)"):
             loss.actor_loss(batch.copy())
+
+        with pytest.raises(RuntimeError, match=r"actor_loss leaves out"):
+            torch.compile(loss.actor_loss, backend="eager")(batch.copy())
+
+    @pytest.mark.parametrize("relative", [False, True])
+    def test_a_break_of_the_graph_changes_nothing(self, relative):
+        """The penalty is added once, and has its size, where compiled code calls eager code."""
+        torch._dynamo.reset()
+        base = seeded(lambda: TD3Loss(Actor(BreaksGraphs()), qvalue(), bounds=(-1, 1)))
+        loss = smooth(base, "cats", lambda_temporal=1.0, ramp=None, relative=relative)
+        batch = seeded(transitions, 12, seed=1)
+        expected = seeded(loss, batch.copy(), seed=2)
+        found = seeded(torch.compile(loss, backend="eager"), batch.copy(), seed=2)
+        for key in ("loss_actor", "penalty_cats"):
+            torch.testing.assert_close(found[key], expected[key])
+        part = torch.compile(loss.actor_loss, backend="eager")
+        value, metadata = seeded(part, batch.copy(), seed=2)
+        torch.testing.assert_close(value, expected["loss_actor"])
+        torch.testing.assert_close(metadata["penalty_cats"], expected["penalty_cats"])
+
+    def test_small_relative_gains_are_not_said_to_have_no_effect(self):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            smooth(td3(), lambda_min=0.01, lambda_max=1.0)
+        with pytest.warns(UserWarning, match="no measurable effect"):
+            smooth(td3(), lambda_min=0.01, lambda_max=1.0, relative=False)
 
     @pytest.mark.parametrize("make", [sac, td3, ddpg])
     def test_it_compiles_into_one_graph(self, make):

@@ -107,7 +107,11 @@ def smooth(
     check_evaluates_states(loss)
     chosen = _chosen(loss, method, overrides)
     make = getattr(objectives, METHODS[method])
-    regularized = make(loss, **_arguments(method, make, chosen.settings))
+    arguments = _arguments(method, make, chosen.settings)
+    with warnings.catch_warnings():
+        if chosen.relative:  # The size of such a gain says nothing.
+            warnings.filterwarnings("ignore", "gains up to .* had no measurable effect")
+        regularized = make(loss, **arguments)
     regularized.regularizer_gain = strength
     if chosen.ramp is not None:
         regularized.ramp(chosen.ramp, end=strength)

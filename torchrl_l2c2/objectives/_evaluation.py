@@ -341,9 +341,10 @@ def _split(
     return out.split(parts, dim)
 
 
+@torch.compiler.assume_constant_result  # Dynamo does not trace get_ident.
 def _thread() -> int:
-    # get_ident does not compile; it is not needed, as a pass begins and ends within a trace.
-    return 0 if is_compiling() else get_ident()
+    """The thread; after a graph break, eager code must find what compiled code has begun."""
+    return get_ident()
 
 
 class SharedEvaluation(LossMixin):

@@ -130,7 +130,8 @@ def make_part(
             if size is not None:
                 raise RuntimeError(
                     f"{method.__name__} leaves out the penalty, and policy_regularizer would not "
-                    "make it relative to this term: call loss.fold() first."
+                    "make it relative to this term: call loss.fold() first, or call loss(batch), "
+                    "which returns the penalty as a term of its own."
                 )
             self._watch.see_part(self, kind)
             return out

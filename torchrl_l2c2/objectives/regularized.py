@@ -348,7 +348,9 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         The second factor is detached. For SAC, TD3 and DDPG it is about the mean size of the action
         values. The same gains then suit rewards of any size, and the penalty is small while the
         action values are. Without it, rewards that are ten times as large need gains ten times as
-        large. TD3+BC (Fujimoto and Gu 2021, equation 5) divides the values by the same mean.
+        large. TD3+BC (Fujimoto and Gu 2021, equation 5) divides the values by the same mean. It
+        applies to the policy terms of all nested regularizers, and is a setting: the ``state_dict``
+        does not keep it.
 
         While all values are 0, as before the first reward, so is the penalty. Terms of value
         functions and predictors stay as they are: the loss of a value function grows with the
