@@ -13,6 +13,9 @@ from torchrl_l2c2.experiment.analysis.reports.table import Estimate, improvement
 SHAKES = 0.2
 """Action variation above which a policy of InvertedDoublePendulum shakes."""
 
+CHANGED = ("td3",)
+"""Algorithms whose presets changed by these runs."""
+
 
 def table() -> str:
     """Every setting on the seeds that decide, by the last policy, compared with the preset."""
@@ -27,7 +30,8 @@ def table() -> str:
         if group is not preset:
             quantities = ("return", "action_variation")
             better = [improvement_cell([group], [preset], TEST, each) for each in quantities]
-        cells = [task, algorithm, group.name + (" (the preset before)" if group is preset else "")]
+        mark = " (the preset before)" if algorithm in CHANGED else " (the preset)"
+        cells = [task, algorithm, group.name + (mark if group is preset else "")]
         cells += [number_range(group.seeds), _estimate(group, "return", "{:.1f}"), better[0]]
         cells += [f"{failed(group)} of {len(group.seeds)}"]
         cells += [_estimate(group, "action_variation", "{:.3f}"), better[1]]

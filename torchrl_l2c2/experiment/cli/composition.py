@@ -43,7 +43,11 @@ PACKAGE = Path(__file__).parents[2]
 CONF = next(folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if folder.is_dir())
 
 # Other names that users may type.
-ALIASES = {"method": ["regularizer"], "methods": ["regularizer"]}
+ALIASES = {
+    "method": ["regularizer"],
+    "methods": ["regularizer"],
+    "regularizer.ramp": ["regularizer.gain=ramp"],
+}
 
 
 def register() -> None:
@@ -275,6 +279,8 @@ def unknown_setting(name: str) -> str:
         'sigma is not a setting; did you mean regularizer.sigma? --help lists every setting.'
         >>> unknown_setting("methods")
         'methods is not a setting; did you mean regularizer? --help lists every setting.'
+        >>> unknown_setting("regularizer.ramp").partition("; ")[2]
+        'did you mean regularizer.gain=ramp? --help lists every setting.'
     """
     group, _, setting = name.partition(".")
     settings = {
