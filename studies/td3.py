@@ -29,11 +29,17 @@ SETTINGS = {
     "L2C2, relative": "`lambda_min={:g}`",
     "CATS, relative": "`lambda_temporal={:g}`",
 }
-GAINS = {"L2C2": (10.0,), "CATS": (3.0,), "CAPS": (1.0, 5.0)}
-"""Gains at strength 1 of the methods that the rule chooses for."""
+CHOSEN = ("L2C2", "CATS", "CAPS")
+"""The methods whose strengths the rule of the page chooses."""
 
-RELATIVE_GAINS = {"L2C2, relative": (0.04,), "CATS, relative": (0.04,)}
-"""Gains at strength 1 of the methods that :mod:`studies.relative` compares."""
+GAINS = {
+    "L2C2": (10.0,),
+    "CATS": (3.0,),
+    "CAPS": (1.0, 5.0),
+    "L2C2, relative": (0.04,),
+    "CATS, relative": (0.04,),
+}
+"""Gains at strength 1."""
 
 PRESETS = {
     "L2C2": ("L2C2, relative", 1.0),
@@ -58,12 +64,7 @@ def name(setting: Setting) -> str:
     method, strength = setting
     if setting == BASELINE:
         return method
-    gains = (strength * gain for gain in _gains(method))
-    return f"{method}, {SETTINGS[method].format(*gains)}"
-
-
-def _gains(method: str) -> tuple[float, ...]:
-    return (GAINS | RELATIVE_GAINS)[method]
+    return f"{method}, {SETTINGS[method].format(*(strength * gain for gain in GAINS[method]))}"
 
 
 def by_setting(runs: pd.DataFrame) -> dict[Setting, Group]:
@@ -78,7 +79,7 @@ def by_setting(runs: pd.DataFrame) -> dict[Setting, Group]:
             if "regularizer.relative" in group.settings:
                 method += RELATIVE
             # Relative to a constant: the preset, whose strength is 1, has changed.
-            setting = method, round(gain / _gains(method)[0], 6)
+            setting = method, round(gain / GAINS[method][0], 6)
         if setting in found:
             raise ValueError(f"Expected one setting of {name(setting)}, got two.")
         found[setting] = group
@@ -90,8 +91,7 @@ def test_table() -> str:
     groups = by_setting(records("td3").query("seed < 10"))
     columns = ["setting", "return", "failed", "action variation", "P(returns more)", "P(smoother)"]
     rows = [columns]
-    tried = ((m, s) for m in GAINS | RELATIVE_GAINS for s in STRENGTHS)
-    for setting in (BASELINE, *(each for each in tried if each in groups)):
+    for setting in (BASELINE, *((m, s) for m in GAINS for s in STRENGTHS if (m, s) in groups)):
         shown = name(setting)
         if setting in PRESETS.values():
             shown = f"**{shown}** (the preset)"
@@ -120,7 +120,7 @@ def failures(group: Group) -> int:
 def chosen(groups: Mapping[Setting, Group]) -> dict[str, float]:
     """The strength of each method by the rule of the page."""
     found = {}
-    for method in GAINS:
+    for method in CHOSEN:
         tried = [strength for strength in STRENGTHS if (method, strength) in groups]
         kept = [strength for strength in tried if qualifies(groups, (method, strength))]
         found[method] = min(
@@ -142,7 +142,7 @@ def last_policy_table() -> str:
     groups = by_setting(records("td3").query("seed >= 110"))
     columns = ["setting", "seeds", "mean return", "failed", "mean action variation", "qualifies"]
     rows = [columns]
-    for setting in (BASELINE, *((m, s) for m in GAINS for s in STRENGTHS)):
+    for setting in (BASELINE, *((m, s) for m in CHOSEN for s in STRENGTHS)):
         group = groups[setting]
         cells = [str(len(group.seeds)), f"{_mean(group, 'return'):.1f}", str(failures(group))]
         cells.append(f"{_mean(group, 'action_variation'):.3f}")

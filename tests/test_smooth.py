@@ -253,7 +253,7 @@ LOOPS = {
     "Isaac Lab": (ppo, on_policy, isaac_lab_loop),
 }
 # The losses whose preset is relative to the action values, or that have none.
-OTHERS = ("TD3", "DDPG", "Trainer with TD3", "IQL")
+WITH_GIVEN_GAINS = ("TD3", "DDPG", "Trainer with TD3", "IQL")
 # The loops that train no value function.
 CLONING = ("CQL, cloning", "CQL, cloning by name")
 
@@ -268,7 +268,7 @@ class TestLoops:
 
     def losses(self, name, **overrides):
         make, batch, loop = LOOPS[name]
-        given = GIVEN | {"beta": 0.0, "relative": False} if name in OTHERS else {}
+        given = GIVEN | {"beta": 0.0, "relative": False} if name in WITH_GIVEN_GAINS else {}
         given = {**given, **overrides}
         base = seeded(make)
         folded, separate = (smooth(seeded(make), fold=fold, **given) for fold in (True, False))
@@ -404,8 +404,14 @@ FOLDED = {
     "QMixer": {"loss": ["local_value"]},
 }
 # Wide and strong, so that a penalty is well above the rounding of the loss's own term.
-WIDE = {"sigma": 1.0, "lambda_min": 2.0, "lambda_max": 20.0, "beta": 0.5}
-WIDE |= {"ramp": None, "relative": False}
+WIDE = {
+    "sigma": 1.0,
+    "lambda_min": 2.0,
+    "lambda_max": 20.0,
+    "beta": 0.5,
+    "ramp": None,
+    "relative": False,
+}
 
 
 @pytest.mark.filterwarnings("ignore")
