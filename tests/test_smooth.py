@@ -934,6 +934,24 @@ class TestRelativeParts:
         with pytest.warns(UserWarning, match="no measurable effect"):
             smooth(td3(), lambda_min=0.01, lambda_max=1.0, relative=False)
 
+    @pytest.mark.parametrize(
+        ("method", "given"),
+        [
+            ("l2c2", {"lambda_min": 3.0, "lambda_max": 300.0}),
+            ("l2c2", {"neighborhood": Neighborhood(lambda_min=3.0, lambda_max=300.0)}),
+            ("cats", {"lambda_temporal": 3.0}),
+        ],
+    )
+    def test_a_gain_of_an_absolute_penalty_is_named(self, method, given):
+        """A gain from before the presets were relative would be 75 times the preset's."""
+        with pytest.warns(UserWarning, match=r"=3 is 75 times the gain .* add relative=False"):
+            smooth(td3(), method, **given)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            smooth(td3(), method, **given, relative=False)
+            smooth(td3(), method, **given, relative=True)
+            smooth(sac(), method, **given)
+
     @pytest.mark.parametrize("make", [sac, td3, ddpg])
     def test_it_compiles_into_one_graph(self, make):
         torch._dynamo.reset()

@@ -26,6 +26,9 @@ from torchrl_l2c2.presets import (
     preset,
 )
 
+_MUCH = 10
+"""Ratio to the preset's gain from which a gain is taken for one of an absolute penalty."""
+
 
 def smooth(
     loss: LossModule,
@@ -73,7 +76,8 @@ def smooth(
         ValueError: the method is unknown, or a value is out of its range.
 
     Warns:
-        UserWarning: the preset was tuned with a similar loss, or was not tuned.
+        UserWarning: the preset was tuned with a similar loss, or was not tuned; or its penalty is
+            relative, and the given gain is more than ten times its gain.
 
     Examples:
         >>> import torch
@@ -140,7 +144,24 @@ def _chosen(loss: LossModule, method: str, overrides: Mapping[str, Any]) -> Pres
             f"{chosen.tasks}, and not tried with {name}.",
             stacklevel=3,
         )
+    _warn_of_absolute_gain(method, chosen, overrides)
     return chosen.overridden(overrides)
+
+
+def _warn_of_absolute_gain(method: str, chosen: Preset, overrides: Mapping[str, Any]) -> None:
+    """Warns of a gain that suits an absolute penalty, if the preset's is relative."""
+    name = GAIN_SETTING[method]
+    gain = overrides.get(name, getattr(overrides.get("neighborhood"), name, None))
+    if not chosen.relative or "relative" in overrides or not isinstance(gain, int | float):
+        return
+    times = gain / chosen.settings[name]
+    if times > _MUCH:
+        warnings.warn(
+            f"{name}={gain:g} is {times:.0f} times the gain of the preset, whose penalty is "
+            "relative to the size of the action values. If the gain is not meant so, add "
+            "relative=False.",
+            stacklevel=4,
+        )
 
 
 def _of_nearest(loss: LossModule, method: str, overrides: Mapping[str, Any]) -> Preset:
