@@ -43,7 +43,6 @@ from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.modules import (
     Actor,
     BatchRenorm1d,
-    LSTMModule,
     MaskedCategorical,
     NormalParamExtractor,
     ProbabilisticActor,
@@ -508,21 +507,6 @@ class TestWhatIsRefused:
         for within in (loss, LCPLoss(loss)):
             with pytest.raises(TypeError, match=r"^Imitation is not trained on transitions"):
                 L2C2Loss(within, beta=0.0)
-
-    def test_recurrent_policies(self):
-        """A policy with a hidden state has no value at a neighbor alone."""
-        lstm = LSTMModule(input_size=OBSERVATION, hidden_size=4, in_key="observation", out_key="h")
-        head = TensorDictModule(
-            nn.Sequential(mlp(4, 2 * ACTION), NormalParamExtractor()), ["h"], ["loc", "scale"]
-        )
-        actor = ProbabilisticActor(
-            TensorDictSequential(lstm, head),
-            in_keys=["loc", "scale"],
-            distribution_class=TanhNormal,
-            return_log_prob=True,
-        )
-        with pytest.raises(TypeError, match="actor_network is recurrent"):
-            L2C2Loss(PPOLoss(actor, critic()))
 
     @pytest.mark.parametrize("inside", [nn.GRUCell(OBSERVATION, 1), nn.LSTM(OBSERVATION, 1)])
     def test_recurrent_policies_of_torchs_own_layers(self, inside):

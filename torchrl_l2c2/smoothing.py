@@ -54,7 +54,8 @@ def smooth(
         loss (LossModule): a loss with a policy that is trained on transitions.
         method (str): the regularizer: ``"l2c2"``, ``"caps"``, ``"cats"``, ``"grad_caps"``,
             ``"asap"``, ``"lcp"`` or ``"sr2l"``. ``grad_caps`` and ``asap`` need the observation
-            before each state in the batch. Defaults to ``"l2c2"``.
+            before each state in the batch, and a policy that is not recurrent. Defaults to
+            ``"l2c2"``.
         strength (float): factor of the penalty, at least 0. Larger values smooth more; too large
             values lower the return. 0 leaves the loss's values and gradients unchanged, if the
             penalty is finite. Defaults to ``1.0``, the preset.

@@ -130,6 +130,31 @@ def find_transitions(
     return {key: pairs[key] for key in keys if key in pairs}
 
 
+def find_recurrent(
+    tensordict: TensorDictBase, keys: Iterable[NestedKey]
+) -> dict[NestedKey, tuple[Tensor, Tensor]]:
+    """Finds the recurrent states of a batch, before and after each step, detached.
+
+    Args:
+        tensordict (TensorDictBase): the batch, ``[*B]``.
+        keys: keys of the recurrent states, and of ``is_init``.
+
+    Returns:
+        dict: pairs by key, ``[*B, *F]`` each.
+
+    Raises:
+        KeyError: the batch lacks an entry.
+    """
+    wanted = [each for key in keys for each in (key, next_key(key))]
+    if lacking := [key for key in wanted if tensordict.get(key, None) is None]:
+        raise KeyError(
+            f"the policy is recurrent, and its next action needs {lacking}, which the batch does "
+            "not have: keep them, or choose a regularizer that needs no next action, such as l2c2."
+        )
+    found = tensordict.select(*wanted).detach()
+    return {key: (found.get(key), found.get(next_key(key))) for key in keys}
+
+
 def find_states(
     tensordict: TensorDictBase, keys: Iterable[NestedKey], network: str
 ) -> dict[NestedKey, Tensor]:

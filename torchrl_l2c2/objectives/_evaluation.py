@@ -15,6 +15,7 @@ from torch.compiler import is_compiling
 from torch.distributions import Distribution, Independent
 from torch.nn.modules.dropout import _DropoutNd
 from torchrl.envs.utils import set_exploration_type
+from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import _vmap_func
 
@@ -174,6 +175,7 @@ class EvaluatedNetworks:
         an older policy, and those at other states are of the present one.
         Nor are they if the network normalizes by its batch, or keeps running statistics: only the
         states of one evaluation are normalized alike.
+        Nor are they if the network is recurrent: the loss evaluates sequences of states.
         Compiled losses evaluate small batches together with the other states, if these are known.
         This changes the rounding, as compiling does; eager losses do not do it.
         """
@@ -283,6 +285,11 @@ class EvaluatedNetworks:
     ) -> TensorDictBase:
         """A network's inputs at the batch's and the other states, ``[(1 + K) * B0, ...]``."""
         spec, batch = self.specs[network], tensordict.batch_size
+        if lacking := [key for key in spec.recurrent if tensordict.get(key, None) is None]:
+            raise KeyError(
+                f"{network} is recurrent, and the batch has no {lacking}: keep the recurrent state "
+                "of every step, and is_init (TensorDictPrimer and InitTracker write them)."
+            )
         # The batch's action may have a gradient of the behavior policy.
         inputs = tensordict.select(*spec.inputs, strict=False).detach()
         moved = {key: states.get(key, None) for key in spec.inputs}
@@ -312,7 +319,10 @@ class EvaluatedNetworks:
         run = net.get_dist_params if policy and self.specs[POLICY_NETWORK].stochastic else net
         dropout_off = without_dropout(net) if spec is None or spec.has_dropout else nullcontext()
         exploration = set_exploration_type(loss.deterministic_sampling_mode)
-        with exploration, in_full_precision(rows), dropout_off:
+        # Rows are single steps from the recurrent states of the batch.
+        recurrent = spec is not None and spec.recurrent
+        single_steps = set_recurrent_mode(False) if recurrent else nullcontext()
+        with exploration, single_steps, in_full_precision(rows), dropout_off:
             if params is None:
                 return run(rows)
             if not params.ndim:

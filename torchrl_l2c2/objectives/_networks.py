@@ -20,7 +20,8 @@ POLICY_NETWORK = "actor_network"
 VALUE_NETWORKS = ("critic_network", "qvalue_network", "value_network", "local_value_network")
 """Names of a loss's attributes with value functions."""
 
-RECURRENT = (LSTMModule, GRUModule, nn.RNNBase, nn.RNNCellBase)
+_STEPPING = (LSTMModule, GRUModule)
+"""Recurrent modules that can take a single step from a recurrent state in the batch."""
 
 # The vector of an ensemble, or of all actions, comes before the scalar computed from it.
 _VALUE_KEYS = ("value_heads", "state_action_value", "action_value", "value")
@@ -42,6 +43,7 @@ class NetworkSpec:
         rowwise: whether a row of the output depends only on the same row of the input, and on no
             random numbers.
         has_dropout: whether the network has dropout layers.
+        recurrent: inputs that carry the past, ``is_init`` among them; empty if feed-forward.
     """
 
     inputs: tuple[NestedKey, ...]
@@ -53,6 +55,7 @@ class NetworkSpec:
     has_buffers: bool
     rowwise: bool
     has_dropout: bool
+    recurrent: tuple[NestedKey, ...]
 
 
 def inspect_network(loss: LossModule, network: str) -> NetworkSpec:
@@ -63,12 +66,12 @@ def inspect_network(loss: LossModule, network: str) -> NetworkSpec:
         network (str): name of the network, such as ``"actor_network"``.
 
     Raises:
-        TypeError: the network is recurrent, does not declare its keys, or has several
-            distributions.
+        TypeError: the network is recurrent in another way than TorchRL's modules, does not declare
+            its keys, or has several distributions.
     """
     net, actor = getattr(loss, network), getattr(loss, POLICY_NETWORK, None)
     _check_declares_keys(net, network)
-    _check_not_recurrent(net, network)
+    recurrent = _recurrent_inputs(net, network)
     stochastic, actions, made = False, _action_keys(loss), set()
     if actor is not None:
         stochastic = _is_stochastic(actor)
@@ -79,11 +82,13 @@ def inspect_network(loss: LossModule, network: str) -> NetworkSpec:
             actions = [_unnamed_action(loss, actor, made)]
     trunk = [key for key in net.in_keys if key in made - set(actions)]
     inputs = dict.fromkeys([*net.in_keys, *(actor.in_keys if trunk and actor is not None else ())])
+    if trunk:
+        recurrent = (*recurrent, *_recurrent_inputs(actor, POLICY_NETWORK))
     if network == POLICY_NETWORK:
         output = next((key for key in actions if key in made), None)
     else:
         output = _value_key(loss, network)
-    computed = made.union(actions, _parents(made))
+    computed = made.union(actions, _parents(made), recurrent)
     return NetworkSpec(
         inputs=tuple(key for key in inputs if key not in trunk),
         states=tuple(key for key in inputs if key not in computed and not _is_private(key)),
@@ -92,8 +97,11 @@ def inspect_network(loss: LossModule, network: str) -> NetworkSpec:
         output=output,
         stochastic=stochastic,
         has_buffers=_has_buffers(loss, network),
-        rowwise=not any(isinstance(m, _BatchNorm | _DropoutNd) for m in net.modules()),
+        rowwise=not (
+            recurrent or any(isinstance(m, _BatchNorm | _DropoutNd) for m in net.modules())
+        ),
         has_dropout=any(isinstance(m, _DropoutNd) for m in net.modules()),
+        recurrent=tuple(dict.fromkeys(recurrent)),
     )
 
 
@@ -173,16 +181,27 @@ def _check_declares_keys(net: nn.Module, name: str) -> None:
         )
 
 
-def _check_not_recurrent(net: Any, name: str) -> None:
-    recurrent = any(isinstance(module, RECURRENT) for module in net.modules())
-    # A network that writes its own next input is recurrent, too.
+def _recurrent_inputs(net: Any, name: str) -> tuple[NestedKey, ...]:
+    """Inputs of recurrent modules that carry the past; refuses modules that cannot take one step.
+
+    Raises:
+        TypeError: a recurrent layer is not in an ``LSTMModule`` or ``GRUModule``, or the network
+            hands on another input to its next evaluation.
+    """
+    stepping = [module for module in net.modules() if isinstance(module, _STEPPING)]
+    known = {id(part) for module in stepping for part in module.modules()}
+    layers = (m for m in net.modules() if isinstance(m, nn.RNNBase | nn.RNNCellBase))
+    carried = [unravel_key(key) for module in stepping for key in module.in_keys[1:]]
     written = {unravel_key(key) for key in net.out_keys}
-    handed_on = any(unravel_key(("next", key)) in written for key in net.in_keys)
-    if recurrent or handed_on or "is_init" in net.in_keys:
+    others = set(net.in_keys) - set(carried)
+    handed_on = "is_init" in others or any(unravel_key(("next", key)) in written for key in others)
+    if handed_on or any(id(layer) not in known for layer in layers):
         raise TypeError(
             f"{name} is recurrent: its output depends on earlier states, and not only on the "
-            "current one. Only feed-forward networks can be regularized."
+            "current one. Use TorchRL's LSTMModule or GRUModule, whose recurrent states are in the "
+            "batch, or a feed-forward network."
         )
+    return tuple(carried)
 
 
 def parameters_of(loss: LossModule, network: str) -> TensorDictBase | None:

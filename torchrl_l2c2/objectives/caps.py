@@ -13,6 +13,7 @@ from torchrl.objectives import LossModule
 from torchrl_l2c2._checks import check_bool, check_choice, check_real
 from torchrl_l2c2.distances import squared_error
 from torchrl_l2c2.objectives._batch import at_rows, finite_successor, is_floating_point
+from torchrl_l2c2.objectives._networks import POLICY_NETWORK
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
 from torchrl_l2c2.policy_distances import policy_mean
 
@@ -141,10 +142,11 @@ class CAPSLoss(RegularizedLoss):
     ) -> TensorDictBase:
         """The next state and a noisy one, ``[2, *B]``."""
         states = TensorDict(batch_size=[2, *batch.batch_size])
+        recurrent = self.networks[POLICY_NETWORK].recurrent
         for key, (state, successor) in transitions.items():
             later = finite_successor(state, successor)
             noisy = state
-            if is_floating_point(state):
+            if is_floating_point(state) and key not in recurrent:
                 noisy = state + self.caps_sigma * torch.randn_like(state)
             states.set(key, torch.stack((later, noisy)))
         return states

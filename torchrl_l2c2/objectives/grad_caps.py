@@ -11,6 +11,7 @@ from torchrl.objectives import LossModule
 
 from torchrl_l2c2._checks import check_bool, check_choice, check_real, read_key
 from torchrl_l2c2.objectives._batch import at_rows, finite_successor, is_floating_point
+from torchrl_l2c2.objectives._networks import POLICY_NETWORK
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
 from torchrl_l2c2.policy_distances import policy_mean
 
@@ -85,8 +86,8 @@ class GradCAPSLoss(RegularizedLoss):
             ``False``.
 
     Raises:
-        TypeError: the loss has no policy or cannot be regularized, or an argument has the wrong
-            type.
+        TypeError: the loss has no policy or cannot be regularized, the policy is recurrent, or an
+            argument has the wrong type.
         ValueError: an argument is out of its range; in use, the policy reads several observations,
             or the frames are not two observations; in the first eager call, the second frame is not
             the state, or the next states are several steps away.
@@ -140,6 +141,12 @@ class GradCAPSLoss(RegularizedLoss):
         self._grad_caps_checked = False
         self.register_coefficient("grad_caps_lambda_temporal", lambda_temporal)
         self.declare_policy()
+        if self.networks[POLICY_NETWORK].recurrent:
+            raise TypeError(
+                f"{type(self).__name__.partition('[')[0]} compares the policy's action with the "
+                "action before, and no batch keeps the recurrent state before: choose another "
+                "regularizer for a recurrent policy."
+            )
         self.declare_terms(policy=["loss_grad_caps"], diagnostics=["grad_caps_counted"])
         self.declare_inputs([self.grad_caps_previous_key or self.grad_caps_frames_key])
 

@@ -24,6 +24,7 @@ from torchrl_l2c2.objectives._batch import (
     check_evaluates_states,
     check_reads_next,
     draw_rows,
+    find_recurrent,
     find_states,
     find_transitions,
     next_key,
@@ -91,10 +92,11 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
     methods compute the terms with :meth:`policies_at`, :meth:`values_at`, :meth:`transitions`,
     :meth:`reduce_term` and :meth:`scaled`. Regularizers can be nested.
 
-    .. note:: Recurrent policies and losses that are not trained on transitions are refused, as is a
-        network that draws random numbers in its forward pass (at its first evaluation).
-        Regularizers evaluate networks without dropout, and do not update running statistics of
-        normalization layers.
+    .. note:: Losses that are not trained on transitions are refused, as is a network that draws
+        random numbers in its forward pass (at its first evaluation). Regularizers evaluate networks
+        without dropout, and do not update running statistics of normalization layers. Recurrent
+        networks, made with ``LSTMModule`` or ``GRUModule``, take a single step from the recurrent
+        state in the batch; only the observation differs.
 
     Args:
         base_loss (LossModule): the loss.
@@ -579,8 +581,9 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             successors: whether they are also evaluated at next states.
 
         Raises:
-            TypeError: a network is recurrent, does not declare its keys, or has several
-                distributions; the loss reads no next states; or ``networks`` is a string.
+            TypeError: a network is recurrent in another way than TorchRL's modules, does not
+                declare its keys, or has several distributions; the loss reads no next states; or
+                ``networks`` is a string.
             ValueError: the loss has no network of that name.
         """
         networks = listed_names(networks)
@@ -735,17 +738,22 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         Args:
             tensordict: the batch, ``[*B]``.
             networks: names of declared networks.
-            labels: whether to include inputs that are not floating point, such as masks.
+            labels: whether to include everything that an evaluation at the next step needs: inputs
+                that are not floating point, such as masks, and recurrent states.
 
         Returns:
             Pairs of state and successor by key, ``[*B, *F]`` each, detached.
 
         Raises:
             TypeError: a network reads no floating-point state.
-            KeyError: no state that a network reads has a successor in the batch.
+            KeyError: no state that a network reads has a successor in the batch, or a recurrent
+                state has none.
         """
-        read = {name: self.networks[name].states for name in networks}
-        return find_transitions(tensordict, read, labels=labels)
+        specs = {name: self.networks[name] for name in networks}
+        read = {name: spec.states for name, spec in specs.items()}
+        found = find_transitions(tensordict, read, labels=labels)
+        recurrent = dict.fromkeys(key for spec in specs.values() for key in spec.recurrent)
+        return {**found, **find_recurrent(tensordict, recurrent)} if labels else found
 
     def policy_states(self, tensordict: TensorDictBase) -> dict[NestedKey, Tensor]:
         """Finds the floating-point states that the policy reads, ``[*B, *F]`` by key.
