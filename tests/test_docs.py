@@ -14,10 +14,17 @@ import pytest
 import torch
 from scipy.integrate import quad
 from tensordict import TensorDict
-from torchrl.objectives import SACLoss
+from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
+from torch import nn
+from torchrl.modules import (
+    IndependentNormal,
+    ProbabilisticActor,
+    ValueOperator,
+)
+from torchrl.objectives import ClipPPOLoss, SACLoss
 
 import torchrl_l2c2
-from torchrl_l2c2 import affinities
+from torchrl_l2c2 import affinities, smooth
 from torchrl_l2c2.experiment.analysis.diagnosis import diagnose_actions, findings
 from torchrl_l2c2.experiment.analysis.diagnosis.words import threshold
 from torchrl_l2c2.experiment.cli import diagnose as diagnose_command
@@ -98,6 +105,33 @@ def test_the_guide_shows_the_table_of_presets() -> None:
         assert kinds.keys() == KINDS.keys()
         for preset in kinds.values():
             assert preset.evidence is None or (ROOT / preset.evidence).exists()
+
+
+def test_the_function_without_torchrl_is_the_presets_penalty() -> None:
+    """With the same random numbers; the gains that the page names are those of the presets."""
+    page = FOLDER / "plain_pytorch.md"
+    defined = run_blocks(page)
+    mean, observation = defined["actor_mean"], torch.randn(32, 3)
+    successor, ended = observation + 0.1 * torch.randn(32, 3), torch.arange(32) % 5 == 0
+    done = ended.unsqueeze(-1)
+    batch = TensorDict({"observation": observation, "action": torch.zeros(32, 1)}, [32])
+    batch["next"] = {"observation": successor, "done": done, "terminated": done}
+    with_scale = nn.Sequential(mean, AddStateIndependentNormalScale(1))
+    actor = ProbabilisticActor(
+        TensorDictModule(with_scale, ["observation"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=IndependentNormal,
+    )
+    critic = ValueOperator(nn.Linear(3, 1), in_keys=["observation"])
+    loss = smooth(ClipPPOLoss(actor, critic), fold=False, ramp=None, skip_ends=True)
+    torch.manual_seed(0)
+    expected = loss.policy_regularizer(batch)["loss_l2c2_actor"]
+    torch.manual_seed(0)
+    torch.testing.assert_close(defined["l2c2"](mean, observation, successor, ended), expected)
+    for kind in ("ppo", "sac", "td3"):
+        chosen = PRESETS["l2c2"][kind].settings
+        gains = f"lambda_min={chosen['lambda_min']:g}", f"lambda_max={chosen['lambda_max']:g}"
+        assert re.search(r"(\.0)?, ".join(map(re.escape, gains)), page.read_text())
 
 
 def test_the_quickstart_is_the_notebook() -> None:

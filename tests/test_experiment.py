@@ -465,6 +465,17 @@ def test_a_run_from_the_command_line_leaves_everything_behind(tmp_path):
     assert "mean of the last 3 episodes: return " in finished.stderr
     assert "evaluate_every=1 has no effect: training is over" in again.stderr
     assert (run.folder / "learning_curves.png").exists()
+    # Without a length, the default would train it on and remove its results.
+    lengthless = [each for each in PENDULUM_OVERRIDES if not each.startswith("task.episodes")]
+    refused = run_train(*lengthless, folder=tmp_path, check=False)
+    assert refused.returncode == 1 and "Traceback" not in refused.stderr
+    assert "this run is finished, with task.episodes=3. Without a length" in refused.stderr
+    assert "task.episodes=350 to train on" in refused.stderr
+    assert (run.folder / "policy.pt").exists() and (run.folder / "evaluation.json").exists()
+    longer = run_train(*lengthless, "task.episodes=4", "test_episodes=0", folder=tmp_path)
+    said = "removed the results of the shorter run: evaluation.json, policy.pt, learning_curves.png"
+    assert said in longer.stdout + longer.stderr
+    assert said in (run.folder / "train.log").read_text()
 
 
 def test_without_a_terminal_there_are_a_few_plain_lines(tmp_path):
@@ -529,7 +540,7 @@ def test_a_sweep_gives_one_table(tmp_path):
     # Each says where the sweep stands, and how long the rest takes by those before.
     assert "run 1 of 4: Pendulum-v1, ppo_rpe, none, seed 0" in done.stdout
     assert "run 4 of 4, about 1 min left: Pendulum-v1, ppo_rpe, l2c2, seed 1" in done.stdout
-    assert "run 4 of 4, about 1 min left; episode 3 of 3" in done.stderr
+    assert "run 4 of 4; episode 3 of 3" in done.stderr
     # At the end of the sweep, of its own runs.
     _, table = done.stdout.split("**Last policy, mean actions**")
     assert table.count("| baseline | 2 |") == table.count("| L2C2 | 2 |") == 1

@@ -758,10 +758,13 @@ def test_a_typo_in_a_gains_name_is_told(name, gain):
     assert not told_by(others)
 
 
-@pytest.mark.parametrize("name", ["sigma", "lambda_min", "method", "fraction", "neighbors"])
+@pytest.mark.parametrize(
+    "name", ["sigma", "lambda_min", "l2c2_lambda_min", "method", "fraction", "neighbors"]
+)
 def test_a_setting_that_is_assigned_too_late_is_told(name):
     loss = L2C2Loss(base_loss(), NEAR)
-    with pytest.warns(UserWarning, match=f"assigning to it has no effect.* with {name}=0.5"):
+    setting = name.removeprefix("l2c2_")
+    with pytest.warns(UserWarning, match=f"assigning to it has no effect.* with {setting}=0.5"):
         setattr(loss, name, 0.5)
 
 

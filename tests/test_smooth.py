@@ -911,6 +911,19 @@ class TestRelativeParts:
         with pytest.raises(RuntimeError, match=r"actor_loss leaves out"):
             torch.compile(loss.actor_loss, backend="eager")(batch.copy())
 
+    def test_terms_without_their_size_are_named(self):
+        """Loops without ``forward`` would add them as they are."""
+        loss, batch = smooth(td3()), seeded(transitions, 12, seed=1)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            warnings.filterwarnings("ignore", "No target network updater")
+            loss(batch.copy())
+            loss.actor_loss(batch.copy())
+            loss.value_regularizer(batch.copy())
+            smooth(sac()).policy_regularizer(batch.copy())
+        with pytest.warns(UserWarning, match="does not know the size of the action values"):
+            loss.policy_regularizer(batch.copy())
+
     @pytest.mark.parametrize("relative", [False, True])
     def test_a_break_of_the_graph_changes_nothing(self, relative):
         """The penalty is added once, and has its size, where compiled code calls eager code."""
@@ -938,19 +951,41 @@ class TestRelativeParts:
         ("method", "given"),
         [
             ("l2c2", {"lambda_min": 3.0, "lambda_max": 300.0}),
-            ("l2c2", {"neighborhood": Neighborhood(lambda_min=3.0, lambda_max=300.0)}),
+            (
+                "l2c2",
+                {"neighborhood": Neighborhood(lambda_min=3.0, lambda_max=300.0, neighbors="line")},
+            ),
             ("cats", {"lambda_temporal": 3.0}),
         ],
     )
     def test_a_gain_of_an_absolute_penalty_is_named(self, method, given):
         """A gain from before the presets were relative would be 75 times the preset's."""
-        with pytest.warns(UserWarning, match=r"=3 is 75 times the gain .* add relative=False"):
+        with pytest.warns(UserWarning, match=r"=3 is 75 times the preset's gain, .* give both"):
             smooth(td3(), method, **given)
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             smooth(td3(), method, **given, relative=False)
-            smooth(td3(), method, **given, relative=True)
             smooth(sac(), method, **given)
+
+    @pytest.mark.parametrize(
+        ("make", "relative", "unit"),
+        [(td3, False, "relative to the action values"), (sac, True, "not relative")],
+    )
+    def test_relative_alone_needs_a_gain(self, make, relative, unit):
+        """The preset's gain has the other unit: it would do nothing, or far too much."""
+        with pytest.warns(UserWarning, match=f"is the preset's gain, which is {unit}: give both"):
+            smooth(make(), relative=relative)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            smooth(make(), relative=relative, lambda_min=0.5, lambda_max=50.0)
+
+    def test_a_neighborhood_of_other_neighbors_than_the_presets(self):
+        with pytest.warns(UserWarning, match="neighbors='box' .* replaces the preset's 'line'"):
+            smooth(sac(), neighborhood=Neighborhood(lambda_min=3.0, lambda_max=300.0))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            near = Neighborhood(lambda_min=3.0, lambda_max=300.0, neighbors="line")
+            smooth(sac(), neighborhood=near)
 
     @pytest.mark.parametrize("make", [sac, td3, ddpg])
     def test_it_compiles_into_one_graph(self, make):

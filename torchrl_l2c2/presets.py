@@ -199,6 +199,9 @@ GAIN_SETTING = {
 }
 """The setting required if there is no preset, by method."""
 
+# From this multiple of the preset's gain on, a gain is taken for one of an absolute penalty.
+_MUCH = 10
+
 # The largest gain of L2C2 that had no measurable effect with these kinds of losses.
 _PAPERS_LAMBDA_MAX = 1.0
 _WITHOUT_EFFECT = ("ppo", "sac", "td3")
@@ -250,6 +253,34 @@ def preset(method: str, kind: str) -> Preset:
     if kind not in KINDS:
         raise ValueError(f"Expected kind to be one of {list(KINDS)}, got {kind!r}.")
     return PRESETS[method][kind]
+
+
+def mixed_units(method: str, chosen: Preset, gain: float, relative: bool) -> str | None:
+    """Says why a gain probably does not suit ``relative``, which gives gains another unit.
+
+    Args:
+        method (str): one of :data:`METHODS`.
+        chosen (Preset): the preset that the settings replace.
+        gain (float): the setting named in :data:`GAIN_SETTING`.
+        relative (bool): whether the penalty is relative to the size of the action values.
+
+    Returns:
+        str: a clause, or ``None`` if nothing is wrong.
+
+    Examples:
+        >>> from torchrl_l2c2.presets import mixed_units, preset
+        >>> mixed_units("cats", preset("cats", "td3"), gain=3.0, relative=True)
+        "lambda_temporal=3 is 75 times the preset's gain, which is relative to the action values"
+    """
+    name = GAIN_SETTING[method]
+    usual = chosen.settings[name]
+    if relative != chosen.relative and gain == usual:
+        unit = "relative to the action values" if chosen.relative else "not relative"
+        return f"{name}={gain:g} is the preset's gain, which is {unit}"
+    if relative and chosen.relative and gain > _MUCH * usual:
+        times = f"{gain / usual:.0f} times the preset's gain"
+        return f"{name}={gain:g} is {times}, which is relative to the action values"
+    return None
 
 
 def without_effect(loss_class: type, lambda_max: float) -> bool:

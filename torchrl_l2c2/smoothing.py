@@ -23,11 +23,9 @@ from torchrl_l2c2.presets import (
     NEIGHBORHOOD_FIELDS,
     Preset,
     kind_of,
+    mixed_units,
     preset,
 )
-
-_MUCH = 10
-"""Ratio to the preset's gain from which a gain is taken for one of an absolute penalty."""
 
 
 def smooth(
@@ -77,8 +75,8 @@ def smooth(
         ValueError: the method is unknown, or a value is out of its range.
 
     Warns:
-        UserWarning: the preset was tuned with a similar loss, or was not tuned; or its penalty is
-            relative, and the given gain is more than ten times its gain.
+        UserWarning: the preset was tuned with a similar loss, or was not tuned; the gain probably
+            does not suit ``relative``; or ``neighborhood`` has other neighbors than the preset.
 
     Examples:
         >>> import torch
@@ -145,24 +143,26 @@ def _chosen(loss: LossModule, method: str, overrides: Mapping[str, Any]) -> Pres
             f"{chosen.tasks}, and not tried with {name}.",
             stacklevel=3,
         )
-    _warn_of_absolute_gain(method, chosen, overrides)
+    _warn_of_units(method, chosen, overrides)
     return chosen.overridden(overrides)
 
 
-def _warn_of_absolute_gain(method: str, chosen: Preset, overrides: Mapping[str, Any]) -> None:
-    """Warns of a gain that suits an absolute penalty, if the preset's is relative."""
-    name = GAIN_SETTING[method]
-    gain = overrides.get(name, getattr(overrides.get("neighborhood"), name, None))
-    if not chosen.relative or "relative" in overrides or not isinstance(gain, int | float):
-        return
-    times = gain / chosen.settings[name]
-    if times > _MUCH:
+def _warn_of_units(method: str, chosen: Preset, overrides: Mapping[str, Any]) -> None:
+    """Warns of a neighborhood or a gain that probably does not suit the preset."""
+    name, near = GAIN_SETTING[method], overrides.get("neighborhood")
+    kind = getattr(near, "neighbors", None)
+    usual = chosen.settings.get("neighbors", kind)
+    if kind is not None and kind != usual:
         warnings.warn(
-            f"{name}={gain:g} is {times:.0f} times the gain of the preset, whose penalty is "
-            "relative to the size of the action values. If the gain is not meant so, add "
-            "relative=False.",
+            f"neighbors={kind!r} of the neighborhood replaces the preset's {usual!r}, and changes "
+            f"the mean gain: give the fields, such as lambda_min=..., or neighbors={usual!r}.",
             stacklevel=4,
         )
+    gain = overrides.get(name, getattr(near, name, chosen.settings[name]))
+    relative = overrides.get("relative", chosen.relative)
+    given = {"relative", name} <= overrides.keys() or not isinstance(gain, int | float)
+    if not given and (mixed := mixed_units(method, chosen, gain, relative)):
+        warnings.warn(f"{mixed}: give both {name} and relative.", stacklevel=4)
 
 
 def _of_nearest(loss: LossModule, method: str, overrides: Mapping[str, Any]) -> Preset:

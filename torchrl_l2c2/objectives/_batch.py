@@ -118,7 +118,8 @@ def find_transitions(
         if not present:
             raise KeyError(
                 f"{network} needs the next observation to be regularized, and the batch has no "
-                f"{list(map(next_key, floating))}: keep it (collectors with compact_obs=False do)."
+                f"{list(map(next_key, floating))}: keep it (collectors with compact_obs=False do). "
+                "If another module computes this input, give the loss a policy that contains it."
             )
         pairs.update(present)
         for key in read if labels else ():

@@ -140,7 +140,11 @@ def make_part(
         metadata = rest[0] if rest and hasattr(rest[0], "update") else {}
         own = [key for key in self.out_keys_source if key.startswith("loss")] or list(targets)
         returned = next((key for key in targets if key in own), None)
+        if not is_compiling():
+            self._watch.in_part = True
         added = regularize(tensordict)
+        if not is_compiling():
+            self._watch.in_part = False
         if self._relative and kind == "policy":
             self._make_relative(added, size, value, tensordict)
         for key, term in list(added.items()):

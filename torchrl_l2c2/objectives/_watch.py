@@ -26,11 +26,13 @@ class TermWatch:
 
     Attributes:
         progress_set: whether the progress of a ramp was set.
+        in_part: whether a method such as ``actor_loss`` computes the terms.
         pending: added terms that were never differentiated; ``None`` before the first call.
     """
 
     def __init__(self) -> None:
         self.progress_set = False
+        self.in_part = False
         self.pending: set[str] | None = None
         self._calls = 0
         self._forwards = 0
@@ -86,10 +88,20 @@ class TermWatch:
         """Terms that were not differentiated in several calls."""
         return self.pending or set() if self._forwards > 1 else set()
 
-    def see_regularizer(self, loss: Any) -> None:
-        """Records that a loop computes the terms itself."""
-        if not is_compiling() and loss._evaluation.forward_pass is None:
-            self._warned.add("parts")
+    def see_regularizer(self, loss: Any, of_policy: bool = False) -> None:
+        """Records that a loop computes the terms itself; warns if it would miss their size."""
+        if is_compiling() or loss._evaluation.forward_pass is not None:
+            return
+        self._warned.add("parts")
+        if of_policy and loss._relative and not self.in_part and "size" not in self._warned:
+            self._warned.add("size")
+            warnings.warn(
+                f"policy_regularizer of {type(loss).__name__} does not know the size of the action "
+                "values, to which the penalty is relative: its terms are too small or too large. "
+                "Call loss(batch) or loss.actor_loss(batch), or make the loss with relative=False "
+                "and a gain.",
+                stacklevel=5,
+            )
 
     def see_part(self, loss: Any, kind: str) -> None:
         """Counts a call of ``actor_loss`` or ``value_loss`` without the added terms."""

@@ -286,7 +286,8 @@ class L2C2Loss(RegularizedLoss):
             warnings.warn(
                 f"gains up to {neighborhood.lambda_max:g}, such as the paper's gains, had no "
                 f"measurable effect with losses like {type(base_loss).__name__}, unless they were "
-                "relative to action values. Use smooth(loss), or raise lambda_min and lambda_max.",
+                "relative to action values. Take the preset (smooth(loss), regularizer=l2c2 in "
+                "train.py), or raise lambda_min and lambda_max.",
                 stacklevel=2,
             )
 

@@ -245,10 +245,15 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Computes the terms that train the policy, and their diagnostics.
 
+        They are not yet multiplied by the size of the action values (:meth:`relative`).
+
         Args:
             tensordict (TensorDictBase): the batch that ``forward`` or ``actor_loss`` takes.
+
+        Warns:
+            UserWarning: once, in a direct call, if the penalty is relative.
         """
-        self._watch.see_regularizer(self)
+        self._watch.see_regularizer(self, of_policy=True)
         return TensorDict()
 
     def value_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -522,6 +527,8 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         """Warns of a new attribute with the name of a setting, or nearly the name of a gain."""
         if name.startswith("_") or hasattr(self, name):
             return
+        setting = name.removeprefix("l2c2_")  # Other settings with this prefix are attributes.
+        setting = setting if setting in NEIGHBORHOOD_FIELDS else name
         if knobs := get_close_matches(name.lower(), KNOBS, 1, cutoff=0.85):
             warnings.warn(
                 f"{name!r} has no effect on a {type(self).__name__}: {KNOBS[knobs[0]]}.",
@@ -535,10 +542,10 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
                 f"{name!r} scales nothing in a {type(self).__name__}: the gain is {gains[0]!r}.",
                 stacklevel=3,
             )
-        elif name in self._made_with():
+        elif setting in self._made_with():
             warnings.warn(
-                f"{name!r} is read when a {type(self).__name__} is made: assigning to it has no "
-                f"effect. Make the loss with {name}={value!r}.",
+                f"{setting!r} is read when a {type(self).__name__} is made: assigning to it has no "
+                f"effect. Make the loss with {setting}={value!r}.",
                 stacklevel=3,
             )
 

@@ -322,8 +322,11 @@ def _allowed_options(method: str | None) -> set[str]:
 def _check_options(method: str, options: Iterable[str]) -> None:
     allowed = _allowed_options(method)
     if unknown := sorted(set(options) - allowed):
+        near = get_close_matches(unknown[0], allowed, 1)
+        hint = f" Did you mean {near[0]!r}?" if near else ""
         raise TypeError(
-            f"Expected settings of {method} in regularizer_cfg, {sorted(allowed)}, got {unknown}."
+            f"Expected settings of {method} in regularizer_cfg, {sorted(allowed)}, got "
+            f"{unknown}.{hint}"
         )
 
 

@@ -36,7 +36,7 @@ from torchrl_l2c2.experiment.settings.regularizers import (
     REGULARIZERS,
     preset_settings,
 )
-from torchrl_l2c2.presets import KINDS, preset
+from torchrl_l2c2.presets import GAIN_SETTING, KINDS, mixed_units, preset
 
 PACKAGE = Path(__file__).parents[2]
 # Next to the package in a clone, inside the package if installed.
@@ -46,6 +46,7 @@ CONF = next(folder for folder in (PACKAGE / "conf", PACKAGE.parent / "conf") if 
 ALIASES = {
     "method": ["regularizer"],
     "methods": ["regularizer"],
+    "regularizer.method": ["regularizer"],
     "regularizer.ramp": ["regularizer.gain=ramp"],
 }
 
@@ -176,6 +177,11 @@ def check_budget(config: ExperimentConfig, given: Sequence[str]) -> None:
             f"has no effect with task.frames={config.task.frames}: set task.frames=... instead, or "
             "add task.frames=null.",
         )
+
+
+def is_length_given(given: Sequence[str]) -> bool:
+    """Checks whether overrides name the length of training."""
+    return any(each.lstrip("+").startswith(("task.episodes=", "task.frames=")) for each in given)
 
 
 def check_folders(chosen: Any, outputs: str) -> None:
@@ -330,7 +336,10 @@ def check_outputs(given: Any) -> str:
 
 
 def describe_preset(config: ExperimentConfig) -> str | None:
-    """Describes the regularizer's preset in one line; ``None`` if it uses no presets."""
+    """Describes the regularizer's preset in one line; ``None`` if it uses no presets.
+
+    Another line warns of a gain that probably does not suit ``relative``.
+    """
     regularizer, algorithm = config.regularizer, config.algorithm.name
     if regularizer.name not in BEGIN_WITH_PRESET:
         return None
@@ -343,7 +352,14 @@ def describe_preset(config: ExperimentConfig) -> str | None:
     chosen = ", ".join(f"{name}={getattr(regularizer, name)}" for name in shown)
     origin = f": {source.evidence}, on {source.tasks}" if source.evidence else ", not tuned"
     note = f" except {', '.join(changed)}" if changed else origin
-    return f"regularizer={regularizer.name}: {chosen} (the preset for {algorithm}{note})"
+    line = f"regularizer={regularizer.name}: {chosen} (the preset for {algorithm}{note})"
+    gain, relative = (getattr(regularizer, name) for name in (GAIN_SETTING[method], "relative"))
+    mixed = mixed_units(method, source, gain, relative)
+    if mixed is None:
+        return line
+    name = f"regularizer.{GAIN_SETTING[method]}"
+    given = f"regularizer.relative={str(relative).lower()}"
+    return f"{line}\nwarning: {mixed}, and {given}: set {name}, too, unless this is meant."
 
 
 def show_sweep_hint() -> None:

@@ -56,7 +56,11 @@ def _parser() -> argparse.ArgumentParser:
         help="standard deviations of the noise on observations, such as 0 0.05 0.1; several levels "
         "give a table (default: the task's)",
     )
-    add("--sampled", action="store_true", help="sampled actions, as in training")
+    add(
+        "--sampled",
+        action="store_true",
+        help="sampled actions, as in training (the variation is also of the mean actions)",
+    )
     add("--best", action="store_true", help="policy_best.pt instead of policy.pt")
     add("--output", help="JSON file for the summary and all episodes")
     return parser
@@ -85,12 +89,12 @@ def _play(chosen: argparse.Namespace, noise: float | None) -> Evaluation:
 
 def _table(played: dict[float | None, Evaluation]) -> str:
     """Formats the summaries, one line per noise level."""
-    lines = [f"{'noise':>8}  {'return':>20}  {'action variation':>20}"]
+    lines = [f"{'noise':>8}  {'return':>20}  {'variation of the mean actions':>30}"]
     for level, test in played.items():
         summary = test.summary()
         total, total_std, variation, variation_std = (float(summary[name]) for name in COLUMNS)
         lines.append(
-            f"{level:>8g}  {total:>10.1f} ({total_std:>7.1f})  {variation:>10.3f} "
+            f"{level:>8g}  {total:>10.1f} ({total_std:>7.1f})  {variation:>20.3f} "
             f"({variation_std:>7.3f})"
         )
     return "\n".join(lines)

@@ -34,6 +34,7 @@ from torchrl_l2c2.experiment.cli.composition import (
     CONF,
     composition_errors,
     describe_preset,
+    is_length_given,
     read,
     register,
     show_sweep_hint,
@@ -131,7 +132,11 @@ def _main(values: DictConfig) -> None:
         return
     try:
         show_sweep_hint()
-        run(*read(plain, HydraConfig.get()), allow_other_versions=plain["allow_other_versions"])
+        run(
+            *read(plain, HydraConfig.get()),
+            allow_other_versions=plain["allow_other_versions"],
+            length_given=is_length_given(HydraConfig.get().overrides.task),
+        )
     except Interrupted as interruption:
         print(interruption, file=sys.stderr)
         sys.exit(128 + interruption.signal_number)
@@ -154,6 +159,7 @@ def _run_job(values: dict[str, Any], sweep: Sweep) -> None:
                 config,
                 folder,
                 allow_other_versions=values["allow_other_versions"],
+                length_given=is_length_given(HydraConfig.get().overrides.task),
                 status=_sweep_status(sweep),
                 patience=patience,
             )
@@ -195,6 +201,7 @@ def run(
     folder: Path,
     *,
     allow_other_versions: bool,
+    length_given: bool = True,
     status: str = "",
     patience: float = 0.0,
 ) -> FinishedRun | None:
@@ -206,6 +213,8 @@ def run(
 
     Keyword Args:
         allow_other_versions (bool): Setting of the command.
+        length_given (bool): Whether the command names the length of training. A finished run of
+            another length is trained on only if it does. Default ``True``.
         status (str): Progress of the sweep, shown before the run's name. Default: none.
         patience (float): Maximum time in seconds to wait for another process that uses the folder.
             Default 0.
@@ -214,7 +223,7 @@ def run(
         FinishedRun: The finished run; ``None`` without test episodes.
     """
     # Local imports: settings are checked before torch is imported.
-    from torchrl_l2c2.experiment.run.continuation import warn_ignored_settings
+    from torchrl_l2c2.experiment.run.continuation import check_length_given, warn_ignored_settings
     from torchrl_l2c2.experiment.run.finished import finished_run
     from torchrl_l2c2.experiment.run.lock import wait_for_folder
 
@@ -232,8 +241,11 @@ def run(
     wait_for_folder(folder, patience)
     with _log_errors(folder):
         finished = finished_run(folder, config.to_dict())
+        if finished is None and not length_given:
+            check_length_given(folder, config.task.budget)
         if finished is None:
-            finished = _train(config, folder, status, allow_other_versions=allow_other_versions)
+            place, _, _ = status.partition(",")  # The time left is of the run's start.
+            finished = _train(config, folder, place, allow_other_versions=allow_other_versions)
         else:
             print(
                 "finished before: these are its results. Use another seed= or outputs= for a new "

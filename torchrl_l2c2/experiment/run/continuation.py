@@ -11,6 +11,7 @@ from typing import Any
 
 from torchrl_l2c2.experiment.errors import OtherRunError, SimulatorError
 from torchrl_l2c2.experiment.run.checkpoints import CheckpointError, list_checkpoints, load_newest
+from torchrl_l2c2.experiment.run.files import read_config
 from torchrl_l2c2.experiment.run.folder import versions
 from torchrl_l2c2.experiment.settings.config import ExperimentConfig
 from torchrl_l2c2.experiment.settings.identity import changed_settings, length_dependent_settings
@@ -84,6 +85,29 @@ def check_length(asked: Budget, before: Budget, played: int) -> None:
             f"{asked.unit}s={asked.total} is fewer than the {least} that this run already has: "
             "use at least as many, or start in another folder (on the command line, "
             "outputs=FOLDER). Nothing was changed."
+        )
+
+
+def check_length_given(folder: str | Path, asked: Budget) -> None:
+    """Checks that a finished run is not trained on because its length was left out.
+
+    Args:
+        folder (str or Path): Run folder.
+        asked (Budget): Length of training, a default.
+
+    Raises:
+        OtherRunError: If the folder has a finished run of another length, whose results would be
+            removed.
+    """
+    if not any((Path(folder) / name).exists() for name in ("evaluation.json", "policy.pt")):
+        return
+    before = TaskConfig(**read_config(folder)["task"]).budget
+    if before != asked:
+        raise OtherRunError(
+            f"this run is finished, with task.{before.unit}s={before.total}. Without a length the "
+            f"command would train on and remove its results: add task.{before.unit}s="
+            f"{before.total} to see them, task.{asked.unit}s={asked.total} to train on, or "
+            "outputs=FOLDER for a new run. Nothing was changed."
         )
 
 

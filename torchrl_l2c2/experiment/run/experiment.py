@@ -319,7 +319,10 @@ class Experiment:
             self.load_state_dict(state)
             show_and_log(folder, f"continuing after episode {len(self.metrics)} from {path}")
         ended = self._ended(self.config.task.budget)
-        prepare_folder(folder, self.config.to_dict(), resumed=found is not None, ended=ended)
+        resumed = found is not None
+        removed = prepare_folder(folder, self.config.to_dict(), resumed=resumed, ended=ended)
+        if resumed and removed and not ended:
+            show_and_log(folder, f"removed the results of the shorter run: {', '.join(removed)}")
 
     def _parts(self) -> dict[str, Any]:
         """Returns the objects with a state by their names in checkpoints."""

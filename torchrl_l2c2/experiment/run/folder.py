@@ -52,7 +52,9 @@ EXPORT_FILES = tuple(f"export/{name}" for name in ("policy.onnx", "policy.pt2", 
 TRAINING_FILES = ("metrics.csv", "evaluations.json", "policy_best.pt")
 
 
-def prepare_folder(folder: Path, settings: dict[str, Any], *, resumed: bool, ended: bool) -> None:
+def prepare_folder(
+    folder: Path, settings: dict[str, Any], *, resumed: bool, ended: bool
+) -> list[str]:
     """Removes outdated files from a run's folder, and writes settings, versions and README.
 
     Outdated results are removed first: a test with other settings, and the final files of a shorter
@@ -66,16 +68,20 @@ def prepare_folder(folder: Path, settings: dict[str, Any], *, resumed: bool, end
     Keyword Args:
         resumed (bool): Whether the run continues from a checkpoint.
         ended (bool): Whether training is over.
+
+    Returns:
+        list: Names of the removed results.
     """
-    if not ended or not is_tested(folder, settings):
-        (folder / "evaluation.json").unlink(missing_ok=True)
+    outdated = [] if ended and is_tested(folder, settings) else ["evaluation.json"]
     if not ended:
-        names = (*FINAL_FILES, *EXPORT_FILES, *(() if resumed else TRAINING_FILES))
-        for path in filter(Path.exists, (folder / name for name in names)):
-            path.unlink()
+        outdated += [*FINAL_FILES, *EXPORT_FILES, *(() if resumed else TRAINING_FILES)]
+    removed = [name for name in outdated if (folder / name).exists()]
+    for name in removed:
+        (folder / name).unlink()
     write_json(folder / "config.json", settings)
     write_json(folder / "versions.json", {**versions(), "commit": code_commit()})
     write_atomically(folder / "README.txt", README.encode())
+    return removed
 
 
 def versions() -> dict[str, str]:

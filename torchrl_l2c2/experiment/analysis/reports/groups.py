@@ -12,7 +12,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from torchrl_l2c2.experiment.analysis.reports.names import method_name, name_with_settings
+from torchrl_l2c2.experiment.analysis.reports.names import (
+    DISTANCES,
+    NAMES,
+    method_name,
+    name_with_settings,
+)
 from torchrl_l2c2.experiment.analysis.reports.records import KIND, merge, other_settings
 from torchrl_l2c2.experiment.analysis.reports.statistics import Scores
 from torchrl_l2c2.experiment.settings.identity import read_differences
@@ -105,7 +110,7 @@ def baseline_of(group: Group, groups: Iterable[Group]) -> Group | None:
 
 
 def settings_notes(groups: Sequence[Group]) -> list[str]:
-    """Notes on settings that no name in the table contains, and on pooled versions."""
+    """Notes on the names, on settings that no name contains, and on pooled versions."""
     notes: dict[str, list[str]] = defaultdict(list)
     for together in by_task(groups):
         where = f"{together[0].first.task}, {together[0].first.algorithm}"
@@ -121,6 +126,9 @@ def settings_notes(groups: Sequence[Group]) -> list[str]:
                 notes[f"{which}: {listed}."].append(where)
     # One note for all tasks with the same settings.
     written = [f"{'; '.join(tasks)}: {note}" for note, tasks in notes.items()]
+    distances = tuple(f"L2C2, {distance}" for distance in DISTANCES.values())
+    if any(group.name.startswith(distances) for group in groups):
+        written.insert(0, NAMES)
     return [*written, *_pooled_versions(groups)]
 
 

@@ -26,6 +26,12 @@ METHODS = {
 
 DISTANCES = {"hellinger": "Hellinger", "mean": "means", "mse": "mse", "kl": "KL"}
 
+NAMES = (
+    "Names of L2C2: the distance of policies (`policy_distance`; *means*: `mean`), the gain "
+    "(`lambda_min`), and *ramp* if the gain rises over training."
+)
+"""Note on names with settings."""
+
 
 def method_name(method: str) -> str:
     """Returns the name of a method in tables and pictures."""

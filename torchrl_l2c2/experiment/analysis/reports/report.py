@@ -21,10 +21,12 @@ from torchrl_l2c2.experiment.settings.naming import unique
 def result_lines(run: FinishedRun) -> str:
     """Returns the return and the action variation of a run's test episodes, in lines.
 
+    With sampled actions the variation is also of the mean actions, at the visited states.
+
     Raises:
         ValueError: the run's folder is damaged.
     """
-    lines = [f"{'':>20}  {'return':>18}  {'action variation':>18}"]
+    lines = [f"{'played with':>20}  {'return':>18}  {'variation of the mean actions':>30}"]
     tests = {"mean actions": run.evaluation, "sampled actions": run.evaluation.get("sampled")}
     for name, test in tests.items():
         own = (test or {}).get("summary")
@@ -33,7 +35,7 @@ def result_lines(run: FinishedRun) -> str:
                 total, variation = ((own[f"{q}_mean"], own[f"{q}_std"]) for q in QUANTITIES)
                 episodes = "episode" if own["episodes"] == 1 else "episodes"
                 lines.append(
-                    f"{name:>20}  {total[0]:>9.1f} ({total[1]:>6.1f})  {variation[0]:>10.3f} "
+                    f"{name:>20}  {total[0]:>9.1f} ({total[1]:>6.1f})  {variation[0]:>22.3f} "
                     f"({variation[1]:.3f})   {own['episodes']} test {episodes}, seed {run.seed}"
                 )
     return "\n".join(lines)

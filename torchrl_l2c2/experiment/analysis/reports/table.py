@@ -117,13 +117,14 @@ def improvement(
         quantity (str): ``"return"``, or a measure that is better if it is smaller.
 
     Returns:
-        Estimate: ``None`` if a task has no such runs.
+        Estimate: ``None`` if a side has less than two such runs of a task: of two runs, one is
+        always better.
     """
     sign = 1.0 if quantity == "return" else -1.0
     matrices = []
     for side in (groups, baselines):
         columns = [group.by_seed(test, quantity).values() for group in side]
-        if not all(columns):
+        if any(len(column) < 2 for column in columns):
             return None
         # Tasks with fewer runs have NaN below them.
         matrices.append(sign * np.array(list(zip_longest(*columns, fillvalue=np.nan))))
