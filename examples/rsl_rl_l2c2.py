@@ -1,7 +1,8 @@
 """rsl_rl's PPO with and without L2C2, on points seen through noise (needs the extra rsl-rl).
 
 ``python examples/rsl_rl_l2c2.py`` shows in seconds that it runs, with three iterations;
-``python examples/rsl_rl_l2c2.py 40`` trains for some minutes.
+``python examples/rsl_rl_l2c2.py 40`` trains for some minutes, and with ``RNNModel`` as a second
+argument it trains recurrent networks.
 """
 
 from __future__ import annotations
@@ -23,9 +24,14 @@ STUDENT = 2.776  # half of a 95 % interval of five seeds, in standard errors
 METHODS = {"PPO": "PPO", "with L2C2": "torchrl_l2c2.rsl_rl:L2C2PPO"}
 
 
-def train(class_name: str, seed: int, iterations: int) -> tuple[float, float]:
+def train(
+    class_name: str, seed: int, iterations: int, model: str = "MLPModel"
+) -> tuple[float, float]:
+    """Trains a model, ``MLPModel`` or ``RNNModel``, and tests its mean actions."""
     torch.manual_seed(seed)
-    network = {"class_name": "MLPModel", "hidden_dims": [64, 64], "activation": "tanh"}
+    network = {"class_name": model, "hidden_dims": [64, 64], "activation": "tanh"}
+    if model == "RNNModel":
+        network |= {"rnn_type": "lstm", "rnn_hidden_dim": 64}
     config = {
         "algorithm": {"class_name": class_name, "gamma": 0.97, "entropy_coef": 0.0},
         "actor": {**network, "distribution_cfg": {"class_name": "GaussianDistribution"}},
@@ -39,6 +45,7 @@ def train(class_name: str, seed: int, iterations: int) -> tuple[float, float]:
         runner = OnPolicyRunner(NoisyPoints(64), config)
         runner.learn(iterations)
     torch.manual_seed(1000 + seed)
+    runner.alg.actor.reset()  # It may remember the training.
     return test(runner.get_inference_policy(), NoisyPoints(100))
 
 
@@ -56,9 +63,9 @@ def test(policy: Callable[[Any], Tensor], env: NoisyPoints) -> tuple[float, floa
     return rewards.mean().item(), variation.mean().item()
 
 
-def main(iterations: int) -> None:
+def main(iterations: int, model: str) -> None:
     found = {
-        name: torch.tensor([train(class_name, seed, iterations) for seed in SEEDS])
+        name: torch.tensor([train(class_name, seed, iterations, model) for seed in SEEDS])
         for name, class_name in METHODS.items()
     }
     found["difference"] = found["with L2C2"] - found["PPO"]
@@ -70,4 +77,5 @@ def main(iterations: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 3)
+    chosen = sys.argv[2] if len(sys.argv) > 2 else "MLPModel"
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 3, chosen)

@@ -19,8 +19,9 @@ from studies.field import TEST
 from studies.front_door import METHODS, add_runs
 from torchrl_l2c2.experiment.analysis.reports.groups import Group
 
-# Iterations of each task: 64,000 and 1,001,472 frames.
-ITERATIONS = {"points": 40, "HalfCheetah-v5": 489}
+RECURRENT = "points, LSTM"
+# Iterations of each task: 64,000 frames of points, and 1,001,472 of HalfCheetah.
+ITERATIONS = {"points": 40, RECURRENT: 40, "HalfCheetah-v5": 489}
 SEEDS = range(5)
 CLASSES = dict(zip(METHODS, ("PPO", "torchrl_l2c2.rsl_rl:L2C2PPO"), strict=True))
 
@@ -42,8 +43,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     import rsl_rl_l2c2
 
     def silent(seed: int, task: str, method: str) -> tuple[float, float]:
-        if task == "points":
-            return rsl_rl_l2c2.train(CLASSES[method], seed, ITERATIONS[task])
+        if task in ("points", RECURRENT):
+            model = "RNNModel" if task == RECURRENT else "MLPModel"
+            return rsl_rl_l2c2.train(CLASSES[method], seed, ITERATIONS[task], model)
         with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
             return rsl_rl_gymnasium.train(CLASSES[method], task, seed, ITERATIONS[task])
 

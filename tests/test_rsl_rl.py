@@ -48,17 +48,30 @@ def observations(seed: int) -> TensorDict:
 
 
 def make(
-    algorithm: type[PPO], model: type[MLPModel] = MLPModel, normal: Any = NORMAL, **settings: Any
+    algorithm: type[PPO],
+    model: type[MLPModel] = MLPModel,
+    normal: Any = NORMAL,
+    memory: tuple[str | None, str | None] = (None, None),
+    **settings: Any,
 ) -> PPO:
-    """An algorithm with the same networks each time; one batch a rollout unless told otherwise."""
+    """An algorithm with the same networks each time; one batch a rollout unless told otherwise.
+
+    ``memory``: the recurrent layers of the actor and the critic, ``"lstm"`` or ``"gru"``.
+    """
     torch.manual_seed(0)
     obs = observations(0)
-    small: dict[str, Any] = {"hidden_dims": [8], "activation": "tanh"}
-    if model is MLPModel:
-        small["obs_normalization"] = True
+    small: dict[str, Any] = {"hidden_dims": [8], "activation": "tanh", "obs_normalization": True}
+    # rsl_rl 5.4 updates a normalization in each step: recurrent states would be of older ones.
+    layers = {"rnn_hidden_dim": 4, "rnn_num_layers": 2, "obs_normalization": False}
+    models = []
+    for kind in memory:
+        recurrent = {"rnn_type": kind, **layers}
+        models.append((model, small) if kind is None else (RNNModel, small | recurrent))
+    (of_actor, actor_settings), (of_critic, critic_settings) = models
     # A copy: rsl_rl 5.4 takes the class's name out of the dictionary.
-    actor = model(obs, GROUPS, "actor", ACTIONS, distribution_cfg=copy.copy(normal), **small)
-    critic = MLPModel(obs, GROUPS, "critic", 1, **small | {"obs_normalization": True})
+    normal = copy.copy(normal)
+    actor = of_actor(obs, GROUPS, "actor", ACTIONS, distribution_cfg=normal, **actor_settings)
+    critic = of_critic(obs, GROUPS, "critic", 1, **critic_settings)
     storage = RolloutStorage("rl", ENVS, STEPS, obs, [ACTIONS])
     settings = {"num_learning_epochs": 1, "num_mini_batches": 1} | settings
     return algorithm(actor, critic, storage, **settings)
@@ -594,6 +607,84 @@ def update_and_save(ppo: PPO) -> dict[str, Any]:
     return copy.deepcopy(ppo.save())
 
 
+class OwnMemory(MLPModel):
+    is_recurrent = True
+
+
+ENDS = {1: [0, 2], 3: [1]}
+MEMORIES = pytest.mark.parametrize(
+    "memory", [("lstm", "gru"), ("gru", None), (None, "lstm")], ids=str
+)
+
+
+def latents(model: MLPModel, groups: list[str], at: TensorDict | None = None) -> Tensor:
+    """What the last layers read at every step, ``[STEPS * ENVS, width]``, by torch's own layers.
+
+    ``at``: other observations ``[STEPS * ENVS]`` at which single steps are taken.
+    """
+    states: Any = None
+    found = []
+    for step in range(STEPS):
+        rows = slice(step * ENVS, (step + 1) * ENVS)
+        there = observations(step) if at is None else at[rows]
+        here, there = (
+            model.obs_normalizer(torch.cat([obs[group] for group in groups], -1))
+            for obs in (observations(step), there)
+        )
+        if not model.is_recurrent:
+            found.append(there)
+            continue
+        found.append(model.rnn.rnn(there[None], states)[0].squeeze(0))
+        _, states = model.rnn.rnn(here[None], states)
+        kept = torch.ones(1, ENVS, 1)
+        kept[:, ENDS.get(step, [])] = 0.0
+        lstm = isinstance(states, tuple)
+        states = tuple(state * kept for state in states) if lstm else states * kept
+    return torch.cat(found)
+
+
+@MEMORIES
+def test_recurrent_models_take_single_steps(memory: tuple[str | None, str | None]) -> None:
+    """The terms are those of the layers, stepped through the episodes and once to each neighbor."""
+    ppo = collected(make(rsl.L2C2PPO, memory=memory, regularizer_cfg={"beta": 0.5}), ENDS)
+    near, transform = Neighborhood(1.0, 1.0, 100.0, neighbors="line"), ppo.regularization.neighbors
+    drawn = transform.generator.get_state()
+    batch = transform(transitions(torch.arange(STEPS * ENVS)))
+    transform.generator.set_state(drawn)
+    neighbors = batch["neighbor"].exclude("distance").apply(lambda value: value.squeeze(1))
+    gain = near.gain(batch["neighbor", "distance"].squeeze(1))
+    counts = torch.ones(STEPS, ENVS)
+    for step, ended in ENDS.items():
+        counts[step, ended] = 0.0
+    weights = gain * counts.flatten() / counts.sum()
+    expected = []
+    for model, groups, factor in (
+        (ppo.actor, GROUPS["actor"], 1.0),
+        (ppo.critic, GROUPS["critic"], 0.5 * 0.5),  # beta, and half the squared difference
+    ):
+        here, there = (model.mlp(latents(model, groups, at)) for at in (None, neighbors))
+        difference = (here - there)[:, :ACTIONS].square().mean(-1)
+        expected.append(factor * (weights * difference).sum().item())
+    losses = update(ppo)
+    assert (losses["l2c2_actor"], losses["l2c2_critic"]) == pytest.approx(expected, rel=1e-4)
+    assert losses["l2c2_counted"] == pytest.approx(counts.mean().item())
+
+
+@MEMORIES
+def test_recurrent_models_learn_as_before_without_a_gain(
+    memory: tuple[str | None, str | None],
+) -> None:
+    plain, ppo = (collected(make(one, memory=memory), ENDS) for one in (PPO, rsl.L2C2PPO))
+    ppo.regularization.loss.regularizer_gain = 0.0
+    smoothed = collected(make(rsl.L2C2PPO, memory=memory), ENDS)
+    (expected, _), (without, _), (with_term, _) = map(steps, (plain, ppo, smoothed))
+    for a, b in zip(without, expected, strict=True):
+        torch.testing.assert_close(a, b)
+    assert any(not torch.allclose(a, b) for a, b in zip(with_term, expected, strict=True))
+    again = collected(ppo)  # The next rollout begins in the middle of episodes.
+    assert update(again)["l2c2_counted"] == 1.0
+
+
 @pytest.mark.parametrize("before", [PPO, rsl.CATSPPO], ids=["plain", "another regularizer"])
 def test_a_checkpoint_of_another_ppo_is_a_beginning(before: type[PPO]) -> None:
     """Its networks are taken, and the ramp begins."""
@@ -607,7 +698,8 @@ def test_a_checkpoint_of_another_ppo_is_a_beginning(before: type[PPO]) -> None:
 @pytest.mark.parametrize(
     "settings, said",
     [
-        ({"model": RNNModel}, "the actor is recurrent .RNNModel.*Take a feed-forward model"),
+        ({"model": OwnMemory}, "the actor is recurrent and of .* .OwnMemory.*Take an RNNModel"),
+        ({"memory": ("gru", None), "regularizer_cfg": {"method": "cats"}}, "cats compares .* l2c2"),
         ({"normal": {"class_name": "BetaDistribution"}}, "normal .* got a BetaDistribution"),
         ({"normal": None}, "normal .* got a NoneType"),
         ({"regularizer_cfg": {"sigmaa": 1.0}}, "sigmaa"),
@@ -619,7 +711,7 @@ def test_a_checkpoint_of_another_ppo_is_a_beginning(before: type[PPO]) -> None:
 def test_what_cannot_be_regularized_is_refused(settings: dict[str, Any], said: str) -> None:
     """With what was given and what to do."""
     with pytest.raises(TypeError, match=said):
-        make(rsl.L2C2PPO, **settings)
+        make(rsl.RegularizedPPO if "memory" in settings else rsl.L2C2PPO, **settings)
 
 
 def test_the_groups_that_move_can_be_chosen() -> None:

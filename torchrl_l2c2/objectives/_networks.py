@@ -20,8 +20,8 @@ POLICY_NETWORK = "actor_network"
 VALUE_NETWORKS = ("critic_network", "qvalue_network", "value_network", "local_value_network")
 """Names of a loss's attributes with value functions."""
 
-_STEPPING = (LSTMModule, GRUModule)
-"""Recurrent modules that can take a single step from a recurrent state in the batch."""
+RECURRENT_KEYS = "recurrent_keys"
+"""Attribute of a recurrent module with the keys of its states, from which it takes one step."""
 
 # The vector of an ensemble, or of all actions, comes before the scalar computed from it.
 _VALUE_KEYS = ("value_heads", "state_action_value", "action_value", "value")
@@ -185,13 +185,18 @@ def _recurrent_inputs(net: Any, name: str) -> tuple[NestedKey, ...]:
     """Inputs of recurrent modules that carry the past; refuses modules that cannot take one step.
 
     Raises:
-        TypeError: a recurrent layer is not in an ``LSTMModule`` or ``GRUModule``, or the network
-            hands on another input to its next evaluation.
+        TypeError: a recurrent layer is not in an ``LSTMModule`` or ``GRUModule``, or a module with
+            :data:`RECURRENT_KEYS`; or the network hands on another input to its next evaluation.
     """
-    stepping = [module for module in net.modules() if isinstance(module, _STEPPING)]
-    known = {id(part) for module in stepping for part in module.modules()}
+    carried: list[NestedKey] = []
+    known: set[int] = set()
+    for module in net.modules():
+        keys = getattr(module, RECURRENT_KEYS, ())
+        keys = module.in_keys[1:] if isinstance(module, LSTMModule | GRUModule) else keys
+        if keys:
+            carried += map(unravel_key, keys)
+            known |= {id(part) for part in module.modules()}
     layers = (m for m in net.modules() if isinstance(m, nn.RNNBase | nn.RNNCellBase))
-    carried = [unravel_key(key) for module in stepping for key in module.in_keys[1:]]
     written = {unravel_key(key) for key in net.out_keys}
     others = set(net.in_keys) - set(carried)
     handed_on = "is_init" in others or any(unravel_key(("next", key)) in written for key in others)

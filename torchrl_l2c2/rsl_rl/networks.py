@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from rsl_rl.models import MLPModel
+from rsl_rl.models import MLPModel, RNNModel
 from rsl_rl.modules.distribution import GaussianDistribution
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import (
@@ -14,10 +15,11 @@ from tensordict.nn import (
     ProbabilisticTensorDictSequential,
     TensorDictModuleBase,
 )
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.modules import IndependentNormal
 
 from torchrl_l2c2.objectives import SharedEvaluation
+from torchrl_l2c2.rsl_rl.storage import RECURRENT_PARTS
 
 MEAN, SCALE, VALUE, VALID = "loc", "scale", "state_value", "valid"
 """Entries of a batch: the policy's parameters, the value, and the mask of known transitions."""
@@ -32,14 +34,17 @@ class ActorCriticLoss(SharedEvaluation):
     Batches have the observation groups by name, and the next observations under ``"next"``. If a
     batch has the policy's parameters as ``"loc"`` and ``"scale"``, which rsl_rl computes first, the
     actor is not evaluated again. If a batch has ``"valid"``, terms are means over the rows where it
-    is true.
+    is true. A recurrent model takes one step from the states in the batch, ``[*B, layers, width]``,
+    whose names :func:`state_keys` returns.
 
     Args:
-        actor (MLPModel): the policy, a normal distribution. Models with convolutions also work.
+        actor (MLPModel): the policy, a normal distribution. Models with convolutions and recurrent
+            models also work.
         critic (MLPModel): the value function.
 
     Raises:
-        TypeError: a model is recurrent, or the policy is not a normal distribution.
+        TypeError: a model is recurrent and no ``RNNModel``, or the policy is not a normal
+            distribution.
     """
 
     @dataclass
@@ -80,12 +85,12 @@ class _Actor(TensorDictModuleBase):
 
     def __init__(self, actor: MLPModel) -> None:
         super().__init__()
-        self.model = actor
-        self.in_keys, self.out_keys = groups(actor), [MEAN, SCALE]
+        self.model, self.recurrent_keys = actor, state_keys(actor, "actor")
+        self.in_keys, self.out_keys = [*groups(actor), *self.recurrent_keys], [MEAN, SCALE]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         # Calling the model would draw actions with the global generator.
-        output = self.model.mlp(self.model.get_latent(tensordict))
+        output = self.model.mlp(_latent(self.model, tensordict, self.recurrent_keys))
         distribution = copy.copy(self.model.distribution)
         distribution.update(output)
         return write_parameters(tensordict, distribution.params)
@@ -94,11 +99,38 @@ class _Actor(TensorDictModuleBase):
 class _Critic(TensorDictModuleBase):
     def __init__(self, critic: MLPModel) -> None:
         super().__init__()
-        self.model = critic
-        self.in_keys, self.out_keys = groups(critic), [VALUE]
+        self.model, self.recurrent_keys = critic, state_keys(critic, "critic")
+        self.in_keys, self.out_keys = [*groups(critic), *self.recurrent_keys], [VALUE]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return tensordict.set(VALUE, self.model(tensordict).float())
+        if self.recurrent_keys:
+            value = self.model.mlp(_latent(self.model, tensordict, self.recurrent_keys))
+        else:
+            value = self.model(tensordict)
+        return tensordict.set(VALUE, value.float())
+
+
+def _latent(model: MLPModel, tensordict: TensorDictBase, states: Sequence[str]) -> Tensor:
+    """The input of a model's last layers, ``[B, width]``; a recurrent model takes one step."""
+    if not states:
+        return model.get_latent(tensordict)
+    observation = MLPModel.get_latent(model, tensordict).unsqueeze(0)  # not through the memory
+    before = tuple(tensordict[key].transpose(0, 1).contiguous() for key in states)
+    out, _ = model.rnn.rnn(observation, before if len(before) > 1 else before[0])
+    return out.squeeze(0)
+
+
+def state_keys(model: MLPModel, name: str) -> tuple[str, ...]:
+    """Keys of a model's recurrent states in batches, in the order of its layers' arguments.
+
+    Args:
+        model: the model.
+        name: ``"actor"`` or ``"critic"``.
+    """
+    if not model.is_recurrent:
+        return ()
+    parts = RECURRENT_PARTS if isinstance(model.rnn.rnn, nn.LSTM) else RECURRENT_PARTS[:1]
+    return tuple(f"recurrent_{name}_{part}" for part in parts)
 
 
 def write_parameters(tensordict: TensorDictBase, parameters: tuple[Tensor, ...]) -> TensorDictBase:
@@ -114,11 +146,11 @@ def groups(model: MLPModel) -> list[str]:
 
 def _check_models(actor: MLPModel, critic: MLPModel) -> None:
     for name, model in (("actor", actor), ("critic", critic)):
-        if model.is_recurrent:
+        if model.is_recurrent and not isinstance(model, RNNModel):
             raise TypeError(
-                f"the {name} is recurrent ({type(model).__name__}): its output depends on earlier "
-                "observations, so it cannot be evaluated at a neighbor of the current observation. "
-                "Take a feed-forward model, such as MLPModel, with a history of observations."
+                f"the {name} is recurrent and of a class of its own ({type(model).__name__}), of "
+                "which a single step is unknown. Take an RNNModel, or a feed-forward model, such "
+                "as MLPModel, with a history of observations."
             )
     if not isinstance(actor.distribution, GaussianDistribution):
         raise TypeError(

@@ -19,7 +19,7 @@ from torchrl_l2c2 import objectives
 from torchrl_l2c2._checks import check_choice, check_positive_int
 from torchrl_l2c2.objectives import L2C2Loss, RegularizedLoss
 from torchrl_l2c2.presets import METHODS, NEIGHBORHOOD_FIELDS, preset
-from torchrl_l2c2.rsl_rl.networks import ENTRIES, ActorCriticLoss
+from torchrl_l2c2.rsl_rl.networks import ENTRIES, ActorCriticLoss, state_keys
 from torchrl_l2c2.rsl_rl.regularization import Regularization
 from torchrl_l2c2.rsl_rl.storage import ROW, SuccessorStorage
 from torchrl_l2c2.smoothing import smooth
@@ -30,6 +30,9 @@ FINAL = "final_obs"
 
 PREVIOUS = ("grad_caps", "asap")
 """Methods that need the previous observation, which rsl_rl's rollouts lack."""
+
+COMPARING_NEXT = ("cats", "caps")
+"""Methods that evaluate the policy at the next observation."""
 
 
 class RegularizedPPO(PPO):
@@ -56,8 +59,9 @@ class RegularizedPPO(PPO):
         **kwargs: arguments of rsl_rl's PPO.
 
     Raises:
-        TypeError: a model is recurrent, the policy is not normal, or an argument is unknown or of
-            the wrong type.
+        TypeError: a model is recurrent in another way than rsl_rl's, the policy is not normal, the
+            method does not work with a recurrent actor, or an argument is unknown or of the wrong
+            type.
         ValueError: an argument is out of its range, or the method is unknown or does not work with
             rsl_rl.
     """
@@ -93,7 +97,8 @@ class RegularizedPPO(PPO):
                 advice = f"Did you mean {near[0]!r}?"
             raise TypeError(f"{unknown!r} is no argument of rsl_rl's PPO. {advice}")
         networks = ActorCriticLoss(actor, critic)
-        _check_groups(storage.observations.keys(), (*ENTRIES, ROW, "next"))
+        states = (*state_keys(actor, "actor"), *state_keys(critic, "critic"))
+        _check_groups(storage.observations.keys(), (*ENTRIES, *states, ROW, "next"))
         super().__init__(actor, critic, SuccessorStorage(storage), *args, **kwargs)
         if max_iterations is not None:
             check_positive_int("max_iterations", max_iterations)
@@ -108,6 +113,11 @@ class RegularizedPPO(PPO):
         hint = chosen.ramp is not None and "ramp_updates" not in overrides
         ramp_updates = overrides.pop("ramp_updates", chosen.ramp and max_iterations)
         loss = smooth(networks, method, strength, fold=False, **overrides, ramp=None)
+        if actor.is_recurrent and method in COMPARING_NEXT:
+            raise TypeError(
+                f"{method} compares the action with the next one, and rsl_rl's rollouts lack the "
+                "recurrent state of the next step. Choose l2c2, lcp or sr2l for a recurrent actor."
+            )
         self.storage.groups = list(_groups(loss))
         self.symmetry = self.regularization = Regularization(
             loss.to(self.device), self._neighbors(loss), method, ramp_updates, self.symmetry

@@ -25,7 +25,7 @@ class Regularization:
     rsl_rl's PPO accepts one additional term, the mirror loss of the symmetry extension. This object
     takes its place: it forwards calls to the real extension, and adds the regularizer's terms to
     the mirror loss. The regularizer is computed at the original rows of the batch, not at mirrored
-    rows.
+    rows. Recurrent models take single steps from the states of the rollout.
 
     Args:
         loss (RegularizedLoss): the regularizer around an
@@ -140,10 +140,16 @@ class Regularization:
     def _transitions(
         self, actor: MLPModel, batch: RolloutStorage.Batch, count: int
     ) -> TensorDictBase:
-        transitions = batch.observations[:count]
-        parameters = tuple(part[:count] for part in actor.output_distribution_params)
-        transitions = write_parameters(transitions, parameters)
-        transitions.set("action", batch.actions[:count])
+        parameters = actor.output_distribution_params
+        if batch.masks is None:
+            transitions, actions = batch.observations[:count], batch.actions[:count]
+            parameters = tuple(part[:count] for part in parameters)
+        else:
+            transitions, actions = batch.single_steps, batch.actions.flatten(0, 1)
+            parameters = tuple(part.flatten(0, 1) for part in torch.broadcast_tensors(*parameters))
+        if not actor.is_recurrent:  # Its parameters would be those of sequences.
+            write_parameters(transitions, parameters)
+        transitions.set("action", actions)
         transitions.set("next", batch.next_observations).set(VALID, batch.has_next)
         return transitions if self.neighbors is None else self.neighbors(transitions)
 

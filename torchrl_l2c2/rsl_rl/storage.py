@@ -6,11 +6,15 @@ from collections.abc import Iterator
 
 import torch
 from rsl_rl.storage import RolloutStorage
+from rsl_rl.utils import unpad_trajectories
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 # Entry of the observations with their rows in the rollout, while a batch is drawn.
 ROW = "_row"
+
+RECURRENT_PARTS = ("h", "c")
+"""Ends of the keys of recurrent states: of a GRU the first, of an LSTM both."""
 
 
 class SuccessorStorage(RolloutStorage):
@@ -22,7 +26,10 @@ class SuccessorStorage(RolloutStorage):
     unless it was passed to :meth:`add_final`.
 
     Batches have two more attributes: ``next_observations``, a TensorDict of the ``groups``, and
-    ``has_next``, boolean, ``[B]``, false in rows whose next observation is unknown.
+    ``has_next``, boolean, ``[B]``, false in rows whose next observation is unknown. Batches of
+    recurrent models have them for the ``B`` steps of their environments, in the order of
+    ``batch.actions.flatten(0, 1)``, and ``single_steps``: the observations and recurrent states
+    before each of these steps.
 
     Attributes:
         groups (list of str): observation groups whose next observations batches have; initially
@@ -82,6 +89,30 @@ class SuccessorStorage(RolloutStorage):
             rows = batch.observations.pop(ROW)
             batch.next_observations, batch.has_next = self._successors(rows, finals)
             yield batch
+
+    def recurrent_mini_batch_generator(
+        self, num_mini_batches: int, num_epochs: int = 8
+    ) -> Iterator[RolloutStorage.Batch]:
+        """Draws batches as rsl_rl does, and adds single steps and their next observations."""
+        finals, states = self._find_finals(), self._recurrent_states()
+        observations = self._observations.exclude(ROW).flatten(0, 1)
+        for batch in super().recurrent_mini_batch_generator(num_mini_batches, num_epochs):
+            rows = unpad_trajectories(batch.observations.pop(ROW), batch.masks).flatten()
+            batch.next_observations, batch.has_next = self._successors(rows, finals)
+            batch.single_steps = observations[rows].update(states[rows])
+            yield batch
+
+    def _recurrent_states(self) -> TensorDict:
+        """The recurrent states of all models, ``[steps * num_envs, layers, width]``."""
+        saved = {"actor": self.saved_hidden_state_a, "critic": self.saved_hidden_state_c}
+        return TensorDict(
+            {
+                f"recurrent_{name}_{part}": state.transpose(1, 2).flatten(0, 1)
+                for name, states in saved.items()
+                for part, state in zip(RECURRENT_PARTS, states or (), strict=False)
+            },
+            batch_size=[self.observations.numel()],
+        )
 
     def _find_finals(self) -> tuple[Tensor, TensorDictBase] | None:
         """The index of each row's final observation, -1 without one, and these observations."""
