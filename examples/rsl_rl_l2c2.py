@@ -1,8 +1,7 @@
 """rsl_rl's PPO with and without L2C2, on points seen through noise (needs the extra rsl-rl).
 
 ``python examples/rsl_rl_l2c2.py`` shows in seconds that it runs, with three iterations;
-``python examples/rsl_rl_l2c2.py 40`` trains for some minutes, and with ``RNNModel`` as a second
-argument it trains recurrent networks.
+``python examples/rsl_rl_l2c2.py 40`` trains for some minutes; ``... 40 RNNModel`` with memory.
 """
 
 from __future__ import annotations
@@ -27,9 +26,8 @@ METHODS = {"PPO": "PPO", "with L2C2": "torchrl_l2c2.rsl_rl:L2C2PPO"}
 def train(
     class_name: str, seed: int, iterations: int, model: str = "MLPModel"
 ) -> tuple[float, float]:
-    """Trains a model, ``MLPModel`` or ``RNNModel``, and tests its mean actions."""
     torch.manual_seed(seed)
-    network = {"class_name": model, "hidden_dims": [64, 64], "activation": "tanh"}
+    network: dict[str, Any] = {"class_name": model, "hidden_dims": [64, 64], "activation": "tanh"}
     if model == "RNNModel":
         network |= {"rnn_type": "lstm", "rnn_hidden_dim": 64}
     config = {

@@ -147,7 +147,7 @@ class Regularization:
         else:
             transitions, actions = batch.single_steps, batch.actions.flatten(0, 1)
             parameters = tuple(part.flatten(0, 1) for part in torch.broadcast_tensors(*parameters))
-        if not actor.is_recurrent:  # Its parameters would be those of sequences.
+        if not actor.is_recurrent:  # It has evaluated sequences, and not single steps.
             write_parameters(transitions, parameters)
         transitions.set("action", actions)
         transitions.set("next", batch.next_observations).set(VALID, batch.has_next)
