@@ -43,9 +43,10 @@ def memory(module, **kwargs):
 class Agent:
     """A recurrent policy in its parts: memory, head, and the whole."""
 
-    def __init__(self, module, gaussian=False):
+    def __init__(self, module, gaussian=False, **layers):
         torch.manual_seed(0)
-        self.memory = memory(module)
+        self.memory = memory(module, **layers)
+        self.depth = layers.get("num_layers", 1)
         self.layer = self.memory.lstm if module is LSTMModule else self.memory.gru
         self.states = [key for key in self.memory.in_keys[1:] if key != "is_init"]
         self.head = nn.Linear(WIDTH, ACTION)
@@ -92,7 +93,7 @@ def rollout(agent):
     """Sequences ``[SEQUENCES, STEPS]`` with recurrent states; an episode ends after three steps."""
     torch.manual_seed(1)
     observations = torch.randn(SEQUENCES, STEPS + 1, OBSERVATION)
-    states = [torch.zeros(SEQUENCES, 1, WIDTH) for _ in agent.states]
+    states = [torch.zeros(SEQUENCES, agent.depth, WIDTH) for _ in agent.states]
     steps = []
     for t in range(STEPS):
         first = torch.full([SEQUENCES], t in (0, 3))
@@ -147,6 +148,30 @@ class TestSingleSteps:
     def test_only_the_observation_moves(self, module):
         loss = L2C2Loss(ddpg(Agent(module)), NEAR, beta=0.0)
         assert loss.neighbor_transform().in_keys == ["observation"]
+
+    def test_a_critic_may_read_the_policys_recurrent_state(self, module):
+        """It is no observation of the critic's either: neighbors keep it."""
+        agent = Agent(module, gaussian=True)
+        state = agent.states[0]
+        value = TensorDictModule(
+            lambda observation, memory: observation.sum(-1, True) + memory.sum((-2, -1))[..., None],
+            in_keys=["observation", state],
+            out_keys=["state_value"],
+        )
+        loss = L2C2Loss(PPOLoss(agent.actor, value), NEAR, beta=1.0)
+        assert loss.neighbor_transform().in_keys == ["observation"]
+        assert loss.value_regularizer(rollout(agent))["loss_l2c2_critic"] > 0
+
+    def test_dropout_between_layers_is_off(self, module):
+        """At a next state that equals the state, with the same memory, nothing changes."""
+        agent = Agent(module, num_layers=2, dropout=0.5)
+        batch = rollout(agent)
+        for key in ("observation", *agent.states):
+            batch["next", key] = batch[key].clone()
+        batch["next", "is_init"] = batch["is_init"].clone()
+        loss = CATSLoss(ddpg(agent))
+        assert loss.policy_regularizer(batch)["loss_cats"] == 0
+        assert agent.layer.training and agent.layer.dropout == 0.5
 
     def test_the_next_action_is_the_one_that_was_taken(self, module):
         """CATS and CAPS: the rollout itself has the policy's next actions."""

@@ -35,6 +35,7 @@ from torchrl.objectives import (
     DTLoss,
     GAILLoss,
     IQLLoss,
+    REDQLoss,
     SACLoss,
     TD3Loss,
 )
@@ -899,6 +900,37 @@ class TestRelativeParts:
         plain = smooth(seeded(make), **GIVEN, fold=False, relative=False)
         plain = seeded(plain, batch.copy(), seed=2)
         assert metadata["penalty_l2c2_actor"] != plain["loss_l2c2_actor"]
+
+    def test_a_loss_that_reduces_its_terms_together(self):
+        """REDQ: values of both signs do not cancel in the size."""
+
+        class BothSigns(nn.Module):
+            def __init__(self):
+                super().__init__()
+                self.scale = nn.Parameter(torch.ones(1))
+
+            def forward(self, observation, action):
+                return self.scale * (100 * observation[..., :1].sign() + 0 * action[..., :1])
+
+        value = ValueOperator(BothSigns(), in_keys=["observation", "action"])
+        base = seeded(
+            lambda: REDQLoss(
+                gaussian_actor(), value, action_spec=BOUNDS, fixed_alpha=True, alpha_init=1e-6
+            )
+        )
+        batch = seeded(transitions, 12, seed=1)
+        batch["observation"][:, 0] = torch.tensor([1.0, -1.0]).repeat(6)
+        plain, relative = CATSLoss(base), CATSLoss(base).relative()
+        plain, relative = (seeded(loss, batch.copy(), seed=2) for loss in (plain, relative))
+        expected = 100 * plain["loss_cats"]
+        torch.testing.assert_close(relative["loss_cats"], expected, rtol=1e-3, atol=0.0)
+
+    def test_losses_without_an_action_value_in_the_policys_term(self):
+        with pytest.raises(TypeError, match="a penalty can be relative to action values"):
+            CATSLoss(iql()).relative()
+        loss = CATSLoss(cql()).relative().fold()
+        with pytest.raises(RuntimeError, match="actor_bc_loss has no action values"):
+            loss.actor_bc_loss(seeded(transitions, 12, seed=1))
 
     def test_separate_penalties_need_forward(self):
         """A loop of methods would add the penalty without its size."""

@@ -148,6 +148,7 @@ def noise_sensitivity(
             f"{type(actions).__name__}. With a TorchRL actor, return the 'action' that it writes "
             "under ExplorationType.DETERMINISTIC."
         )
+    scale = torch.as_tensor(scale).to(observations)
     change = policy(observations + scale * noise) - actions
     batch = change.shape[:-1]
     if (not batch and observations.ndim > 1) or observations.shape[: len(batch)] != batch:

@@ -13,7 +13,6 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torch.compiler import is_compiling
 from torch.distributions import Distribution, Independent
-from torch.nn.modules.dropout import _DropoutNd
 from torchrl.envs.utils import set_exploration_type
 from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import LossModule
@@ -23,6 +22,7 @@ from torchrl_l2c2.objectives._batch import at_rows
 from torchrl_l2c2.objectives._networks import (
     POLICY_NETWORK,
     NetworkSpec,
+    drops_out,
     inspect_network,
     is_ensemble,
     parameters_of,
@@ -93,14 +93,14 @@ class EvaluatedNetworks:
         """The sizes of the terms that this thread reduces; ``None`` outside of a measurement."""
         return self._sizes.get(_thread())
 
-    def measure(self, call: Callable[[], Any]) -> tuple[Any, Tensor | None]:
-        """Calls a method of the loss; returns its result and the size of the last reduced term."""
+    def measure(self, call: Callable[[], Any]) -> tuple[Any, list[Tensor]]:
+        """Calls a method of the loss; returns its result and the sizes of the reduced terms."""
         sizes = self._sizes[_thread()] = []
         try:
             result = call()
         finally:
             del self._sizes[_thread()]
-        return result, sizes[-1] if sizes else None
+        return result, sizes
 
     def inspect(self, loss: LossModule, networks: Iterable[str]) -> None:
         """Inspects these networks; refuses networks that cannot be evaluated at other states."""
@@ -418,7 +418,7 @@ def without_dropout(net: nn.Module) -> Iterator[None]:
 
     With dropout, two evaluations of one state differ, and a distance would measure the difference.
     """
-    layers = [m for m in net.modules() if isinstance(m, _DropoutNd) and m.training]
+    layers = [m for m in net.modules() if drops_out(m) and m.training]
     for layer in layers:
         layer.training = False
     try:

@@ -38,6 +38,9 @@ PARTS: dict[str, tuple[str, tuple[str, ...]]] = {
     "q_loss": ("value", ("loss_qvalue",)),
 }
 
+MEASURED_PARTS = [name for name, (_, targets) in PARTS.items() if targets is POLICY_LOSSES]
+"""Methods that compute the term to which a penalty is relative."""
+
 
 def fold_targets(term: str, trains_policy: bool, own: Iterable[str]) -> list[str]:
     """Finds the loss's own terms to which a penalty is added.
@@ -114,7 +117,8 @@ def make_part(
     def part(self: Any, tensordict: TensorDictBase, *args: Any, **kwargs: Any) -> Any:
         size = None
         if self._relative and is_measured:
-            out, size = self._evaluation.measure(lambda: method(self, tensordict, *args, **kwargs))
+            out, sizes = self._evaluation.measure(lambda: method(self, tensordict, *args, **kwargs))
+            size = sizes[-1] if sizes else None
         else:
             out = method(self, tensordict, *args, **kwargs)
         # Within forward, the penalty is added there.
@@ -140,11 +144,16 @@ def make_part(
         metadata = rest[0] if rest and hasattr(rest[0], "update") else {}
         own = [key for key in self.out_keys_source if key.startswith("loss")] or list(targets)
         returned = next((key for key in targets if key in own), None)
-        if not is_compiling():
-            self._watch.in_part = True
-        added = regularize(tensordict)
-        if not is_compiling():
-            self._watch.in_part = False
+        if self._relative and kind == "policy" and not is_measured:
+            raise RuntimeError(
+                f"{method.__name__} has no action values to which the penalty is relative: call "
+                "loss(batch) instead, or make the loss with relative=False and a gain."
+            )
+        outer = self._evaluation.begin_forward_pass()
+        try:
+            added = regularize(tensordict)
+        finally:
+            self._evaluation.end_forward_pass(outer)
         if self._relative and kind == "policy":
             self._make_relative(added, size, value, tensordict)
         for key, term in list(added.items()):

@@ -11,7 +11,13 @@ from tensordict.nn import ProbabilisticTensorDictModule
 from torch import nn
 from torch.nn.modules.batchnorm import _BatchNorm
 from torch.nn.modules.dropout import _DropoutNd
-from torchrl.modules import Delta, GRUModule, LSTMModule, TanhDelta
+from torchrl.modules import (
+    ConsistentDropoutModule,
+    Delta,
+    GRUModule,
+    LSTMModule,
+    TanhDelta,
+)
 from torchrl.objectives import IQLLoss, LossModule, PPOLoss, ReinforceLoss
 
 POLICY_NETWORK = "actor_network"
@@ -71,7 +77,8 @@ def inspect_network(loss: LossModule, network: str) -> NetworkSpec:
     """
     net, actor = getattr(loss, network), getattr(loss, POLICY_NETWORK, None)
     _check_declares_keys(net, network)
-    recurrent = _recurrent_inputs(net, network)
+    recurrent = _recurrent_inputs(net)
+    _check_recurrent(net, network, recurrent)
     stochastic, actions, made = False, _action_keys(loss), set()
     if actor is not None:
         stochastic = _is_stochastic(actor)
@@ -82,13 +89,14 @@ def inspect_network(loss: LossModule, network: str) -> NetworkSpec:
             actions = [_unnamed_action(loss, actor, made)]
     trunk = [key for key in net.in_keys if key in made - set(actions)]
     inputs = dict.fromkeys([*net.in_keys, *(actor.in_keys if trunk and actor is not None else ())])
-    if trunk:
-        recurrent = (*recurrent, *_recurrent_inputs(actor, POLICY_NETWORK))
+    of_policy = () if actor is None else _recurrent_inputs(actor)
+    recurrent = (*recurrent, *of_policy) if trunk else recurrent
     if network == POLICY_NETWORK:
         output = next((key for key in actions if key in made), None)
     else:
         output = _value_key(loss, network)
-    computed = made.union(actions, _parents(made), recurrent)
+    masks = (m.out_keys[1] for m in net.modules() if isinstance(m, ConsistentDropoutModule))
+    computed = made.union(actions, _parents(made), recurrent, of_policy, map(unravel_key, masks))
     return NetworkSpec(
         inputs=tuple(key for key in inputs if key not in trunk),
         states=tuple(key for key in inputs if key not in computed and not _is_private(key)),
@@ -98,9 +106,9 @@ def inspect_network(loss: LossModule, network: str) -> NetworkSpec:
         stochastic=stochastic,
         has_buffers=_has_buffers(loss, network),
         rowwise=not (
-            recurrent or any(isinstance(m, _BatchNorm | _DropoutNd) for m in net.modules())
+            recurrent or any(isinstance(m, _BatchNorm) or drops_out(m) for m in net.modules())
         ),
-        has_dropout=any(isinstance(m, _DropoutNd) for m in net.modules()),
+        has_dropout=any(map(drops_out, net.modules())),
         recurrent=tuple(dict.fromkeys(recurrent)),
     )
 
@@ -181,21 +189,32 @@ def _check_declares_keys(net: nn.Module, name: str) -> None:
         )
 
 
-def _recurrent_inputs(net: Any, name: str) -> tuple[NestedKey, ...]:
-    """Inputs of recurrent modules that carry the past; refuses modules that cannot take one step.
+def drops_out(module: nn.Module) -> bool:
+    """Checks whether a layer drops out numbers in training."""
+    own = isinstance(module, nn.RNNBase | nn.MultiheadAttention) and module.dropout > 0
+    return own or isinstance(module, _DropoutNd)
+
+
+def _steps(module: Any) -> tuple[NestedKey, ...]:
+    """The states from which a recurrent module can take one step; none for other modules."""
+    if isinstance(module, LSTMModule | GRUModule):
+        return tuple(map(unravel_key, module.in_keys[1:]))
+    return getattr(module, RECURRENT_KEYS, ())
+
+
+def _recurrent_inputs(net: nn.Module) -> tuple[NestedKey, ...]:
+    """Inputs of recurrent modules that carry the past."""
+    return tuple(key for module in net.modules() for key in _steps(module))
+
+
+def _check_recurrent(net: Any, name: str, carried: Iterable[NestedKey]) -> None:
+    """Refuses a recurrent network that cannot take a single step from given states.
 
     Raises:
         TypeError: a recurrent layer is not in an ``LSTMModule`` or ``GRUModule``, or a module with
             :data:`RECURRENT_KEYS`; or the network hands on another input to its next evaluation.
     """
-    carried: list[NestedKey] = []
-    known: set[int] = set()
-    for module in net.modules():
-        keys = getattr(module, RECURRENT_KEYS, ())
-        keys = module.in_keys[1:] if isinstance(module, LSTMModule | GRUModule) else keys
-        if keys:
-            carried += map(unravel_key, keys)
-            known |= {id(part) for part in module.modules()}
+    known = {id(part) for module in net.modules() if _steps(module) for part in module.modules()}
     layers = (m for m in net.modules() if isinstance(m, nn.RNNBase | nn.RNNCellBase))
     written = {unravel_key(key) for key in net.out_keys}
     others = set(net.in_keys) - set(carried)
@@ -206,7 +225,6 @@ def _recurrent_inputs(net: Any, name: str) -> tuple[NestedKey, ...]:
             "current one. Use TorchRL's LSTMModule or GRUModule, whose recurrent states are in the "
             "batch, or a feed-forward network."
         )
-    return tuple(carried)
 
 
 def parameters_of(loss: LossModule, network: str) -> TensorDictBase | None:

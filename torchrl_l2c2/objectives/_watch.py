@@ -26,13 +26,11 @@ class TermWatch:
 
     Attributes:
         progress_set: whether the progress of a ramp was set.
-        in_part: whether a method such as ``actor_loss`` computes the terms.
         pending: added terms that were never differentiated; ``None`` before the first call.
     """
 
     def __init__(self) -> None:
         self.progress_set = False
-        self.in_part = False
         self.pending: set[str] | None = None
         self._calls = 0
         self._forwards = 0
@@ -93,7 +91,7 @@ class TermWatch:
         if is_compiling() or loss._evaluation.forward_pass is not None:
             return
         self._warned.add("parts")
-        if of_policy and loss._relative and not self.in_part and "size" not in self._warned:
+        if of_policy and loss._relative and "size" not in self._warned:
             self._warned.add("size")
             warnings.warn(
                 f"policy_regularizer of {type(loss).__name__} does not know the size of the action "

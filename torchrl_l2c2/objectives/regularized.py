@@ -16,7 +16,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import dispatch
 from torch import Tensor
 from torch.compiler import is_compiling
-from torchrl.objectives import LossModule
+from torchrl.objectives import DiscreteIQLLoss, IQLLoss, LossModule
 
 from torchrl_l2c2._checks import as_number, check_of_each, check_real
 from torchrl_l2c2.objectives._batch import (
@@ -32,6 +32,7 @@ from torchrl_l2c2.objectives._batch import (
 )
 from torchrl_l2c2.objectives._evaluation import EvaluatedNetworks, Policy, SharedEvaluation
 from torchrl_l2c2.objectives._fold import (
+    MEASURED_PARTS,
     PARTS,
     add_penalty,
     fold_targets,
@@ -220,11 +221,9 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         outer = self._evaluation.begin_forward_pass()
         try:
             # The base loss draws its random numbers first: with one seed its terms stay the same.
-            terms = super().forward(tensordict)
+            terms, size = self._forward_and_size(super().forward, tensordict)
             added = self.policy_regularizer(tensordict)
             if self._relative:
-                assert self._evaluation.forward_pass is not None
-                size = self._evaluation.forward_pass.policy_size
                 self._make_relative(added, size, terms.get(RELATIVE_TO), tensordict)
             added.update(self.value_regularizer(tensordict))
         finally:
@@ -368,7 +367,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             The loss itself.
 
         Raises:
-            TypeError: the loss has no action value that trains a policy, as in PPO.
+            TypeError: the loss has no action value that trains a policy, as PPO and IQL.
             RuntimeError: in use, a method such as ``actor_loss`` is called by itself, and the
                 penalty is not folded.
 
@@ -382,7 +381,8 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             >>> loss = CATSLoss(loss, lambda_temporal=0.04).relative()
         """
         values = set(self.value_networks()) - {"critic_network"}
-        if not self.policy_networks() or not values:
+        imitates = isinstance(self, IQLLoss | DiscreteIQLLoss)  # weighs actions of the batch
+        if not self.policy_networks() or not values or imitates:
             raise TypeError(
                 "a penalty can be relative to action values that train a policy, as in SAC, TD3 "
                 f"and DDPG, and {type(self).__name__} has none: leave relative out."
@@ -390,11 +390,23 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         self._relative = True
         return self
 
+    def _forward_and_size(
+        self, forward: Callable[[TensorDictBase], TensorDictBase], tensordict: TensorDictBase
+    ) -> tuple[TensorDictBase, Tensor | None]:
+        """The loss's own terms, and the size of its policy term if it was measured."""
+        if not self._relative or any(hasattr(self, name) for name in MEASURED_PARTS):
+            terms = forward(tensordict)
+            assert self._evaluation.forward_pass is not None
+            return terms, self._evaluation.forward_pass.policy_size
+        # REDQLoss has no method for this term, which is the first that it reduces.
+        terms, sizes = self._evaluation.measure(lambda: forward(tensordict))
+        return terms, sizes[0] if sizes else None
+
     def _make_relative(
         self, added: TensorDictBase, size: Tensor | None, own: Tensor, tensordict: TensorDictBase
     ) -> None:
         """Multiplies policy terms by the size of the loss's own policy term."""
-        if size is None:  # REDQLoss has no method for this term.
+        if size is None:  # A loss that does not reduce it by _reduce_loss.
             size = own.detach().abs().mean()
             size = size / tensordict.numel() if self._term_reduction == "sum" else size
         for key in self.policy_terms:
@@ -1008,7 +1020,10 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         """As for the base loss; measures the term's size if this is asked for."""
         if (sizes := self._evaluation.sizes) is not None:
             mean = {**kwargs, "reduction": "mean"}
-            sizes.append(super()._reduce_loss(loss.detach().abs(), tensordict, **mean))
+            size = super()._reduce_loss(loss.detach().abs(), tensordict, **mean)
+            if self._term_reduction == "sum" and tensordict is not None:  # over an ensemble, too
+                size = size * (loss.numel() / tensordict.numel())
+            sizes.append(size)
         return super()._reduce_loss(loss, tensordict, **kwargs)
 
     def evaluate_at_batch(self, network: str, tensordict: TensorDictBase) -> TensorDictBase:
