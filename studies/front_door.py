@@ -255,7 +255,7 @@ def add_runs(
         train (callable): Returns the return and the action variation of a run.
     """
     torch.set_num_threads(1)
-    describe = ["git", "rev-parse", "--short=12", "HEAD"]
+    describe = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short=12", "HEAD"]
     commit = subprocess.run(describe, capture_output=True, text=True, check=True).stdout.strip()
     done = set()
     if path.exists():

@@ -187,11 +187,14 @@ def reacher_by_seed(runs: pd.DataFrame) -> str:
     groups = shown_groups(runs[runs["task"] == "reacher"])
     groups = [group for group in groups if group.first.method != "caps"]
     rows = [["seed", *(group.name for group in groups)]]
-    for together in zip(*(group.runs.itertuples() for group in groups), strict=True):
+    runs_of = [{run.seed: run for run in group.runs.itertuples()} for group in groups]
+    for seed in sorted({seed for runs in runs_of for seed in runs}):
+        found = (runs.get(seed) for runs in runs_of)
         cells = (
-            f"{r.late_sampled_return:.1f} / {r.late_sampled_action_variation:.3f}" for r in together
+            f"{r.late_sampled_return:.1f} / {r.late_sampled_action_variation:.3f}" if r else ""
+            for r in found
         )
-        rows.append([str(together[0].seed), *cells])
+        rows.append([str(seed), *cells])
     return pipe_table(rows)
 
 

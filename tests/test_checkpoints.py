@@ -1,6 +1,7 @@
 """Checkpoint files: whole or refused, the newest whole one first, and no code inside."""
 
 import io
+import json
 import pickle
 import struct
 
@@ -171,6 +172,24 @@ def test_a_line_that_the_disk_has_no_room_for_is_taken_back(tmp_path, monkeypatc
     with pytest.raises(OSError, match="No space left on device: the file could not be written"):
         append_line(path, "another\n")
     assert path.read_text() == "whole\n"
+
+
+def test_after_training_its_settings_and_versions_stay(tmp_path, monkeypatch):
+    """A test of another day does not change what the training was made with."""
+    before = ExperimentConfig(late_share=1.0, evaluate_every=5)
+    monkeypatch.setattr("torchrl_l2c2.experiment.run.folder.code_commit", lambda: "first")
+    prepare_folder(tmp_path, before.to_dict(), resumed=False, ended=False)
+    monkeypatch.setattr("torchrl_l2c2.experiment.run.folder.code_commit", lambda: "second")
+    again = ExperimentConfig(late_share=0.1, test_episodes=3)
+    prepare_folder(tmp_path, again.to_dict(), resumed=True, ended=True)
+    written = json.loads((tmp_path / "config.json").read_text())
+    assert (written["late_share"], written["evaluate_every"]) == (1.0, 5)
+    assert written["test_episodes"] == 3
+    versions = tmp_path / "versions.json"
+    assert json.loads(versions.read_text())["commit"] == "first"
+    for commit in ("first+second", "first+second"):  # It is continued there, twice.
+        prepare_folder(tmp_path, before.to_dict(), resumed=True, ended=False)
+        assert json.loads(versions.read_text())["commit"] == commit
 
 
 def test_a_run_that_begins_anew_keeps_nothing_of_the_one_before(tmp_path):

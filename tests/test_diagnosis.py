@@ -234,6 +234,22 @@ class TestWords:
         actions = torch.where(STEPS < 60, 1.0, 0.5 * SINE[:, 0]).unsqueeze(-1)
         assert "pinned at its upper bound in 60%" in said(made_up(actions), "pinned").text
 
+    def test_an_action_that_never_leaves_its_bound_is_pinned(self):
+        """Beside one that moves."""
+        actions = torch.cat((0.5 * SINE, torch.ones(len(SINE), 1)), -1)
+        assert "pinned at its upper bound in 100%" in said(made_up(actions), "pinned").text
+
+    def test_short_episodes_have_no_fast_frequencies(self):
+        for steps in range(4, 12):
+            actions = 0.1 * torch.linspace(0, 1, steps).square().unsqueeze(-1)
+            assert findings(made_up(actions))
+
+    def test_names_of_actions_are_no_formulas(self):
+        """Nor hidden from the legend."""
+        actions = torch.cat((SINE, SINE.roll(9)), -1)
+        shown = page([diagnose_actions(actions, action_names=["$\\torque$", "_hip"])])
+        assert "$\\torque$" in shown and "_hip" in shown
+
     def test_a_constant_action_stands_still(self):
         """Nothing else is said of it, but of its training."""
         still = made_up(torch.full((100, 1), 0.3) + 1e-4 * SINE, noise_share=1.0, spread=0.9)

@@ -473,7 +473,7 @@ def test_a_run_from_the_command_line_leaves_everything_behind(tmp_path):
     assert "task.episodes=350 to train on" in refused.stderr
     assert (run.folder / "policy.pt").exists() and (run.folder / "evaluation.json").exists()
     longer = run_train(*lengthless, "task.episodes=4", "test_episodes=0", folder=tmp_path)
-    said = "removed the results of the shorter run: evaluation.json, policy.pt, learning_curves.png"
+    said = "removed the results of the earlier policy: evaluation.json, policy.pt"
     assert said in longer.stdout + longer.stderr
     assert said in (run.folder / "train.log").read_text()
 

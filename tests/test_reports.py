@@ -43,7 +43,7 @@ from torchrl_l2c2.experiment.analysis.reports.statistics import (
     mean,
     probability_of_improvement,
 )
-from torchrl_l2c2.experiment.analysis.reports.table import known_tests
+from torchrl_l2c2.experiment.analysis.reports.table import known_tests, pipe_table
 from torchrl_l2c2.experiment.cli.report import main
 from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.run.finished import TESTS
@@ -418,6 +418,28 @@ class TestSettings:
             "replay.name": "prioritized",
             "task.noise_scale": "0.05",
         }
+
+    def test_a_task_of_ones_own_name_differs_by_its_environment(self):
+        """Else runs of two environments would be compared."""
+        task = {"name": "mine", "env_id": "Pendulum-v1"}
+        chosen = {"algorithm": {"name": "sac"}, "regularizer": {"name": "none"}}
+        config = ExperimentConfig.from_dict({"task": task, **chosen})
+        assert differences(config.to_dict()) == {"task.env_id": '"Pendulum-v1"'}
+
+
+def test_names_of_runs_are_no_markup():
+    """A run's name may be anything: it cannot write into the page, nor break a row."""
+    table = pipe_table([["task"], ["<img src=x>\n\n# heading | b"]])
+    assert table.splitlines()[2:] == [r"| &lt;img src=x>  # heading \| b |"]
+
+
+def test_records_without_results_are_one_line(tmp_path):
+    make_run(tmp_path / "run", make_config(), 10.0, 0.1)
+    records = records_of(read_runs(tmp_path))
+    tested = [column for column in records if column.startswith(("late_", "last_"))]
+    write_records(tmp_path / "empty.csv", records.assign(**dict.fromkeys(tested, math.nan)))
+    with pytest.raises(SystemExit, match="no run among these has the results of a test"):
+        main(["--from", str(tmp_path / "empty.csv")])
 
 
 class TestStatistics:

@@ -1015,6 +1015,17 @@ class TestStrength:
         assert "10 has half of the preset's Sm" in guide
         assert ratios["hopper_v5"][10.0] / ratios["hopper_v5"][1.0] == pytest.approx(0.5, abs=0.05)
 
+    def test_seeds_are_beside_their_own(self):
+        """Where a method lacks a seed, its cell is empty."""
+        runs = records("runs")
+        lacking = ~((runs["method"] == "none") & (runs["seed"] == 3))
+        whole, cut = (pages.reacher_by_seed(each).splitlines() for each in (runs, runs[lacking]))
+        assert [line for line in cut if not line.startswith("| 3 ")] == [
+            line for line in whole if not line.startswith("| 3 ")
+        ]
+        (row,) = (line for line in cut if line.startswith("| 3 "))
+        assert row.split("|")[2].strip() == ""
+
     def test_no_weaker_preset_by_the_rule(self):
         """On Pendulum every strength returns more than 5% less than the baseline."""
         found = strength.candidates()

@@ -12,13 +12,10 @@ from typing import Any
 from torchrl_l2c2.experiment.errors import OtherRunError, SimulatorError
 from torchrl_l2c2.experiment.run.checkpoints import CheckpointError, list_checkpoints, load_newest
 from torchrl_l2c2.experiment.run.files import read_config
-from torchrl_l2c2.experiment.run.folder import versions
+from torchrl_l2c2.experiment.run.folder import TRAINING_ONLY, versions
 from torchrl_l2c2.experiment.settings.config import ExperimentConfig
 from torchrl_l2c2.experiment.settings.identity import changed_settings, length_dependent_settings
 from torchrl_l2c2.experiment.settings.tasks import Budget, TaskConfig
-
-# Settings that may change, but have an effect only during training.
-TRAINING_ONLY = ("evaluate_every", "late_share")
 
 
 def check_same_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> None:
@@ -122,7 +119,7 @@ def warn_ignored_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> N
         UserWarning: For each changed setting.
     """
     for name in TRAINING_ONLY:
-        if saved[name] != now[name]:
+        if name in saved and saved[name] != now[name]:
             warnings.warn(
                 f"{name}={now[name]} has no effect: training is over in this folder, with "
                 f"{name}={saved[name]}. Choose another folder to train with {name}={now[name]}.",

@@ -231,7 +231,8 @@ def measure(actions: Tensor, spec: TensorSpec) -> dict[str, float]:
         for name, function in ACTION_MEASURES.items()
     }
     if isinstance(spec, Bounded) and spec.dtype.is_floating_point:
-        found["saturation"] = saturation(actions, spec.space.low, spec.space.high).item()
+        low, high = spec.space.low.flatten(), spec.space.high.flatten()
+        found["saturation"] = saturation(actions, low, high).item()
     return found
 
 

@@ -322,7 +322,7 @@ class Experiment:
         resumed = found is not None
         removed = prepare_folder(folder, self.config.to_dict(), resumed=resumed, ended=ended)
         if resumed and removed and not ended:
-            show_and_log(folder, f"removed the results of the shorter run: {', '.join(removed)}")
+            show_and_log(folder, f"removed the results of the earlier policy: {', '.join(removed)}")
 
     def _parts(self) -> dict[str, Any]:
         """Returns the objects with a state by their names in checkpoints."""

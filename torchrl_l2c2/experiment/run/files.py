@@ -76,7 +76,8 @@ def write_atomically(path: str | Path, content: bytes) -> None:
         OSError: If the file cannot be written. The old file is then unchanged.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.name}.partial")
+    # Another process may write the same file; a killed one leaves its file, which it writes again.
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     with _named(path):
         try:
             with open(temporary, "wb") as file:

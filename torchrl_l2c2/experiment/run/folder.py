@@ -8,7 +8,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from torchrl_l2c2.experiment.run.files import write_atomically, write_json
+from torchrl_l2c2.experiment.run.files import read_json, write_atomically, write_json
 from torchrl_l2c2.experiment.run.finished import is_tested
 
 VERSIONED = (
@@ -45,6 +45,8 @@ Play test episodes:
 
     python -m torchrl_l2c2 evaluate FOLDER --episodes 100
 """
+# Settings that may change, but have an effect only during training.
+TRAINING_ONLY = ("evaluate_every", "late_share")
 # Files written after training, in addition to evaluation.json.
 FINAL_FILES = ("video.mp4", "policy.pt", "learning_curves.png", "diagnosis.html")
 EXPORT_FILES = tuple(f"export/{name}" for name in ("policy.onnx", "policy.pt2", "contract.json"))
@@ -59,7 +61,8 @@ def prepare_folder(
 
     Outdated results are removed first: a test with other settings, and the final files of a shorter
     run that is extended. If the process is killed, the folder has the old run or an unfinished run,
-    never new settings with an old policy.
+    never new settings with an old policy. After training, settings and versions of the training
+    stay. A run that was continued at another commit has both, such as ``"a+b"``.
 
     Args:
         folder (Path): Run folder.
@@ -78,10 +81,21 @@ def prepare_folder(
     removed = [name for name in outdated if (folder / name).exists()]
     for name in removed:
         (folder / name).unlink()
+    before = {name: _written(folder / name) for name in ("config.json", "versions.json")}
+    if ended and before["config.json"]:
+        kept = {k: v for k, v in before["config.json"].items() if k in TRAINING_ONLY}
+        settings = {**settings, **kept}
     write_json(folder / "config.json", settings)
-    write_json(folder / "versions.json", {**versions(), "commit": code_commit()})
+    if not ended or not before["versions.json"]:
+        commits = (before["versions.json"].get("commit", "") if resumed else "", code_commit())
+        commit = "+".join(dict.fromkeys("+".join(filter(None, commits)).split("+")))
+        write_json(folder / "versions.json", {**versions(), "commit": commit})
     write_atomically(folder / "README.txt", README.encode())
     return removed
+
+
+def _written(path: Path) -> dict[str, Any]:
+    return read_json(path) if path.exists() else {}
 
 
 def versions() -> dict[str, str]:

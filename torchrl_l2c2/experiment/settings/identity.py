@@ -185,8 +185,8 @@ def read_differences(line: str) -> dict[str, str]:
 
 def _names(config: Mapping[str, Any], groups: Any) -> dict[str, Any]:
     named = {group: {"name": config[group]["name"]} for group in groups if group in config}
-    if named["task"]["name"] not in TASKS:  # A user's own task is identified by its env_id.
-        named["task"]["env_id"] = config["task"]["env_id"]
+    if (name := named["task"]["name"]) not in TASKS:  # task=gymnasium names a task by its env_id.
+        named["task"]["env_id"] = name
     return named
 
 

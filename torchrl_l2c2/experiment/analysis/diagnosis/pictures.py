@@ -263,7 +263,9 @@ def _limits(constants: Iterable[Tensor]) -> tuple[float, float]:
 
 
 def _line(place: int, number: int, one: Diagnosis) -> dict[str, Any]:
-    label = one.action_name(number)
+    # Without TeX; matplotlib hides labels that begin with an underscore.
+    label = one.action_name(number).replace("$", r"\$")
+    label = f"\u200b{label}" if label.startswith("_") else label
     return {"color": COLORS[place], "linewidth": 0.9, "markersize": 3, "label": label}
 
 

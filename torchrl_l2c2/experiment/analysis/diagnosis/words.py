@@ -184,17 +184,17 @@ def _grouped(found: Iterable[tuple[str, Finding]]) -> Iterator[Finding]:
 
 
 def _actions(diagnosis: Diagnosis) -> Iterator[tuple[str, Finding]]:
-    """Findings about each action dimension that moves, by the size of its changes, and its name."""
+    """Findings about each action that moves or is at a bound, largest changes first, and names."""
     relative = diagnosis.relative
     changes = relative.diff(dim=0).abs().mean(0)
     for number in changes.argsort(descending=True).tolist():
         action = relative[:, number : number + 1]
-        if action.std() <= threshold("STILL"):
-            continue
         name, change = diagnosis.action_name(number), changes[number].item()
         at_bounds = saturation(action, 0.0, 1.0).item() if diagnosis.bounded else 0.0
         if at_bounds >= threshold("BANG_BANG"):
             yield name, _at_bounds(name, action, at_bounds)
+        if action.std() <= threshold("STILL"):
+            continue
         gain, rough = previous_action_gain(action).item(), roughness(action).item()
         if gain <= threshold("FLIPS"):
             yield name, _flips(name, action, gain, diagnosis.rate)
@@ -255,6 +255,8 @@ def _peak(action: Tensor, above: float) -> float | None:
     window = torch.hann_window(len(action), dtype=action.dtype)
     heights = torch.fft.rfft((action - action.mean()) * window).abs()
     first = math.ceil(above * len(action))
+    if first >= len(heights):  # The episode is too short for fast frequencies.
+        return None
     peak = first + int(heights[first:].argmax())
     slower = heights[peak // 3 : peak - 2]
     if len(slower) and slower.max() > TAIL * heights[peak]:

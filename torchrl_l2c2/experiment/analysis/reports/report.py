@@ -10,9 +10,10 @@ import pandas as pd
 
 from torchrl_l2c2.experiment.analysis.document import data_uri, render
 from torchrl_l2c2.experiment.analysis.reports.figures import draw_learning_curves, draw_plane
-from torchrl_l2c2.experiment.analysis.reports.groups import group_records, settings_notes
+from torchrl_l2c2.experiment.analysis.reports.groups import Group, group_records, settings_notes
 from torchrl_l2c2.experiment.analysis.reports.records import find_runs, records_of
 from torchrl_l2c2.experiment.analysis.reports.table import comparison_table, known_tests
+from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.run.files import make_folder, read_back, write_atomically
 from torchrl_l2c2.experiment.run.finished import QUANTITIES, FinishedRun
 from torchrl_l2c2.experiment.settings.naming import unique
@@ -47,8 +48,19 @@ def printed_table(records: pd.DataFrame) -> str:
     It has the test of the last policy with mean actions, or else the first recorded test.
     """
     groups = group_records(records)
-    table = comparison_table(known_tests(groups)[0], groups)
+    table = comparison_table(_shown_test(groups), groups)
     return "\n\n".join([table.markdown(), *settings_notes(groups)])
+
+
+def _shown_test(groups: Sequence[Group]) -> str:
+    """The last policy's test with mean actions, or else the first that was recorded.
+
+    Raises:
+        UserError: no run has a test.
+    """
+    if not (known := known_tests(groups)):
+        raise UserError("no run among these has the results of a test: add runs with test episodes")
+    return known[0]
 
 
 def sweep_summary(folders: Sequence[str | Path]) -> str:
@@ -83,7 +95,7 @@ def write_report(
         Path: The page, which contains its pictures and needs no other file.
     """
     groups = group_records(records)
-    test = known_tests(groups)[0]
+    test = _shown_test(groups)
     table = comparison_table(test, groups)
     notes = [*notes, *settings_notes(groups)]
     titles = {"plane.svg": "plane"}

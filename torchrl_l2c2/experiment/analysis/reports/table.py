@@ -75,9 +75,14 @@ def pipe_table(lines: Sequence[Sequence[str]]) -> str:
         | --- | --- |
         | 2 | 4 |
     """
-    columns, *rows = ([cell.replace("|", "\\|") for cell in line] for line in lines)
+    columns, *rows = ([_cell(text) for text in line] for line in lines)
     ruled = [columns, ["---"] * len(columns), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in ruled)
+
+
+def _cell(text: str) -> str:
+    """Text of a cell: without line breaks, and without HTML, which a run's name may have."""
+    return " ".join(text.replace("|", "\\|").replace("<", "&lt;").split("\n"))
 
 
 @dataclass(frozen=True)
