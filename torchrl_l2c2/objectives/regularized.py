@@ -109,6 +109,9 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             calls of a compiled loss.
         regularizer_gain (Tensor): the factor at present, at least 0; initially 1. A ramp sets it at
             every :meth:`set_progress`. Without a ramp it is the strength.
+        skip_ends (bool): whether transitions that end an episode are left out of comparisons with
+            the next state. It describes the environment: ``True`` in one of nested regularizers
+            holds for all. If each agent has its own end, one agent's end leaves out the transition.
         policy_terms (frozenset of str): the added ``loss_*`` keys that train the policy.
         auxiliary_terms (frozenset of str): the added ``loss_*`` keys that train networks of a
             regularizer, such as a predictor.

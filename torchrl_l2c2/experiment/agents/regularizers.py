@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import singledispatch
+from inspect import signature
 
 import torch
 from torchrl.objectives import LossModule
@@ -85,52 +87,23 @@ def _l2c2(config: L2C2Config, loss: LossModule) -> LossModule:
     )
 
 
-@wrap.register
-def _caps(config: CAPSConfig, loss: LossModule) -> LossModule:
-    return CAPSLoss(
-        loss, config.sigma, config.lambda_temporal, config.lambda_spatial, mean=config.mean
-    )
+def _with_settings(make: Callable[..., LossModule]) -> Callable[..., LossModule]:
+    """Makes a function that passes the settings that have the names of arguments."""
+
+    def wrapped(config: RegularizerConfig, loss: LossModule) -> LossModule:
+        settings = {k: v for k, v in vars(config).items() if k in signature(make).parameters}
+        previous = {"previous_key": PREVIOUS} if config.reads_previous else {}
+        return make(loss, **settings, **previous)
+
+    return wrapped
 
 
-@wrap.register
-def _cats(config: CATSConfig, loss: LossModule) -> LossModule:
-    return CATSLoss(loss, config.lambda_temporal, mean=config.mean)
-
-
-@wrap.register
-def _grad_caps(config: GradCAPSConfig, loss: LossModule) -> LossModule:
-    return GradCAPSLoss(
-        loss, config.lambda_temporal, config.epsilon, previous_key=PREVIOUS, mean=config.mean
-    )
-
-
-@wrap.register
-def _asap(config: ASAPConfig, loss: LossModule) -> LossModule:
-    return ASAPLoss(
-        loss,
-        config.lambda_spatial,
-        config.lambda_temporal,
-        config.lambda_grad,
-        config.epsilon,
-        previous_key=PREVIOUS,
-        mean=config.mean,
-    )
-
-
-@wrap.register
-def _sr2l(config: SR2LConfig, loss: LossModule) -> LossModule:
-    return SR2LLoss(
-        loss,
-        config.epsilon,
-        config.coeff,
-        steps=config.steps,
-        policy_distance=config.policy_distance,
-    )
-
-
-@wrap.register
-def _lcp(config: LCPConfig, loss: LossModule) -> LossModule:
-    return LCPLoss(loss, config.coeff, of=config.of)
+wrap.register(CAPSConfig, _with_settings(CAPSLoss))
+wrap.register(CATSConfig, _with_settings(CATSLoss))
+wrap.register(GradCAPSConfig, _with_settings(GradCAPSLoss))
+wrap.register(ASAPConfig, _with_settings(ASAPLoss))
+wrap.register(SR2LConfig, _with_settings(SR2LLoss))
+wrap.register(LCPConfig, _with_settings(LCPLoss))
 
 
 def make_neighborhood(config: RegularizerConfig) -> Neighborhood | None:
