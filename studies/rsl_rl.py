@@ -31,6 +31,8 @@ def recorded(path: Path, task: str) -> tuple[Group, Group]:
     measures = ("return", "action_variation")
     runs = pd.read_csv(path).rename(columns={name: f"{TEST}_{name}" for name in measures})
     runs = runs[runs["algorithm"] == task]
+    pairs = runs.groupby("seed")["method"].nunique()  # A seed without its pair is left out.
+    runs = runs[runs["seed"].isin(pairs[pairs == len(METHODS)].index)]
     baseline, smooth = (Group(runs[runs["method"] == method], method) for method in METHODS)
     return smooth, baseline
 
