@@ -10,8 +10,8 @@ cd "$(dirname "$0")/.."
 # Tests that need no package of the extra "experiment".
 tests="
   adaterm caps checks distances l2c2 loss_contract metrics modules neighborhood pitfalls
-  policy_distances ppo_rpe precision properties regularized rsl_rl several_devices smooth transforms
-  updaters
+  policy_distances ppo_rpe precision properties recurrent regularized rsl_rl several_devices smooth
+  transforms updaters
 "
 tools=(pytest pytest-xdist hypothesis scipy gymnasium)
 
