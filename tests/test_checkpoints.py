@@ -190,6 +190,9 @@ def test_after_training_its_settings_and_versions_stay(tmp_path, monkeypatch):
     for commit in ("first+second", "first+second"):  # It is continued there, twice.
         prepare_folder(tmp_path, before.to_dict(), resumed=True, ended=False)
         assert json.loads(versions.read_text())["commit"] == commit
+    versions.write_text("{")  # Damaged: the run goes on, and writes it anew.
+    prepare_folder(tmp_path, before.to_dict(), resumed=True, ended=False)
+    assert json.loads(versions.read_text())["commit"] == "second"
 
 
 def test_a_run_that_begins_anew_keeps_nothing_of_the_one_before(tmp_path):

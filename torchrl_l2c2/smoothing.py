@@ -143,11 +143,11 @@ def _chosen(loss: LossModule, method: str, overrides: Mapping[str, Any]) -> Pres
             f"{chosen.tasks}, and not tried with {name}.",
             stacklevel=3,
         )
-    _warn_of_units(method, chosen, overrides)
+    _warn_of_mismatch(method, chosen, overrides)
     return chosen.overridden(overrides)
 
 
-def _warn_of_units(method: str, chosen: Preset, overrides: Mapping[str, Any]) -> None:
+def _warn_of_mismatch(method: str, chosen: Preset, overrides: Mapping[str, Any]) -> None:
     """Warns of a neighborhood or a gain that probably does not suit the preset."""
     name, near = GAIN_SETTING[method], overrides.get("neighborhood")
     kind = getattr(near, "neighbors", None)

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torchrl.modules import IndependentNormal
 
 from torchrl_l2c2.objectives import SharedEvaluation
-from torchrl_l2c2.rsl_rl.storage import RECURRENT_PARTS
+from torchrl_l2c2.rsl_rl.storage import recurrent_keys
 
 MEAN, SCALE, VALUE, VALID = "loc", "scale", "state_value", "valid"
 """Entries of a batch: the policy's parameters, the value, and the mask of known transitions."""
@@ -129,8 +129,7 @@ def state_keys(model: MLPModel, name: str) -> tuple[str, ...]:
     """
     if not model.is_recurrent:
         return ()
-    parts = RECURRENT_PARTS if isinstance(model.rnn.rnn, nn.LSTM) else RECURRENT_PARTS[:1]
-    return tuple(f"recurrent_{name}_{part}" for part in parts)
+    return recurrent_keys(name, 2 if isinstance(model.rnn.rnn, nn.LSTM) else 1)
 
 
 def write_parameters(tensordict: TensorDictBase, parameters: tuple[Tensor, ...]) -> TensorDictBase:

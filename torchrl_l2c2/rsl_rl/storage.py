@@ -13,8 +13,10 @@ from torch import Tensor
 # Entry of the observations with their rows in the rollout, while a batch is drawn.
 ROW = "_row"
 
-RECURRENT_PARTS = ("h", "c")
-"""Ends of the keys of recurrent states: of a GRU the first, of an LSTM both."""
+
+def recurrent_keys(name: str, count: int) -> tuple[str, ...]:
+    """Keys of a model's recurrent states in batches: one of a GRU, two of an LSTM."""
+    return tuple(f"recurrent_{name}_{part}" for part in "hc"[:count])
 
 
 class SuccessorStorage(RolloutStorage):
@@ -105,14 +107,13 @@ class SuccessorStorage(RolloutStorage):
     def _recurrent_states(self) -> TensorDict:
         """The recurrent states of all models, ``[steps * num_envs, layers, width]``."""
         saved = {"actor": self.saved_hidden_state_a, "critic": self.saved_hidden_state_c}
-        return TensorDict(
-            {
-                f"recurrent_{name}_{part}": state.transpose(1, 2).flatten(0, 1)
-                for name, states in saved.items()
-                for part, state in zip(RECURRENT_PARTS, states or (), strict=False)
-            },
-            batch_size=[self.observations.numel()],
-        )
+        found = TensorDict(batch_size=[self.observations.numel()])
+        for name, states in saved.items():
+            for key, state in zip(
+                recurrent_keys(name, len(states or ())), states or (), strict=True
+            ):
+                found.set(key, state.transpose(1, 2).flatten(0, 1))
+        return found
 
     def _find_finals(self) -> tuple[Tensor, TensorDictBase] | None:
         """The index of each row's final observation, -1 without one, and these observations."""

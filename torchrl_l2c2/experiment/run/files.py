@@ -76,8 +76,7 @@ def write_atomically(path: str | Path, content: bytes) -> None:
         OSError: If the file cannot be written. The old file is then unchanged.
     """
     path = Path(path)
-    # Another process may write the same file; a killed one leaves its file, which it writes again.
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    temporary = path.with_name(f".{path.name}.partial")
     with _named(path):
         try:
             with open(temporary, "wb") as file:

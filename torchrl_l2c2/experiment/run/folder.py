@@ -8,6 +8,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.run.files import read_json, write_atomically, write_json
 from torchrl_l2c2.experiment.run.finished import is_tested
 
@@ -87,15 +88,18 @@ def prepare_folder(
         settings = {**settings, **kept}
     write_json(folder / "config.json", settings)
     if not ended or not before["versions.json"]:
-        commits = (before["versions.json"].get("commit", "") if resumed else "", code_commit())
-        commit = "+".join(dict.fromkeys("+".join(filter(None, commits)).split("+")))
-        write_json(folder / "versions.json", {**versions(), "commit": commit})
+        earlier = before["versions.json"].get("commit", "").split("+") if resumed else []
+        commits = dict.fromkeys(commit for commit in [*earlier, code_commit()] if commit)
+        write_json(folder / "versions.json", {**versions(), "commit": "+".join(commits)})
     write_atomically(folder / "README.txt", README.encode())
     return removed
 
 
 def _written(path: Path) -> dict[str, Any]:
-    return read_json(path) if path.exists() else {}
+    """Reads a file that is written anew; empty if it is missing or damaged."""
+    with contextlib.suppress(FileNotFoundError, UserError):
+        return read_json(path)
+    return {}
 
 
 def versions() -> dict[str, str]:
