@@ -307,8 +307,10 @@ def spread_rows(value: Tensor, rows: Tensor, shape: torch.Size) -> Tensor:
     return spread.reshape(*shape, *rest)
 
 
-def at_rows(tensordict: TensorDictBase, rows: Tensor, dim: int = 0) -> TensorDictBase:
-    """Selects rows of a batch by indices in the flattened batch, behind ``dim`` dimensions."""
+def at_rows(tensordict: TensorDictBase, rows: Tensor | None, dim: int = 0) -> TensorDictBase:
+    """Selects rows by indices in the flattened batch, behind ``dim`` dimensions; ``None``: all."""
+    if rows is None:
+        return tensordict
     if tensordict.ndim > dim + 1:
         tensordict = tensordict.flatten(dim, tensordict.ndim - 1)
     return tensordict[:, rows] if dim else tensordict[rows]

@@ -121,7 +121,7 @@ class CAPSLoss(RegularizedLoss):
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
         terms = super().policy_regularizer(tensordict)
         rows = self.sample_rows("caps", tensordict, self.caps_fraction)
-        batch = tensordict if rows is None else at_rows(tensordict, rows)
+        batch = at_rows(tensordict, rows)
         transitions = self.transitions(batch, self.policy_networks(), labels=True)
         counts = self.counted(batch, transitions)
         policies = self.policies_at(tensordict, self._states(batch, transitions), rows)

@@ -92,7 +92,7 @@ class CATSLoss(RegularizedLoss):
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
         terms = super().policy_regularizer(tensordict)
         rows = self.sample_rows("cats", tensordict, self.cats_fraction)
-        batch = tensordict if rows is None else at_rows(tensordict, rows)
+        batch = at_rows(tensordict, rows)
         transitions = self.transitions(batch, self.policy_networks(), labels=True)
         counts = self.counted(batch, transitions)
         later = {key: finite_successor(*pair)[None] for key, pair in transitions.items()}

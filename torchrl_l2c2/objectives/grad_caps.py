@@ -172,7 +172,7 @@ class GradCAPSLoss(RegularizedLoss):
     def _evaluate_means(self, tensordict: TensorDictBase) -> SuccessiveMeans:
         squashed = self.grad_caps_mean == "action"
         rows = self.sample_rows("grad_caps", tensordict, self.grad_caps_fraction)
-        batch = tensordict if rows is None else at_rows(tensordict, rows)
+        batch = at_rows(tensordict, rows)
         counts = self.counted(batch, self.transitions(batch, self.policy_networks()))
         states = self._states_around(batch)
         policies = self.policies_at(tensordict, states, rows)

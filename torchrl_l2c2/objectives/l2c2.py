@@ -385,7 +385,7 @@ class L2C2Loss(RegularizedLoss):
             neighbor = self._draw(tensordict, rows)
         else:
             self._watch.see_neighbors(self, neighbor, tensordict, self.l2c2_neighborhood)
-            neighbor = neighbor if rows is None else at_rows(neighbor, rows)
+            neighbor = at_rows(neighbor, rows)
         states, distance = _read_neighbors(neighbor, self.l2c2_neighbor_key)
         counts = distance[0].isfinite()
         self._watch.see_counts(self, counts, self.l2c2_neighborhood.max_step)
@@ -397,8 +397,7 @@ class L2C2Loss(RegularizedLoss):
         """Draws the entry that NeighborTransform would have written."""
         networks = [*self._l2c2_policies, *self._l2c2_values]
         keys = self.l2c2_moved_keys or list(self.transitions(tensordict, networks))
-        states = tensordict.select(*keys, *map(next_key, keys)).detach()
-        states = states if rows is None else at_rows(states, rows)
+        states = at_rows(tensordict.select(*keys, *map(next_key, keys)).detach(), rows)
         return draw_neighbors(states, self.l2c2_neighborhood, keys, self.l2c2_num_samples)
 
     def _diagnostic(self, value: Tensor, near: Neighbors, tensordict: TensorDictBase) -> Tensor:

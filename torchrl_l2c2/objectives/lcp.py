@@ -101,7 +101,7 @@ class LCPLoss(RegularizedLoss):
         terms = super().policy_regularizer(tensordict)
         check_takes_gradients("LCPLoss")
         rows = self.sample_rows("lcp", tensordict, self.lcp_fraction)
-        batch = tensordict if rows is None else at_rows(tensordict, rows)
+        batch = at_rows(tensordict, rows)
         read = self.policy_states(batch)
         with torch.enable_grad():
             states = {key: state.unsqueeze(0).requires_grad_() for key, state in read.items()}

@@ -115,7 +115,7 @@ class SR2LLoss(RegularizedLoss):
         terms = super().policy_regularizer(tensordict)
         check_takes_gradients("SR2LLoss")
         rows = self.sample_rows("sr2l", tensordict, self.sr2l_fraction)
-        batch = tensordict if rows is None else at_rows(tensordict, rows)
+        batch = at_rows(tensordict, rows)
         states = self.policy_states(batch)
 
         def policy_at(places: States) -> Policy:
