@@ -9,6 +9,7 @@ from importlib import import_module
 from importlib.util import find_spec
 
 from torchrl_l2c2._version import __version__
+from torchrl_l2c2.experiment.errors import how_to_install
 
 # Packages of the experiment extra, which the components do not need.
 PACKAGES = ("gymnasium", "hydra", "pydantic", "matplotlib", "pandas", "jinja2", "tqdm", "filelock")
@@ -49,10 +50,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         hint = f" Did you mean: train {' '.join(given)}" if "=" in name else ""
         sys.exit(f"error: Expected one of {', '.join(COMMANDS)}, got {name!r}.{hint}")
     if missing := [each for each in PACKAGES if find_spec(each) is None]:
-        sys.exit(
-            f"error: {name} needs the packages {', '.join(missing)}. In a clone of the repository, "
-            'run: pip install -e ".[experiment]"'
-        )
+        needed = ", ".join(missing)
+        sys.exit(f"error: {name} needs the packages {needed}. {how_to_install('experiment')}")
     try:
         command = import_module(f"torchrl_l2c2.experiment.cli.{COMMANDS[name][0]}")
     except KeyboardInterrupt:  # Imports take a second.
