@@ -43,8 +43,8 @@ class RegularizedPPO(PPO):
     settings are printed in one line.
 
     Args:
-        actor (MLPModel): the policy, feed-forward and normal.
-        critic (MLPModel): the value function, feed-forward.
+        actor (MLPModel): the policy, a normal distribution; feed-forward, or an ``RNNModel``.
+        critic (MLPModel): the value function; feed-forward, or an ``RNNModel``.
         storage (RolloutStorage): the storage that rsl_rl has made; its buffers are taken over.
         *args: arguments of rsl_rl's PPO.
         regularizer_cfg (dict, optional): settings of the regularizer. ``method`` is a method of

@@ -139,8 +139,7 @@ class NeighborTransform(RandomTransform):
         }
 
     Several keys are parts of one state. Their displacements are independent in a box and the
-    same on a line;
-    the state's distance is the largest distance of its parts.
+    same on a line; the state's distance is the largest distance of its parts.
 
     .. note::
         A transform that widens the step from :math:`s` to :math:`s'`, such as
