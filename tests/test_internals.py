@@ -301,7 +301,6 @@ ALLOWED = {
     **dict.fromkeys(("_BatchNorm", "_DropoutNd"), "all layers whose rows depend on each other"),
     "_vmap_func": "ensembles as TorchRL's losses evaluate them",
     **dict.fromkeys(("_param", "_mask", "_sparse_mask"), "logits without a second normalization"),
-    "_sum_rightmost": "as torch.distributions sums the dimensions of an event",
     **dict.fromkeys(("_normalize_hydra_key", "_normalize_hydra_keys"), "keys in configurations"),
 }
 

@@ -19,7 +19,6 @@ from torch.distributions import (
     OneHotCategorical,
     TransformedDistribution,
 )
-from torch.distributions.utils import _sum_rightmost
 from torchrl.modules import MaskedCategorical, TanhNormal
 
 LogAffinity = Callable[[Any, Any], Tensor]
@@ -85,7 +84,7 @@ def log_affinity(p: Distribution, q: Distribution) -> Tensor:
 
 def sum_to(x: Tensor, ndim: int) -> Tensor:
     """The sum over all but the first dimensions."""
-    return _sum_rightmost(x, x.ndim - ndim)
+    return x if x.ndim == ndim else x.flatten(ndim).sum(-1)
 
 
 @register_hellinger(Normal)
@@ -146,7 +145,7 @@ def _independent(p: Independent[Any], q: Independent[Any]) -> Tensor:
     base = log_affinity(p.base_dist, q.base_dist)
     if base is NotImplemented:
         return NotImplemented
-    return _sum_rightmost(base, p.reinterpreted_batch_ndims)
+    return sum_to(base, base.ndim - p.reinterpreted_batch_ndims)
 
 
 @register_hellinger(TransformedDistribution)
