@@ -721,7 +721,7 @@ class TestRun:
             lambda *_, **__: [episode],
         )
         learned, read = [], _batch(agent, config, env, 3)
-        learner = Learner(agent, make_replay(config), reward_factor=0.01, compile=False)
+        learner = Learner(agent, make_replay(config, agent.loss), reward_factor=0.01, compile=False)
         monkeypatch.setattr(learner.replay, "extend", learned.append)
         learner.remember(agent.normalization.normalized(episode))
         expected = torch.tensor([[0.01], [0.1], [-0.1]])

@@ -29,7 +29,7 @@ from torchrl_l2c2.experiment import (
 )
 from torchrl_l2c2.experiment.agents._torchrl_internals import load_replay_state, replay_state
 from torchrl_l2c2.experiment.learn.compilation import compiler_available
-from torchrl_l2c2.experiment.learn.replay import make_buffer, make_replay
+from torchrl_l2c2.experiment.learn.replay import make_buffer
 from torchrl_l2c2.experiment.learn.update import ReplayUpdate, make_update
 from torchrl_l2c2.experiment.settings.fields import SettingError
 
@@ -306,8 +306,8 @@ def test_a_rollout_that_is_shorter_than_a_batch_is_learned_from_whole():
 def test_a_buffer_of_rollouts_has_room_for_the_longest(num_envs, rows):
     """Exactly the frames from several simulators; of whole episodes, the last may go beyond."""
     algorithm = PPOConfig(hidden=(8,), frames=40, num_envs=num_envs)
-    replay = make_replay(replace(CASES["rollout"], algorithm=algorithm))
-    assert replay.storage.max_size == rows
+    experiment = Experiment(replace(CASES["rollout"], algorithm=algorithm))
+    assert experiment.learner.replay.storage.max_size == rows
 
 
 def begin(experiment, state):
@@ -330,5 +330,5 @@ def test_priorities_need_a_torch_with_which_torchrls_trees_load(monkeypatch):
     monkeypatch.setattr("torchrl_l2c2.experiment.learn.replay.SumSegmentTreeFp32", None)
     needed = r"'prioritized' needs .* torch 2\.14 or newer, got torch \S+\. Set replay=uniform"
     with pytest.raises(SettingError, match=needed):
-        make_replay(PAPER)
-    assert len(make_replay(replace(PAPER, replay=UniformReplayConfig()))) == 0
+        make_buffer(PAPER.replay, 0, 0)
+    assert len(make_buffer(UniformReplayConfig(), 0, 0)) == 0

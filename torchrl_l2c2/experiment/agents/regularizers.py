@@ -1,4 +1,4 @@
-"""Regularized losses and sampled neighbors, from settings."""
+"""Regularized losses from settings."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Callable
 from functools import singledispatch
 from inspect import signature
 
-import torch
 from torchrl.objectives import LossModule
 
 from torchrl_l2c2.experiment.envs.frames import PREVIOUS
@@ -32,7 +31,6 @@ from torchrl_l2c2.objectives import (
     LCPLoss,
     SR2LLoss,
 )
-from torchrl_l2c2.transforms import NeighborTransform
 
 
 def add_regularizer(loss: LossModule, config: RegularizerConfig) -> LossModule:
@@ -117,12 +115,3 @@ def make_neighborhood(config: RegularizerConfig) -> Neighborhood | None:
         neighbors=config.neighbors,
         max_step=config.max_step,
     )
-
-
-def make_neighbors(
-    config: RegularizerConfig, generator: torch.Generator
-) -> NeighborTransform | None:
-    """Returns the transform that samples neighbors in the replay buffer, or ``None``."""
-    if not isinstance(config, L2C2Config) or (near := make_neighborhood(config)) is None:
-        return None
-    return NeighborTransform(near, num_samples=config.num_samples, generator=generator)

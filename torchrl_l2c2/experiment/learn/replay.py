@@ -10,8 +10,8 @@ from torchrl.data import (
     TensorDictReplayBuffer,
 )
 from torchrl.data.replay_buffers.samplers import SumSegmentTreeFp32
+from torchrl.objectives import LossModule
 
-from torchrl_l2c2.experiment.agents.regularizers import make_neighbors
 from torchrl_l2c2.experiment.envs.environments import time_limit
 from torchrl_l2c2.experiment.settings.config import ExperimentConfig
 from torchrl_l2c2.experiment.settings.fields import SettingError
@@ -20,16 +20,18 @@ from torchrl_l2c2.experiment.settings.replay import (
     ReplayConfig,
     RolloutReplayConfig,
 )
+from torchrl_l2c2.objectives import L2C2Loss
 
 # Added to the run's seed for its neighbors, to differ from the seeds of tests and noise.
 NEIGHBOR_SEED = 32_452_843
 
 
-def make_replay(config: ExperimentConfig) -> TensorDictReplayBuffer:
+def make_replay(config: ExperimentConfig, loss: LossModule) -> TensorDictReplayBuffer:
     """Builds the replay buffer of a run, including the transform that samples neighbors.
 
     Args:
         config (ExperimentConfig): Settings of the run.
+        loss (LossModule): Loss of the run.
 
     Raises:
         SettingError: If replay is prioritized, and TorchRL's compiled trees do not support the
@@ -39,11 +41,11 @@ def make_replay(config: ExperimentConfig) -> TensorDictReplayBuffer:
     if config.algorithm.num_envs is None:  # The last episode may exceed the rollout's frames.
         longest += time_limit(config.task)
     buffer = make_buffer(config.replay, config.seed, longest, config.device)
-    # A different seed from the sampler's: otherwise both would sample the same numbers, and a
-    # transition's row would determine its neighbor.
-    generator = torch.Generator(config.device).manual_seed(config.seed + NEIGHBOR_SEED)
-    if (transform := make_neighbors(config.regularizer, generator)) is not None:
-        buffer.append_transform(transform)
+    if isinstance(loss, L2C2Loss):
+        # A different seed from the sampler's: otherwise both would sample the same numbers, and a
+        # transition's row would determine its neighbor.
+        generator = torch.Generator(config.device).manual_seed(config.seed + NEIGHBOR_SEED)
+        buffer.append_transform(loss.neighbor_transform(generator))
     return buffer
 
 

@@ -105,7 +105,7 @@ class Experiment:
             self.agent = make_agent(config, env)
             self.learner = Learner(
                 self.agent,
-                make_replay(config),
+                make_replay(config, self.agent.loss),
                 reward_factor=config.algorithm.reward_factor,
                 compile=self._compile,
             )
