@@ -66,14 +66,10 @@ def action_bounds(env: EnvBase) -> tuple[Tensor, Tensor] | tuple[()]:
     return (spec.space.low, spec.space.high) if _bounded(spec) else ()
 
 
-def clip_bounds(env: EnvBase) -> tuple[Tensor, Tensor]:
-    """Returns the lower and upper bounds ``[A]`` of actions, infinite without bounds."""
+def clip_bounds(env: EnvBase) -> tuple[Tensor, Tensor] | tuple[()]:
+    """Returns bounds ``[A]`` as :func:`action_bounds` does, of which some may be infinite."""
     spec = env.action_spec.to(torch.get_default_device())
-    low, high = spec.space.low, spec.space.high
-    if isinstance(spec, Bounded):
-        return low, high
-    # An unbounded spec has the largest floats as low and high.
-    return torch.full_like(low, -torch.inf), torch.full_like(high, torch.inf)
+    return (spec.space.low, spec.space.high) if isinstance(spec, Bounded) else ()
 
 
 def observation_size(env: EnvBase) -> int:

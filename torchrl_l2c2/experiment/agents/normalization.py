@@ -219,4 +219,4 @@ class ActingPolicy(TensorDictModuleBase):
         """Clips sampled actions ``[*B, A]`` to the bounds, for the task."""
         if self.low is None or self.high is None:
             return action
-        return torch.maximum(torch.minimum(action, self.high), self.low)
+        return action.clamp(self.low, self.high)
