@@ -29,7 +29,7 @@ from torchrl_l2c2.experiment.analysis.diagnosis import diagnose_actions, finding
 from torchrl_l2c2.experiment.analysis.diagnosis.words import threshold
 from torchrl_l2c2.experiment.cli import diagnose as diagnose_command
 from torchrl_l2c2.experiment.learn.learner import MEASURE_AFTER, WARN_BELOW
-from torchrl_l2c2.presets import KINDS, PRESETS, presets_table
+from torchrl_l2c2.presets import KINDS, PRESETS
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs"
@@ -94,6 +94,18 @@ def test_the_readmes_code_does_what_it_says() -> None:
     assert isinstance(defined["loss"], SACLoss)
     assert {"penalty_l2c2_actor", "l2c2_mean_distance"} <= set(defined["terms"].keys())
     assert defined["ppo"].regularizer_gain.item() == 0.25
+
+
+def presets_table() -> str:
+    """The table of presets as Markdown."""
+    lines = ["| loss | method | settings | evidence |", "| --- | --- | --- | --- |"]
+    for kind, (exact, _) in KINDS.items():
+        for method, kinds in PRESETS.items():
+            chosen = kinds[kind]
+            shown = ", ".join(f"`{name}={value!r}`" for name, value in chosen.shown.items())
+            page = f"[{chosen.tasks}](../{chosen.evidence})" if chosen.evidence else "no runs"
+            lines.append(f"| {exact[0]} | {method} | {shown} | {page} |")
+    return "\n".join(lines) + "\n"
 
 
 def test_the_guide_shows_the_table_of_presets() -> None:

@@ -287,21 +287,3 @@ def without_effect(loss_class: type, lambda_max: float) -> bool:
     """Checks whether such small gains of L2C2 had no measurable effect with such losses."""
     kind, _ = kind_of(loss_class)
     return kind in _WITHOUT_EFFECT and lambda_max <= _PAPERS_LAMBDA_MAX
-
-
-def presets_table() -> str:
-    """The table of presets as Markdown, for the docs.
-
-    Examples:
-        >>> from torchrl_l2c2.presets import presets_table
-        >>> print(presets_table().splitlines()[0])
-        | loss | method | settings | evidence |
-    """
-    lines = ["| loss | method | settings | evidence |", "| --- | --- | --- | --- |"]
-    for kind, (exact, _) in KINDS.items():
-        for method, kinds in PRESETS.items():
-            chosen = kinds[kind]
-            shown = ", ".join(f"`{name}={value!r}`" for name, value in chosen.shown.items())
-            page = f"[{chosen.tasks}](../{chosen.evidence})" if chosen.evidence else "no runs"
-            lines.append(f"| {exact[0]} | {method} | {shown} | {page} |")
-    return "\n".join(lines) + "\n"
