@@ -38,14 +38,13 @@ from torchrl_l2c2.experiment.analysis.reports.statistics import mean, probabilit
 from torchrl_l2c2.experiment.analysis.reports.table import Estimate, pipe_table
 
 SEEDS = range(10)
+FRAMES, PPO_FRAMES = 5_000, 30_720
 TEST_EPISODES = 10
 METHODS = ("baseline", "smooth")
 COLUMNS = ["algorithm", "method", "seed", "return", "action_variation", "seconds", "commit"]
 
 
-def train_sac(
-    seed: int, strength: float | None, gamma: float = 0.95, frames: int = 5_000
-) -> torch.nn.Module:
+def train_sac(seed: int, strength: float | None, gamma: float = 0.95) -> torch.nn.Module:
     """SAC, an update every other frame, on losses that are summed by name."""
     env = pendulum(seed)
     actor, qvalue = make_actor(3, env.action_spec, hidden=(64, 64)), make_qvalue()
@@ -55,9 +54,9 @@ def train_sac(
         loss = smooth(loss, strength=strength)
     updater = SoftUpdate(loss, tau=0.01)
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
-    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(frames), batch_size=64)
+    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(FRAMES), batch_size=64)
     collector = Collector(
-        env, actor, frames_per_batch=50, total_frames=frames, init_random_frames=500
+        env, actor, frames_per_batch=50, total_frames=FRAMES, init_random_frames=500
     )
     for collected in collector:
         replay.extend(collected)
@@ -71,9 +70,7 @@ def train_sac(
     return actor
 
 
-def train_td3(
-    seed: int, strength: float | None, gamma: float = 0.95, frames: int = 5_000
-) -> torch.nn.Module:
+def train_td3(seed: int, strength: float | None, gamma: float = 0.95) -> torch.nn.Module:
     """TD3, which calls the parts of the loss by themselves."""
     env = pendulum(seed)
     network = MLP(in_features=3, out_features=1, num_cells=[64, 64])
@@ -87,12 +84,12 @@ def train_td3(
     updater = SoftUpdate(loss, tau=0.01)
     actor_optimizer = torch.optim.Adam(loss.actor_network_params.flatten_keys().values(), lr=1e-3)
     critic_optimizer = torch.optim.Adam(loss.qvalue_network_params.flatten_keys().values(), lr=1e-3)
-    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(frames), batch_size=64)
+    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(FRAMES), batch_size=64)
     collector = Collector(
         env,
         TensorDictSequential(actor, noise),
         frames_per_batch=50,
-        total_frames=frames,
+        total_frames=FRAMES,
         init_random_frames=500,
     )
     for collected in collector:
@@ -113,9 +110,7 @@ def train_td3(
     return actor
 
 
-def train_ppo(
-    seed: int, strength: float | None, gamma: float = 0.9, frames: int = 30_720
-) -> torch.nn.Module:
+def train_ppo(seed: int, strength: float | None, gamma: float = 0.9) -> torch.nn.Module:
     """PPO on rollouts of 2,048 frames, with rewards of about 1."""
     env = TransformedEnv(pendulum(seed), RewardScaling(loc=0.0, scale=0.1))
     actor, critic = make_actor(3, env.action_spec, hidden=(64, 64)), make_critic(3, hidden=(64, 64))
@@ -127,10 +122,10 @@ def train_ppo(
     replay = TensorDictReplayBuffer(
         storage=LazyTensorStorage(2_048), sampler=SamplerWithoutReplacement(), batch_size=128
     )
-    collector = Collector(env, actor, frames_per_batch=2_048, total_frames=frames)
+    collector = Collector(env, actor, frames_per_batch=2_048, total_frames=PPO_FRAMES)
     for number, rollout in enumerate(collector):
         if strength is not None:
-            loss.set_progress(number * 2_048 / frames)
+            loss.set_progress(number * 2_048 / PPO_FRAMES)
         for _ in range(8):
             with torch.no_grad():
                 advantage(rollout)
