@@ -23,6 +23,12 @@ COMPARED_MEAN: Any = Field(
     description="means to compare: before the squashing (loc) or after it (action); the same for "
     "deterministic policies (td3) [inferred: loc]",
 )
+# Shared by Grad-CAPS and ASAP, which contains it.
+ZIGZAG_EPSILON: Any = Field(
+    default=0.1,
+    gt=0,
+    description="constant in the denominator; smaller values penalize small zigzags more",
+)
 
 
 class RegularizerConfig:
@@ -227,11 +233,7 @@ class GradCAPSConfig(GainConfig):
     lambda_temporal: float = Field(
         default=0.01, ge=0, description="gain of the action's second difference [inferred]"
     )
-    epsilon: float = Field(
-        default=0.1,
-        gt=0,
-        description="constant in the denominator; smaller values penalize small zigzags more",
-    )
+    epsilon: float = ZIGZAG_EPSILON
     mean: Literal["loc", "action"] = COMPARED_MEAN
 
 
@@ -257,11 +259,7 @@ class ASAPConfig(GainConfig):
         description="gain of the action's second difference [the authors' value for MuJoCo; for "
         "LunarLander and Pendulum: 0.005]",
     )
-    epsilon: float = Field(
-        default=0.1,
-        gt=0,
-        description="constant in the denominator; smaller values penalize small zigzags more",
-    )
+    epsilon: float = ZIGZAG_EPSILON
     mean: Literal["loc", "action"] = COMPARED_MEAN
 
 
