@@ -31,7 +31,6 @@ class Simulation:
     Keyword Args:
         keep_previous (bool): Whether frames contain the previous observation as
             ``"previous_observation"``; the first frame of an episode repeats its own observation.
-            Default ``False``.
 
     Attributes:
         env: The ``GymEnv`` or ``GymWrapper``, without noise.
@@ -44,7 +43,7 @@ class Simulation:
             not a ``numpy.random.Generator``.
     """
 
-    def __init__(self, env: EnvBase, *, keep_previous: bool = False) -> None:
+    def __init__(self, env: EnvBase, *, keep_previous: bool) -> None:
         parts = split_environment(env)
         if parts is None:
             raise ValueError(

@@ -46,9 +46,8 @@ class Progress:
     Keyword Args:
         shown (bool or str): Whether to show the bar or lines; a text is shown before them.
         compiles (bool): Whether the first updates are compiled.
-        unit (str): Unit of ``total`` and ``done``, ``"episode"`` or ``"frame"``. Default
-            ``"episode"``.
-        folder (Path, optional): Run folder, for ``train.log``. Default: nothing is logged.
+        unit (str): Unit of ``total`` and ``done``, ``"episode"`` or ``"frame"``.
+        folder (Path, optional): Run folder, for ``train.log``. ``None``: nothing is logged.
     """
 
     def __init__(
@@ -59,8 +58,8 @@ class Progress:
         *,
         shown: bool | str,
         compiles: bool,
-        unit: str = "episode",
-        folder: Path | None = None,
+        unit: str,
+        folder: Path | None,
     ) -> None:
         self._total, self._folder, self._shown, self._unit = total, folder, bool(shown), unit
         name = shown if isinstance(shown, str) else ""
