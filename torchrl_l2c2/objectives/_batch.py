@@ -89,7 +89,7 @@ def find_transitions(
     tensordict: TensorDictBase,
     states: Mapping[str, Iterable[NestedKey]],
     *,
-    labels: bool = False,
+    all_inputs: bool,
 ) -> dict[NestedKey, tuple[Tensor, Tensor]]:
     """Finds the states that networks read and their successors, detached.
 
@@ -98,7 +98,7 @@ def find_transitions(
     Args:
         tensordict (TensorDictBase): the batch, ``[*B]``.
         states (Mapping): keys of the states that each network reads, by the network's name.
-        labels (bool): whether to include inputs that are not floating point, such as masks.
+        all_inputs (bool): whether to include inputs that are not floating point, such as masks.
 
     Returns:
         dict: pairs of state and successor by key, ``[*B, *F]`` each.
@@ -122,7 +122,7 @@ def find_transitions(
                 "If another module computes this input, give the loss a policy that contains it."
             )
         pairs.update(present)
-        for key in read if labels else ():
+        for key in read if all_inputs else ():
             state, successor = tensordict.get(key, None), next_states.get(next_key(key), None)
             if isinstance(state, Tensor) and isinstance(successor, Tensor):
                 pairs.setdefault(key, (state, successor))

@@ -122,7 +122,7 @@ class CAPSLoss(RegularizedLoss):
         terms = super().policy_regularizer(tensordict)
         rows = self.sample_rows("caps", tensordict, self.caps_fraction)
         batch = at_rows(tensordict, rows)
-        transitions = self.transitions(batch, self.policy_networks(), labels=True)
+        transitions = self.transitions(batch, self.policy_networks(), all_inputs=True)
         counts = self.counted(batch, transitions)
         policies = self.policies_at(tensordict, self._states(batch, transitions), rows)
         squashed = self.caps_mean == "action"

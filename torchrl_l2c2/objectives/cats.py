@@ -93,7 +93,7 @@ class CATSLoss(RegularizedLoss):
         terms = super().policy_regularizer(tensordict)
         rows = self.sample_rows("cats", tensordict, self.cats_fraction)
         batch = at_rows(tensordict, rows)
-        transitions = self.transitions(batch, self.policy_networks(), labels=True)
+        transitions = self.transitions(batch, self.policy_networks(), all_inputs=True)
         counts = self.counted(batch, transitions)
         later = {key: finite_successor(*pair)[None] for key, pair in transitions.items()}
         states = TensorDict(later, batch_size=[1, *batch.batch_size])

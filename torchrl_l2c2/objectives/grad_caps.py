@@ -181,7 +181,7 @@ class GradCAPSLoss(RegularizedLoss):
 
     def _states_around(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The previous and the next states, ``[2, *B]``."""
-        transitions = self.transitions(tensordict, self.policy_networks(), labels=True)
+        transitions = self.transitions(tensordict, self.policy_networks(), all_inputs=True)
         observations = [key for key, (s, _) in transitions.items() if is_floating_point(s)]
         if len(observations) != 1:
             raise ValueError(

@@ -751,7 +751,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
     # Computations, for the two methods of a regularizer.
 
     def transitions(
-        self, tensordict: TensorDictBase, networks: Iterable[str], *, labels: bool = False
+        self, tensordict: TensorDictBase, networks: Iterable[str], *, all_inputs: bool = False
     ) -> dict[NestedKey, tuple[Tensor, Tensor]]:
         """Finds the states that networks read, and their successors.
 
@@ -760,8 +760,8 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         Args:
             tensordict: the batch, ``[*B]``.
             networks: names of declared networks.
-            labels: whether to include everything that an evaluation at the next step needs: inputs
-                that are not floating point, such as masks, and recurrent states.
+            all_inputs: whether to include all inputs that an evaluation at the next step needs:
+                also those that are not floating point, such as masks, and recurrent states.
 
         Returns:
             Pairs of state and successor by key, ``[*B, *F]`` each, detached.
@@ -773,9 +773,9 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         """
         specs = {name: self.networks[name] for name in networks}
         read = {name: spec.states for name, spec in specs.items()}
-        found = find_transitions(tensordict, read, labels=labels)
+        found = find_transitions(tensordict, read, all_inputs=all_inputs)
         recurrent = dict.fromkeys(key for spec in specs.values() for key in spec.recurrent)
-        return {**found, **find_recurrent(tensordict, recurrent)} if labels else found
+        return {**found, **find_recurrent(tensordict, recurrent)} if all_inputs else found
 
     def policy_states(self, tensordict: TensorDictBase) -> dict[NestedKey, Tensor]:
         """Finds the floating-point states that the policy reads, ``[*B, *F]`` by key.
