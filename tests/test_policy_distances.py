@@ -98,6 +98,19 @@ class TestMeanDistance:
         )
         torch.testing.assert_close(mean_distance(p, q), torch.tensor([0.32]))
 
+    @pytest.mark.parametrize(
+        "matrix",
+        [
+            lambda loc: rl.IndependentNormal(loc, torch.ones_like(loc), event_dim=2),
+            lambda loc: rl.TanhNormal(loc, torch.ones_like(loc), event_dims=2),
+            lambda loc: d.Independent(d.Normal(loc, 1.0), 2),
+        ],
+    )
+    def test_a_matrix_of_actions_is_one_vector(self, matrix):
+        """Such as a chunk of three actions of two numbers, however it is told: 1/2 * 6."""
+        p, q = (matrix(torch.full((4, 3, 2), x)) for x in (0.0, 1.0))
+        torch.testing.assert_close(mean_distance(p, q), torch.full((4,), 3.0))
+
     def test_torchs_own_squashed_normals_are_compared_before_it(self):
         """Wrapped as a whole, where torch has no mean: 1/2 (1^2 + 1^2); and 0 of the actions'."""
         p, q = (

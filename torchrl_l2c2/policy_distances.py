@@ -157,8 +157,8 @@ def policy_mean(policy: Distribution | Tensor, *, squashed: bool = False) -> Ten
     if isinstance(policy, Categorical | OneHotCategorical):
         return all_probs(policy)
     mean = _mean(policy, squashed=squashed)
-    # Actions of one number may lack a dimension, as with torch's Normal.
-    return mean if policy.event_shape else mean.unsqueeze(-1)
+    # Actions of one number may lack a dimension, as with torch's Normal; others are a matrix.
+    return mean.flatten(len(policy.batch_shape)) if policy.event_shape else mean.unsqueeze(-1)
 
 
 def _mean(policy: Distribution, *, squashed: bool) -> Tensor:
@@ -174,8 +174,7 @@ def _mean(policy: Distribution, *, squashed: bool) -> Tensor:
         return mean
     if isinstance(policy, Independent):
         # Torch's mean is NaN for labels and missing for squashed distributions.
-        base = policy_mean(policy.base_dist, squashed=squashed)
-        return base.reshape(*policy.batch_shape, -1)
+        return policy_mean(policy.base_dist, squashed=squashed)
     try:
         return policy.mean
     except NotImplementedError as error:
