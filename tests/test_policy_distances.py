@@ -134,6 +134,22 @@ class TestMeanDistance:
         p, q = (CompositeDistribution(params + x, kinds) for x in (0.0, 1.0))
         torch.testing.assert_close(mean_distance(p, q), torch.full((4,), 1.5))
 
+    def test_labels_are_no_mean(self):
+        """Of a class of one's own for several discrete actions: they would have no gradient."""
+
+        class Labels(d.Independent):
+            @property
+            def deterministic_sample(self):
+                return self.base_dist.logits.argmax(-1)
+
+        class Pair(d.Distribution):
+            deterministic_sample = torch.zeros(2, dtype=torch.long)
+
+        choices = d.Categorical(logits=torch.randn(4, 2, 3))
+        torch.testing.assert_close(policy_mean(Labels(choices, 1)), choices.probs.flatten(1))
+        with pytest.raises(NotImplementedError, match=r"Pair has no mean: .* in a Composite"):
+            policy_mean(Pair(event_shape=torch.Size([2]), validate_args=False))
+
     def test_actions_are_their_own_mean(self):
         """A deterministic policy."""
         assert policy_mean(LOC) is LOC

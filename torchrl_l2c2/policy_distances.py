@@ -170,7 +170,7 @@ def _mean(policy: Distribution, *, squashed: bool) -> Tensor:
         if isinstance(policy, TruncatedNormal):
             return policy.loc
     mean = getattr(policy, "deterministic_sample", None)
-    if mean is not None:
+    if mean is not None and mean.is_floating_point():  # Labels have no gradient.
         return mean
     if isinstance(policy, Independent):
         # Torch's mean is NaN for labels and missing for squashed distributions.
@@ -180,7 +180,8 @@ def _mean(policy: Distribution, *, squashed: bool) -> Tensor:
     except NotImplementedError as error:
         raise NotImplementedError(
             f"{type(policy).__name__} has no mean: choose another policy_distance or "
-            "regularizer, or give the class a deterministic_sample."
+            "regularizer, join discrete actions in a CompositeDistribution, or give a continuous "
+            "policy's class a deterministic_sample."
         ) from error
 
 
