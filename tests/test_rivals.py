@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import pickle
+import warnings
 from functools import partial
 
 import pytest
@@ -429,6 +430,28 @@ class TestASAP:
         twin = copy.deepcopy(loss)
         twin.asap_predictor.module.weight.data.zero_()
         assert loss.asap_predictor.module.weight.equal(self.PREDICTOR)
+
+    @pytest.mark.parametrize("part", ["forward", "loss_actor"])
+    def test_an_optimizer_without_the_predictor_is_told(self, part):
+        """As of TorchRL's SAC and TD3 scripts, which take the networks' parameters by name."""
+        for names in (["actor_network_params"], ["actor_network_params", "asap_predictor"]):
+            base = DDPGLoss(Actor(nn.Linear(3, 2)), qvalue())
+            base.make_value_estimator(gamma=0.9)
+            loss = ASAPLoss(base, previous_key="before").fold()
+            parameters = [p for name in names for p in getattr(loss, name).parameters()]
+            optimizer, batch = torch.optim.SGD(parameters, 0.01), self.batch()
+            with warnings.catch_warnings(record=True) as told:
+                warnings.simplefilter("always")
+                for _ in range(60):
+                    if part == "forward":
+                        term = loss(batch)["loss_actor"]
+                    else:
+                        term = loss.loss_actor(batch)[0]
+                    optimizer.zero_grad()
+                    term.backward()
+                    optimizer.step()
+            told = [str(each.message) for each in told if "the predictor of" in str(each.message)]
+            assert len(told) == (len(names) == 1), told
 
     def test_a_policy_that_explores_is_compared_without_its_noise(self):
         """Also outside of the loss's own forward: a copy predicts for the same state."""

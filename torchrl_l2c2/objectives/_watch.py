@@ -36,6 +36,7 @@ class TermWatch:
         self._forwards = 0
         self._parts = 0
         self._counted = 0
+        self._sums: list[list[float]] = []
         self._warned: set[str] = set()
 
     def see_call(self, loss: Any, batch: TensorDictBase) -> None:
@@ -43,6 +44,8 @@ class TermWatch:
         self._calls += 1
         if self._calls == 1 and loss._followed:
             _warn_of_several_steps(batch)
+        if self._calls in (1, PATIENCE) and hasattr(loss, "asap_predictor"):
+            self._see_predictor(loss)
         if self._calls == PATIENCE and loss._ramp is not None and not self.progress_set:
             warnings.warn(
                 f"the gain of {type(loss).__name__} follows the progress of training, and "
@@ -60,6 +63,20 @@ class TermWatch:
                 "loss.set_progress(frames / total_frames) before the updates on every rollout, "
                 "with / and not //.",
                 stacklevel=4,
+            )
+
+    def _see_predictor(self, loss: Any) -> None:
+        """Warns if the optimizer moves other parameters, but not those of ASAP's predictor."""
+        predictor = {id(parameter) for parameter in loss.asap_predictor.parameters()}
+        before, self._sums = self._sums, [[], []]
+        for parameter in loss.parameters():
+            self._sums[id(parameter) in predictor].append(parameter.detach().sum().item())
+        if before and before[1] == self._sums[1] and before[0] != self._sums[0]:
+            warnings.warn(
+                f"the predictor of {type(loss).__name__} did not change in {PATIENCE} updates: the "
+                "penalty pulls the policy towards what it was in the beginning. Make the optimizer "
+                "with loss.parameters(), or give it loss.asap_predictor.parameters(), too.",
+                stacklevel=5,
             )
 
     def see_forward(self, loss: Any, terms: TensorDictBase) -> None:

@@ -65,6 +65,9 @@ class ASAPLoss(GradCAPSLoss):
         ValueError: as for :class:`GradCAPSLoss`.
         KeyError: as for :class:`GradCAPSLoss`.
 
+    Warns:
+        UserWarning: in eager use, once: the optimizer moves other parameters than the predictor's.
+
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
