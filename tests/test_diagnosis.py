@@ -444,6 +444,23 @@ class TestMeasured:
         assert found.measures["action_variation"] == pytest.approx(0.3, rel=1e-5)
         assert found.spread == 0.0 and found.low.tolist() == [-4.0] and found.bounded
 
+    def test_a_policy_in_double_precision_keeps_it(self):
+        """As its layers ask for; the numbers are the same."""
+
+        class Fine(Walk):
+            observation_space = gymnasium.spaces.Box(-9, 9, (2,), np.float64)
+
+            def _seen(self):
+                return super()._seen().astype(np.float64)
+
+        layer = nn.Linear(2, 1, bias=False, dtype=torch.float64)
+        layer.weight.data = torch.tensor([[3.0, 0.0]], dtype=torch.float64)
+        policy = TensorDictModule(layer, ["observation"], ["action"])
+        found = diagnose(policy, GymWrapper(Fine()), episodes=1)
+        expected = torch.full((10,), 3.0)
+        torch.testing.assert_close(found.policy_lipschitz.float(), expected, rtol=1e-3, atol=0.0)
+        assert "observation[0]: 100%" in page([found])
+
     def test_the_action_follows_the_coordinate_that_the_policy_reads(self):
         """Held, it leaves no change; the other coordinate leaves all of it."""
         found = diagnose(linear(3.0), GymWrapper(Walk()), episodes=1)

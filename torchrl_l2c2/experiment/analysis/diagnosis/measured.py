@@ -363,8 +363,10 @@ def _steepness(
     """Distances, and local Lipschitz constants along an episode, some steps at a time."""
     found: dict[str, list[Tensor]] = {"policy": [], "value": [], "distance": []}
     for part in episode.split(STEPS_AT_ONCE):
-        state, action = part[key].float(), part[action_key]
-        neighbor, distance = near.sample(state, part["next", key].float(), num_neighbors, generator)
+        state, successor, action = part[key], part["next", key], part[action_key]
+        if not state.is_floating_point():
+            state, successor = state.float(), successor.float()
+        neighbor, distance = near.sample(state, successor, num_neighbors, generator)
         rows = neighbor.flatten(0, 1)
         places = state.flatten(1), neighbor.flatten(2)
         found["distance"].append((distance - near.epsilon).flatten())
