@@ -431,6 +431,20 @@ class TestASAP:
         twin.asap_predictor.module.weight.data.zero_()
         assert loss.asap_predictor.module.weight.equal(self.PREDICTOR)
 
+    def test_layers_without_a_size_have_no_copy(self):
+        """The first batch would give the predictor other numbers than the policy."""
+        net = nn.Sequential(nn.LazyLinear(4), NormalParamExtractor())
+        actor = ProbabilisticActor(
+            TensorDictModule(net, ["observation"], ["loc", "scale"]),
+            in_keys=["loc", "scale"],
+            distribution_class=IndependentNormal,
+        )
+        base = PPOLoss(actor, None)
+        with pytest.raises(ValueError, match="layers have no size yet: call the policy"):
+            ASAPLoss(base)
+        actor(self.batch())
+        ASAPLoss(base)
+
     @pytest.mark.parametrize("part", ["forward", "loss_actor"])
     def test_an_optimizer_without_the_predictor_is_told(self, part):
         """As of TorchRL's SAC and TD3 scripts, which take the networks' parameters by name."""

@@ -7,6 +7,7 @@ from typing import Literal
 
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch.nn.parameter import is_lazy
 from torchrl.objectives import LossModule
 
 from torchrl_l2c2.distances import squared_error
@@ -62,7 +63,7 @@ class ASAPLoss(GradCAPSLoss):
 
     Raises:
         TypeError: as for :class:`GradCAPSLoss`.
-        ValueError: as for :class:`GradCAPSLoss`.
+        ValueError: as for :class:`GradCAPSLoss`; or layers of the policy have no size yet.
         KeyError: as for :class:`GradCAPSLoss`.
 
     Warns:
@@ -109,6 +110,11 @@ class ASAPLoss(GradCAPSLoss):
         self.register_coefficient("asap_lambda_spatial", lambda_spatial)
         self.register_coefficient("asap_lambda_temporal", lambda_temporal)
         self.asap_predictor = _copy_of_policy(self)
+        if any(map(is_lazy, self.asap_predictor.parameters())):
+            raise ValueError(
+                "the predictor of ASAPLoss begins as a copy of the policy, whose layers have no "
+                "size yet: call the policy on a batch before, or give its layers their in_features."
+            )
         self.declare_terms(policy=["loss_asap_spatial"], auxiliary=["loss_asap_temporal"])
 
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
