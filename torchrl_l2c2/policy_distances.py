@@ -157,7 +157,7 @@ def policy_mean(policy: Distribution | Tensor, *, squashed: bool = False) -> Ten
     if isinstance(policy, Categorical | OneHotCategorical):
         return all_probs(policy)
     mean = _mean(policy, squashed=squashed)
-    # Actions of one number may lack a dimension, as with torch's Normal; others are a matrix.
+    # A single number may lack its dimension, as with torch's Normal; a matrix has one too many.
     return mean.flatten(len(policy.batch_shape)) if policy.event_shape else mean.unsqueeze(-1)
 
 

@@ -66,7 +66,7 @@ class TermWatch:
             )
 
     def _see_predictor(self, loss: Any) -> None:
-        """Warns if the optimizer moves other parameters, but not those of ASAP's predictor."""
+        """Warns if the optimizer moves parameters of the loss, but none of ASAP's predictor."""
         predictor = {id(parameter) for parameter in loss.asap_predictor.parameters()}
         before, self._sums = self._sums, [[], []]
         for parameter in loss.parameters():
@@ -74,8 +74,8 @@ class TermWatch:
         if before and before[1] == self._sums[1] and before[0] != self._sums[0]:
             warnings.warn(
                 f"the predictor of {type(loss).__name__} did not change in {PATIENCE} updates: the "
-                "penalty pulls the policy towards what it was in the beginning. Make the optimizer "
-                "with loss.parameters(), or give it loss.asap_predictor.parameters(), too.",
+                "penalty pulls the policy back to its initial actions. Make the optimizer with "
+                "loss.parameters(), or give it loss.asap_predictor.parameters(), too.",
                 stacklevel=5,
             )
 

@@ -761,7 +761,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             tensordict: the batch, ``[*B]``.
             networks: names of declared networks.
             all_inputs: whether to include all inputs that an evaluation at the next step needs:
-                also those that are not floating point, such as masks, and recurrent states.
+                also masks, other inputs that are not floating point, and recurrent states.
 
         Returns:
             Pairs of state and successor by key, ``[*B, *F]`` each, detached.
