@@ -52,7 +52,9 @@ def main(frames: int, baseline: bool = False) -> None:
         init_random_frames=RANDOM_FRAMES,
     )
 
-    for collected in collector:
+    for number, collected in enumerate(collector):
+        if not baseline:
+            loss.set_progress(number * FRAMES_PER_BATCH / frames)
         replay.extend(collected)
         if len(replay) < RANDOM_FRAMES:
             continue

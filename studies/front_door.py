@@ -3,7 +3,7 @@
 ``python -m studies.front_door FILE.csv`` makes 10 seeds of each on Pendulum, and adds a line to the
 file after each run; runs that the file has are skipped. The loops are like TorchRL's own scripts,
 which sum the losses by name. With the regularizer they have a line more, ``smooth``, and with PPO
-a second one, ``set_progress``.
+and SAC a second one, ``set_progress``.
 """
 
 from __future__ import annotations
@@ -58,7 +58,9 @@ def train_sac(seed: int, strength: float | None, gamma: float = 0.95) -> torch.n
     collector = Collector(
         env, actor, frames_per_batch=50, total_frames=FRAMES, init_random_frames=500
     )
-    for collected in collector:
+    for number, collected in enumerate(collector):
+        if strength is not None:
+            loss.set_progress(number * 50 / FRAMES)
         replay.extend(collected)
         for _ in range(25 if len(replay) >= 500 else 0):
             terms = loss(replay.sample())

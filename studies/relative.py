@@ -16,9 +16,6 @@ SHAKES = 0.2
 FAILURES = ("InvertedDoublePendulum-v5", "Pendulum-v1", "pendulum")
 """Tasks on which a run can fail by the rules of the page."""
 
-CHANGED = ("td3",)
-"""Algorithms whose presets changed by these runs."""
-
 
 def table() -> str:
     """Every setting on the seeds that decide, by the last policy, compared with the preset."""
@@ -33,8 +30,8 @@ def table() -> str:
         if preset is not None and group is not preset:
             quantities = ("return", "action_variation")
             better = [improvement_cell([group], [preset], TEST, each) for each in quantities]
-        mark = " (the preset before)" if algorithm in CHANGED else " (the preset)"
-        cells = [task, algorithm, group.name + (mark if group is preset else "")]
+        mark = " (the preset before)" if group is preset else ""
+        cells = [task, algorithm, group.name + mark]
         cells += [number_range(group.seeds), _estimate(group, "return", "{:.1f}"), better[0]]
         cells += [f"{failed(group)} of {len(group.seeds)}" if task in FAILURES else ""]
         cells += [_estimate(group, "action_variation", "{:.3f}"), better[1]]

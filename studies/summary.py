@@ -24,6 +24,9 @@ from torchrl_l2c2.experiment.analysis.reports.table import (
 OURS = "L2C2, mse 1, ramp"
 """PPO's preset, in tables."""
 
+OF_SAC = "L2C2, means 10, ramp"
+"""SAC's preset, in tables."""
+
 MILLION = "1000000 frames"
 RSL_RL = ROOT / "results" / "rsl_rl.csv"
 Pair = tuple[Group, Group]
@@ -53,10 +56,8 @@ class Benchmark(NamedTuple):
 
 
 BENCHMARKS = (
-    Benchmark("Pendulum", "SAC", "sac_pendulum", "pendulum", "L2C2, means 10", "30000 frames"),
-    Benchmark(
-        "LunarLander", "SAC", "sac_lunarlander", "lunarlander", "L2C2, means 10", "100000 frames"
-    ),
+    Benchmark("Pendulum", "SAC", "sac_pendulum", "pendulum", OF_SAC, "30000 frames"),
+    Benchmark("LunarLander", "SAC", "sac_lunarlander", "lunarlander", OF_SAC, "100000 frames"),
     Benchmark("Pendulum", "PPO", "field", "pendulum", OURS, "500000 frames"),
     Benchmark("LunarLander", "PPO", "field", "lunarlander", OURS, "500000 frames"),
     Benchmark("Hopper", "PPO", "hopper", "hopper_v5", OURS, MILLION),

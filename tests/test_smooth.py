@@ -656,7 +656,8 @@ class TestPresets:
 
     def test_the_numbers(self):
         """As the pages of results have them."""
-        assert "lambda_min=10.0, lambda_max=1000.0" in str(smooth(sac()))
+        shown = str(smooth(sac()))
+        assert "lambda_min=10.0, lambda_max=1000.0" in shown and "ramp=(1.0, 1.0)" in shown
         assert "lambda_min=1.0, lambda_max=100.0" in str(smooth(ppo()))
         shown = str(smooth(td3()))
         assert "lambda_min=0.04, lambda_max=4.0" in shown and "ramp=None, relative=True" in shown
@@ -730,11 +731,11 @@ class TestPresets:
     def test_without_a_preset_single_settings_replace_those_of_the_nearest(self):
         """As they replace a preset's; the others are told."""
         (case,) = (case for case in CASES if case.name == "IQL")
-        with pytest.warns(UserWarning, match=r"of SACLoss, the nearest: policy_dist.*beta=0\.0\.$"):
+        with pytest.warns(UserWarning, match=r"of SACLoss, the nearest: policy_dist.*ramp=1\.0\.$"):
             loss = smooth(case.make(), lambda_min=20.0)
         near = loss.l2c2_neighborhood
         assert (near.lambda_min, near.lambda_max, near.neighbors) == (20.0, 1000.0, "line")
-        assert loss.l2c2_policy_distance == "mean" and loss._ramp is None
+        assert loss.l2c2_policy_distance == "mean" and loss._ramp == (1.0, 1.0)
         with pytest.warns(UserWarning, match="has no preset") as told:
             loss = smooth(case.make(), neighborhood=Neighborhood(0.3, 2.0, 5.0))
         assert "lambda_max" not in str(told[0].message)
@@ -1168,7 +1169,7 @@ class TestProgress:
                 loss(batch)
 
     def test_presets_with_a_constant_gain_ignore_it(self):
-        loss = smooth(sac())
+        loss = smooth(td3())
         loss.set_progress(0.1)
         assert loss.regularizer_gain.item() == 1.0
         assert "regularizer_progress" not in loss.state_dict()

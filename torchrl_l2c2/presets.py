@@ -110,8 +110,9 @@ PRESETS: dict[str, dict[str, Preset]] = {
                 "lambda_max": 1000.0,
                 "beta": 0.0,
             },
-            evidence="results/sac_pendulum.md",
-            tasks="Pendulum",
+            ramp=1.0,
+            evidence="results/relative.md",
+            tasks="Pendulum and LunarLander",
         ),
         "td3": Preset(
             {
@@ -245,7 +246,7 @@ def preset(method: str, kind: str) -> Preset:
 
     Examples:
         >>> from torchrl_l2c2.presets import preset
-        >>> preset("l2c2", "sac").settings["lambda_min"], preset("l2c2", "ppo").ramp
+        >>> preset("l2c2", "sac").settings["lambda_min"], preset("l2c2", "sac").ramp
         (10.0, 1.0)
     """
     if method not in METHODS:

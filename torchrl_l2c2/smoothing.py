@@ -42,11 +42,11 @@ def smooth(
     that sum terms by name, or all ``loss_*`` keys, need no change. The penalty is reported as
     ``penalty_*``.
 
-    The presets are in ``torchrl_l2c2.presets.PRESETS``. The gain of ``"l2c2"`` with PPO, and
-    of ``"cats"`` with PPO and SAC, rises with the progress of training: call
-    ``loss.set_progress(frames / total_frames)`` before the updates on every rollout. Without this
-    call the gain stays at its final value. With TD3 the penalty of both is relative to the size
-    of the action values (:meth:`RegularizedLoss.relative`).
+    The presets are in ``torchrl_l2c2.presets.PRESETS``. The gain of ``"l2c2"`` and ``"cats"`` with
+    PPO and SAC rises with the progress of training: call
+    ``loss.set_progress(frames / total_frames)`` before the updates on every batch that was
+    collected. Without this call the gain stays at its final value. With TD3 the penalty of both is
+    relative to the size of the action values (:meth:`RegularizedLoss.relative`).
 
     Args:
         loss (LossModule): a loss with a policy that is trained on transitions.
