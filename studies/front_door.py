@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -41,17 +42,18 @@ SEEDS = range(10)
 FRAMES, PPO_FRAMES = 5_000, 30_720
 TEST_EPISODES = 10
 METHODS = ("baseline", "smooth")
+RELATIVE = {"relative": True, "ramp": None, "lambda_min": 0.2, "lambda_max": 20.0}
 COLUMNS = ["algorithm", "method", "seed", "return", "action_variation", "seconds", "commit"]
 
 
-def train_sac(seed: int, strength: float | None, gamma: float = 0.95) -> torch.nn.Module:
+def train_sac(seed: int, settings: dict[str, Any] | None, gamma: float = 0.95) -> torch.nn.Module:
     """SAC, an update every other frame, on losses that are summed by name."""
     env = pendulum(seed)
     actor, qvalue = make_actor(3, env.action_spec, hidden=(64, 64)), make_qvalue()
     loss: LossModule = SACLoss(actor, qvalue, action_spec=env.action_spec)
     loss.make_value_estimator(gamma=gamma)
-    if strength is not None:
-        loss = smooth(loss, strength=strength)
+    if settings is not None:
+        loss = smooth(loss, **settings)
     updater = SoftUpdate(loss, tau=0.01)
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
     replay = TensorDictReplayBuffer(storage=LazyTensorStorage(FRAMES), batch_size=64)
@@ -59,7 +61,7 @@ def train_sac(seed: int, strength: float | None, gamma: float = 0.95) -> torch.n
         env, actor, frames_per_batch=50, total_frames=FRAMES, init_random_frames=500
     )
     for number, collected in enumerate(collector):
-        if strength is not None:
+        if settings is not None:
             loss.set_progress(number * 50 / FRAMES)
         replay.extend(collected)
         for _ in range(25 if len(replay) >= 500 else 0):
@@ -72,7 +74,7 @@ def train_sac(seed: int, strength: float | None, gamma: float = 0.95) -> torch.n
     return actor
 
 
-def train_td3(seed: int, strength: float | None, gamma: float = 0.95) -> torch.nn.Module:
+def train_td3(seed: int, settings: dict[str, Any] | None, gamma: float = 0.95) -> torch.nn.Module:
     """TD3, which calls the parts of the loss by themselves."""
     env = pendulum(seed)
     network = MLP(in_features=3, out_features=1, num_cells=[64, 64])
@@ -81,8 +83,8 @@ def train_td3(seed: int, strength: float | None, gamma: float = 0.95) -> torch.n
     noise = AdditiveGaussianModule(env.action_spec, sigma_init=0.2, sigma_end=0.2)
     loss: LossModule = TD3Loss(actor, make_qvalue(), action_spec=env.action_spec)
     loss.make_value_estimator(gamma=gamma)
-    if strength is not None:
-        loss = smooth(loss, strength=strength)
+    if settings is not None:
+        loss = smooth(loss, **settings)
     updater = SoftUpdate(loss, tau=0.01)
     actor_optimizer = torch.optim.Adam(loss.actor_network_params.flatten_keys().values(), lr=1e-3)
     critic_optimizer = torch.optim.Adam(loss.qvalue_network_params.flatten_keys().values(), lr=1e-3)
@@ -112,21 +114,21 @@ def train_td3(seed: int, strength: float | None, gamma: float = 0.95) -> torch.n
     return actor
 
 
-def train_ppo(seed: int, strength: float | None, gamma: float = 0.9) -> torch.nn.Module:
+def train_ppo(seed: int, settings: dict[str, Any] | None, gamma: float = 0.9) -> torch.nn.Module:
     """PPO on rollouts of 2,048 frames, with rewards of about 1."""
     env = TransformedEnv(pendulum(seed), RewardScaling(loc=0.0, scale=0.1))
     actor, critic = make_actor(3, env.action_spec, hidden=(64, 64)), make_critic(3, hidden=(64, 64))
     loss: LossModule = ClipPPOLoss(actor, critic, normalize_advantage=True, entropy_coeff=0.0)
     advantage = GAE(gamma=gamma, lmbda=0.95, value_network=critic)
-    if strength is not None:
-        loss = smooth(loss, strength=strength)
+    if settings is not None:
+        loss = smooth(loss, **settings)
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
     replay = TensorDictReplayBuffer(
         storage=LazyTensorStorage(2_048), sampler=SamplerWithoutReplacement(), batch_size=128
     )
     collector = Collector(env, actor, frames_per_batch=2_048, total_frames=PPO_FRAMES)
     for number, rollout in enumerate(collector):
-        if strength is not None:
+        if settings is not None:
             loss.set_progress(number * 2_048 / PPO_FRAMES)
         for _ in range(8):
             with torch.no_grad():
@@ -208,7 +210,7 @@ def strengths_table(path: Path) -> str:
         runs = list(csv.DictReader(file))
     found = {}
     for method in dict.fromkeys(run["method"] for run in runs):
-        name = {"baseline": "baseline", "smooth": "strength 1"}.get(method)
+        name = {"smooth": "strength 1", "smooth relative": "relative"}.get(method)
         name = name or method.replace("smooth", "strength")
         ours = [run for run in runs if run["method"] == method]
         returns, variations = (
@@ -225,10 +227,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--algorithms", nargs="+", choices=ALGORITHMS, default=list(ALGORITHMS))
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
     parser.add_argument("--strengths", nargs="+", type=float, default=[1.0])
+    parser.add_argument(
+        "--relative", action="store_true", help="also SAC's penalty of results/relative.md"
+    )
     parser.add_argument("--gamma", type=float, help="discount factor (default: 0.95, PPO 0.9)")
     chosen = parser.parse_args(arguments)
-    methods = {"baseline": None}
-    methods |= {"smooth" if each == 1.0 else f"smooth {each:g}": each for each in chosen.strengths}
+    methods: dict[str, dict[str, Any] | None] = {"baseline": None}
+    for each in chosen.strengths:
+        methods["smooth" if each == 1.0 else f"smooth {each:g}"] = {"strength": each}
+    if chosen.relative:
+        methods["smooth relative"] = RELATIVE
     options = {} if chosen.gamma is None else {"gamma": chosen.gamma}
     add_runs(
         chosen.file,
