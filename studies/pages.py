@@ -130,6 +130,7 @@ def pages() -> dict[str, Page]:
                     ROOT / "results" / "front_door_gamma.csv", ["TD3", "SAC"]
                 ),
                 "strengths": front_door.strengths_table(ROOT / "results" / "td3_strength.csv"),
+                "sac": front_door.strengths_table(ROOT / "results" / "sac_strength.csv"),
             }
         ),
         "results/rsl_rl.md": Page({"results": front_door.table(RSL_RL, rsl_rl.ITERATIONS)}),

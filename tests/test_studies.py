@@ -510,7 +510,7 @@ class TestPages:
     def test_every_generated_part_is_that_of_its_records(self):
         """``python -m studies.pages`` would change nothing."""
         made = pages.pages()
-        assert sum(len(page.parts) for page in made.values()) == 34
+        assert sum(len(page.parts) for page in made.values()) == 35
         for name, page in made.items():
             text = (ROOT / name).read_text()
             assert text.count(": start -->") == len(page.parts)
@@ -763,6 +763,16 @@ class TestProse:
         learned = pairs[(pairs >= -200).all(axis=1)].groupby("algorithm").mean().round()
         assert learned.loc["SAC"].to_list() == [-126, -134]
         assert learned.loc["TD3"].to_list() == [-126, -126]
+
+    def test_sacs_advice_for_short_trainings(self):
+        """The rule of results/front_door.md, and the sentence on runs that do not learn."""
+        runs = pd.read_csv(ROOT / "results" / "sac_strength.csv").groupby("method")
+        failed = runs["return"].apply(lambda returns: (returns < -200).sum())
+        assert failed[failed > 0].to_dict() == {"baseline": 1, "smooth": 1}
+        returned = runs["return"].mean()
+        free = returned.index[(returned >= 1.1 * returned["baseline"]) & (failed <= 1)]
+        varied = runs["action_variation"].mean()[free].drop("baseline")
+        assert len(varied) == 4 and varied.idxmin() == "smooth relative"
 
     def test_td3s_strength(self):
         """The rule on the last policies, its consequence on seeds 0 to 9, and the sentences."""
