@@ -228,7 +228,12 @@ def _paper_page(runs: pd.DataFrame) -> Page:
     ]
     more = partial(draw_published, paper.point, "hollow: the paper")
     draw = partial(draw_plane, groups, "late_sampled", more=more, description=description(groups))
-    return Page({"results": "\n\n".join(texts)}, groups, draw)
+    hopper = paper_table(group_records(records("hopper_terminated")))
+    hopper = replace(
+        hopper, title="Hopper with another time limit, next to the paper's table", notes=[]
+    )
+    parts = {"results": "\n\n".join(texts), "hopper": hopper.markdown()}
+    return Page(parts, groups, draw)
 
 
 def _comparison_page(found: pd.DataFrame, picture: str, measure: str) -> Page:
