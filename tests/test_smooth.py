@@ -49,6 +49,7 @@ from torchrl_l2c2 import (
     PPORPELoss,
     smooth,
 )
+from torchrl_l2c2.objectives import _watch
 from torchrl_l2c2.presets import KINDS, METHODS, PRESETS
 
 # Settings for losses without a preset.
@@ -1147,24 +1148,47 @@ class TestProgress:
                 loss.strength = wrong
         assert loss.regularizer_gain.item() == 0.5
 
-    def test_progress_that_stays_at_zero_is_told_once(self):
+    def test_progress_that_stays_at_zero_is_told_once(self, monkeypatch):
         """As from frames // total_frames."""
+        monkeypatch.setattr(_watch, "STANDSTILL", 100)
         loss, batch = smooth(cloning(), **GIVEN, ramp=1.0, beta=0.0), seeded(transitions, 4)
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
-            for _ in range(1010):
+            for _ in range(210):
                 loss.set_progress(0)
                 loss(batch)
         (message,) = (str(each.message) for each in told if "progress" in str(each.message))
-        assert "still 0 after 1000 updates" in message
+        assert "still 0 after 100 updates" in message
         assert "loss.set_progress(frames / total_frames)" in message
 
-    def test_at_strength_0_a_standstill_is_meant(self):
+    def test_many_updates_on_the_first_rollout_are_no_standstill(self, monkeypatch):
+        """Its progress is 0, and may have been set before training, too."""
+        monkeypatch.setattr(_watch, "STANDSTILL", 100)
+        loss, batch = smooth(cloning(), **GIVEN, ramp=1.0, beta=0.0), seeded(transitions, 4)
+        loss.set_progress(0)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            for progress in (0, 0.01):
+                loss.set_progress(progress)
+                for _ in range(110):
+                    loss(batch)
+
+    def test_progress_that_is_set_once_is_told_at_last(self, monkeypatch):
+        monkeypatch.setattr(_watch, "STANDSTILL", 100)
+        monkeypatch.setattr(_watch, "LONGEST_ROLLOUT", 200)
+        loss, batch = smooth(cloning(), **GIVEN, ramp=1.0, beta=0.0), seeded(transitions, 4)
+        loss.set_progress(0)
+        with pytest.warns(UserWarning, match="still 0 after 200 updates"):
+            for _ in range(200):
+                loss(batch)
+
+    def test_at_strength_0_a_standstill_is_meant(self, monkeypatch):
+        monkeypatch.setattr(_watch, "STANDSTILL", 100)
         loss, batch = smooth(cloning(), **GIVEN, ramp=1.0, beta=0.0), seeded(transitions, 4)
         loss.strength = 0.0
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            for _ in range(1010):
+            for _ in range(210):
                 loss.set_progress(0)
                 loss(batch)
 

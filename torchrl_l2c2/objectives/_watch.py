@@ -18,7 +18,10 @@ PATIENCE = 50
 """Calls of a loss before it warns of mistakes in the training loop."""
 
 STANDSTILL = 1000
-"""Calls of a loss at progress 0 before it warns; a first rollout has fewer."""
+"""Calls of a loss at progress 0 before it warns, unless they may be those of the first rollout."""
+
+LONGEST_ROLLOUT = 20 * STANDSTILL
+"""Calls of a loss at progress 0 before it warns in any case."""
 
 
 class TermWatch:
@@ -26,11 +29,13 @@ class TermWatch:
 
     Attributes:
         progress_set: whether the progress of a ramp was set.
+        standing: how often in a row it was set to 0.
         pending: added terms that were never differentiated; ``None`` before the first call.
     """
 
     def __init__(self) -> None:
         self.progress_set = False
+        self.standing = 0
         self.pending: set[str] | None = None
         self._calls = 0
         self._forwards = 0
@@ -55,15 +60,23 @@ class TermWatch:
                 "first with 0, or choose ramp=None.",
                 stacklevel=4,
             )
-        stands = self._calls == STANDSTILL and self.progress_set and loss.strength > 0
-        if stands and not loss.regularizer_gain:
-            warnings.warn(
-                f"the penalty of {type(loss).__name__} was 0 until now, because the progress of "
-                f"training is still 0 after {STANDSTILL} updates. Call "
-                "loss.set_progress(frames / total_frames) before the updates on every rollout, "
-                "with / and not //.",
-                stacklevel=4,
-            )
+        if self._calls % STANDSTILL == 0 and "standing" not in self._warned and loss.strength > 0:
+            # Twice at the first rollout, if it was also set before training.
+            stands = self.standing > 2 or (self.standing and self._calls >= LONGEST_ROLLOUT)
+            if stands and not loss.regularizer_gain:
+                self._warned.add("standing")
+                warnings.warn(
+                    f"the penalty of {type(loss).__name__} was 0 until now, because the progress "
+                    f"of training is still 0 after {self._calls} updates. Call "
+                    "loss.set_progress(frames / total_frames) before the updates on every "
+                    "rollout, with / and not //.",
+                    stacklevel=4,
+                )
+
+    def see_progress(self, progress: float) -> None:
+        """Records that the progress of a ramp was set."""
+        self.progress_set = True
+        self.standing = 0 if progress else self.standing + 1
 
     def _see_predictor(self, loss: Any) -> None:
         """Warns if the optimizer moves parameters of the loss, but none of ASAP's predictor."""

@@ -461,7 +461,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         check_real("progress", progress, at_least=0, at_most=2, hint=hint)
         if self._ramp is None:
             return
-        self._watch.progress_set = True
+        self._watch.see_progress(progress)
         self._buffers[PROGRESS].fill_(min(1.0, progress))
         self._follow_progress()
 
