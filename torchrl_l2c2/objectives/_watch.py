@@ -18,7 +18,7 @@ PATIENCE = 50
 """Calls of a loss before it warns of mistakes in the training loop."""
 
 STANDSTILL = 1000
-"""Calls of a loss at progress 0 before it warns, unless they may be those of the first rollout."""
+"""Calls of a loss at progress 0 before it warns, unless the first rollout may have as many."""
 
 LONGEST_ROLLOUT = 20 * STANDSTILL
 """Calls of a loss at progress 0 before it warns in any case."""
