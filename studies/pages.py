@@ -49,7 +49,7 @@ from torchrl_l2c2.experiment.analysis.reports.table import (
 )
 
 FRONT_DOOR = ROOT / "results" / "front_door.csv"
-FIELD_PAGES = ("field", "hopper", "sac_lunarlander", "sac_pendulum", "walker2d")
+FIELD_PAGES = ("field", "hopper", "sac_hopper", "sac_lunarlander", "sac_pendulum", "walker2d")
 # The methods that one page compares PPO's preset of L2C2 with.
 RIVALS = ("baseline", "CAPS", "CAPS, lambda_spatial=0.005", "CATS")
 # Methods of the pictures, each with more than two runs: more than six cannot be told apart.
