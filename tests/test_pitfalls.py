@@ -775,6 +775,14 @@ def test_a_method_is_not_replaced_by_a_value():
     assert loss.ramp(0.5) is loss
 
 
+def test_another_distance_needs_another_loss():
+    """The function was chosen when the loss was made."""
+    loss = L2C2Loss(base_loss(), NEAR, policy_distance="mean")
+    with pytest.raises(AttributeError, match=r"l2c2_policy_distance.* has no setter"):
+        loss.l2c2_policy_distance = "kl"
+    assert loss.l2c2_policy_distance == "mean"
+
+
 def test_returns_of_several_steps_are_told_once():
     """The neighborhoods are then larger; with one step nothing is told."""
     for steps, count in ((3, 1), (1, 0)):

@@ -169,9 +169,11 @@ class TestSingleSteps:
         for key in ("observation", *agent.states):
             batch["next", key] = batch[key].clone()
         batch["next", "is_init"] = batch["is_init"].clone()
-        loss = CATSLoss(ddpg(agent))
+        loss, training = CATSLoss(ddpg(agent)), []
+        agent.layer.register_forward_pre_hook(lambda layer, _: training.append(layer.training))
         assert loss.policy_regularizer(batch)["loss_cats"] == 0
         assert agent.layer.training and agent.layer.dropout == 0.5
+        assert all(training) and training  # cuDNN differentiates in no other mode.
 
     def test_the_next_action_is_the_one_that_was_taken(self, module):
         """CATS and CAPS: the rollout itself has the policy's next actions."""

@@ -899,6 +899,24 @@ def test_cats_compiles_into_one_graph():
         torch.testing.assert_close(compiled(batch)["loss_cats"], expected)
 
 
+def test_lcp_runs_uncompiled_in_a_compiled_loop():
+    """With the eager numbers and gradients, where Dynamo would fail."""
+    loss, batch = LCPLoss(DDPGLoss(deterministic_actor(), qvalue()), of="mean"), transitions(8)
+    weights = [p for p in loss.actor_network_params.values(True, True) if p.ndim == 2]
+
+    def gradients():
+        torch.manual_seed(0)
+        return torch.autograd.grad(loss.policy_regularizer(batch)["loss_lcp"], weights)
+
+    def compute(values):
+        return loss.policy_regularizer(values)["loss_lcp"]
+
+    torch._dynamo.reset()
+    torch.manual_seed(0)
+    found = torch.autograd.grad(torch.compile(compute, backend="eager")(batch), weights)
+    torch.testing.assert_close(found, gradients())
+
+
 RUNNING = [CATSConfig(), GradCAPSConfig(), ASAPConfig(), SR2LConfig(steps=2), LCPConfig()]
 
 

@@ -927,6 +927,31 @@ class TestRelativeParts:
         expected = 100 * plain["loss_cats"]
         torch.testing.assert_close(relative["loss_cats"], expected, rtol=1e-3, atol=0.0)
 
+    @pytest.mark.parametrize("first", [True, False])
+    def test_a_subclass_with_a_term_of_its_own(self, first):
+        """Before or after the action values: the size is the values', not that term's."""
+
+        class Sparing(TD3Loss):
+            def effort(self, tensordict):
+                with self.actor_network_params.to_module(self.actor_network):
+                    action = self.actor_network(tensordict.select("observation"))["action"]
+                return self._reduce_loss(action.square().sum(-1), tensordict)
+
+            def actor_loss(self, tensordict):
+                before = self.effort(tensordict) if first else 0.0
+                value, metadata = super().actor_loss(tensordict)
+                after = 0.0 if first else self.effort(tensordict)
+                return value + before + after, metadata
+
+        batch = seeded(transitions, 12, seed=1)
+        found = []
+        for kind in (TD3Loss, Sparing):
+            base = seeded(lambda kind=kind: kind(deterministic_actor(), qvalue(), bounds=(-1, 1)))
+            with torch.no_grad():
+                base.qvalue_network_params.apply(lambda p: p.mul_(10), inplace=False)
+            found.append(seeded(smooth(base), batch.copy(), seed=2)["penalty_l2c2_actor"])
+        torch.testing.assert_close(*found)
+
     def test_losses_without_an_action_value_in_the_policys_term(self):
         with pytest.raises(TypeError, match="a penalty can be relative to action values"):
             CATSLoss(iql()).relative()
@@ -1064,6 +1089,14 @@ class TestProgress:
         for progress, gain in ((0.0, 0.0), (0.125, 0.5), (0.25, 1.0), (0.5, 2.0), (1.3, 2.0)):
             loss.set_progress(progress)
             assert loss.regularizer_gain.item() == gain
+
+    @pytest.mark.parametrize("strength", [0.0, 3.0])
+    def test_it_ends_at_the_strength(self, strength):
+        loss = smooth(td3(), strength=strength).ramp(0.5)
+        assert loss.strength == loss.regularizer_gain.item() == strength
+        loss.set_progress(0.25)
+        assert loss.regularizer_gain.item() == strength / 2
+        assert loss.ramp(1.0).strength == strength
 
     def test_the_penalty_follows(self):
         batch = seeded(on_policy, 12)

@@ -115,9 +115,9 @@ def smooth(
         if chosen.relative:  # The size of such a gain says nothing.
             warnings.filterwarnings("ignore", "gains up to .* had no measurable effect")
         regularized = make(loss, **arguments)
-    regularized.regularizer_gain = strength
     if chosen.ramp is not None:
-        regularized.ramp(chosen.ramp, end=strength)
+        regularized.ramp(chosen.ramp)
+    regularized.strength = strength
     if chosen.relative:
         regularized.relative()
     return regularized.fold() if fold else regularized

@@ -419,12 +419,19 @@ def without_dropout(net: nn.Module) -> Iterator[None]:
     With dropout, two evaluations of one state differ, and a distance would measure the difference.
     """
     layers = [m for m in net.modules() if drops_out(m) and m.training]
-    for layer in layers:
+    # cuDNN differentiates recurrent layers only in training mode.
+    recurrent = [(m, m.dropout) for m in layers if isinstance(m, nn.RNNBase)]
+    others = [m for m in layers if not isinstance(m, nn.RNNBase)]
+    for rnn, _ in recurrent:
+        rnn.dropout = 0.0
+    for layer in others:
         layer.training = False
     try:
         yield
     finally:
-        for layer in layers:
+        for rnn, dropout in recurrent:
+            rnn.dropout = dropout
+        for layer in others:
             layer.training = True
 
 

@@ -38,9 +38,6 @@ PARTS: dict[str, tuple[str, tuple[str, ...]]] = {
     "q_loss": ("value", ("loss_qvalue",)),
 }
 
-MEASURED_PARTS = [name for name, (_, targets) in PARTS.items() if targets is POLICY_LOSSES]
-"""Methods that compute the term to which a penalty is relative."""
-
 
 def fold_targets(term: str, trains_policy: bool, own: Iterable[str]) -> list[str]:
     """Finds the loss's own terms to which a penalty is added.
@@ -118,7 +115,8 @@ def make_part(
         size = None
         if self._relative and is_measured:
             out, sizes = self._evaluation.measure(lambda: method(self, tensordict, *args, **kwargs))
-            size = sizes[-1] if sizes else None
+            # A subclass may reduce other terms than the action values, before or after these.
+            size = torch.stack(sizes).max() if sizes else None
         else:
             out = method(self, tensordict, *args, **kwargs)
         # Within forward, the penalty is added there.

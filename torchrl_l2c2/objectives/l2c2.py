@@ -252,8 +252,9 @@ class L2C2Loss(RegularizedLoss):
         check_bool("skip_ends", skip_ends)
         self.skip_ends = self.skip_ends or skip_ends
         self._l2c2_distance = choose_policy_distance(policy_distance, hellinger_samples)
-        own_distance = not isinstance(policy_distance, str)  # Not a module: it is the caller's.
-        self.l2c2_policy_distance = "a function" if own_distance else policy_distance
+        # The name alone, since a module would become part of the loss.
+        named = isinstance(policy_distance, str)
+        self._l2c2_distance_name = str(policy_distance) if named else "a function"
         self.l2c2_neighborhood = neighborhood
         self.l2c2_num_samples = int(num_samples)
         self.l2c2_over_neighbors: Literal["mean", "max"] = over_neighbors
@@ -290,6 +291,11 @@ class L2C2Loss(RegularizedLoss):
                 "train.py), or raise lambda_min and lambda_max.",
                 stacklevel=2,
             )
+
+    @property
+    def l2c2_policy_distance(self) -> str:
+        """The ``policy_distance`` with which the loss was made."""
+        return self._l2c2_distance_name
 
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
         terms = super().policy_regularizer(tensordict)

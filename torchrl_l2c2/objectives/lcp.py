@@ -97,6 +97,8 @@ class LCPLoss(RegularizedLoss):
             )
         self.declare_terms(policy=["loss_lcp"])
 
+    # Dynamo does not trace a gradient within the loss; the rest is compiled around it.
+    @torch.compiler.disable
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
         terms = super().policy_regularizer(tensordict)
         check_takes_gradients("LCPLoss")

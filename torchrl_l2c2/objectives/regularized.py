@@ -16,7 +16,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import dispatch
 from torch import Tensor
 from torch.compiler import is_compiling
-from torchrl.objectives import DiscreteIQLLoss, IQLLoss, LossModule
+from torchrl.objectives import DiscreteIQLLoss, IQLLoss, LossModule, REDQLoss
 
 from torchrl_l2c2._checks import as_number, check_of_each, check_real
 from torchrl_l2c2.objectives._batch import (
@@ -32,7 +32,6 @@ from torchrl_l2c2.objectives._batch import (
 )
 from torchrl_l2c2.objectives._evaluation import EvaluatedNetworks, Policy, SharedEvaluation
 from torchrl_l2c2.objectives._fold import (
-    MEASURED_PARTS,
     PARTS,
     add_penalty,
     fold_targets,
@@ -316,36 +315,32 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         """``True`` if the penalty is part of the loss's own terms."""
         return self._folded
 
-    def ramp(self, length: float = 1.0, *, end: float = 1.0) -> RegularizedLoss:
+    def ramp(self, length: float = 1.0) -> RegularizedLoss:
         r"""Makes the gain rise linearly with the progress of training.
 
         .. math::
-            \mathtt{regularizer\_gain} = \mathtt{end} \cdot \min(1, x / \mathtt{length})
+            \mathtt{regularizer\_gain} = \mathtt{strength} \cdot \min(1, x / \mathtt{length})
 
-        :meth:`set_progress` sets the progress :math:`x`. Until its first call the gain is ``end``.
-        CATS (arXiv 2610.07910) has this schedule, with ``length=1``.
+        :meth:`set_progress` sets the progress :math:`x`. Until its first call the gain is the
+        :attr:`strength`. CATS (arXiv 2610.07910) has this schedule, with ``length=1``.
 
         Args:
-            length (float): share of training after which the gain is ``end``, in (0, 1]. Smaller
-                values smooth earlier. Defaults to ``1.0``.
-
-        Keyword Args:
-            end (float): final gain, at least 0. Larger values regularize more. Defaults to
-                ``1.0``.
+            length (float): share of training after which the gain is the strength, in (0, 1].
+                Smaller values smooth earlier. Defaults to ``1.0``.
 
         Returns:
             The loss itself.
 
         Raises:
-            TypeError: a value is not a real number.
-            ValueError: a value is out of its range.
+            TypeError: the length is not a real number.
+            ValueError: it is out of its range.
         """
         check_real("length", length, above=0, at_most=1)
-        check_real("end", end, at_least=0)
-        self._ramp = float(end), float(length)
+        strength = self.strength
+        self._ramp = strength, float(length)
         progress = torch.tensor(-1.0, device=self._buffers[GAIN].device)
         self.register_buffer(PROGRESS, progress)
-        self.regularizer_gain = end
+        self.regularizer_gain = strength
         return self
 
     def relative(self) -> RegularizedLoss:
@@ -364,7 +359,8 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         While all values are 0, as before the first reward, so is the penalty. Terms of value
         functions and predictors stay as they are: the loss of a value function grows with the
         values, too. A direct call of :meth:`policy_regularizer` returns its terms before the
-        multiplication.
+        multiplication. If the ``actor_loss`` of a subclass reduces several terms, the largest size
+        counts.
 
         Returns:
             The loss itself.
@@ -397,13 +393,13 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         self, forward: Callable[[TensorDictBase], TensorDictBase], tensordict: TensorDictBase
     ) -> tuple[TensorDictBase, Tensor | None]:
         """The loss's own terms, and the size of its policy term if it was measured."""
-        if not self._relative or any(hasattr(self, name) for name in MEASURED_PARTS):
-            terms = forward(tensordict)
-            assert self._evaluation.forward_pass is not None
-            return terms, self._evaluation.forward_pass.policy_size
-        # REDQLoss has no method for this term, which is the first that it reduces.
-        terms, sizes = self._evaluation.measure(lambda: forward(tensordict))
-        return terms, sizes[0] if sizes else None
+        if self._relative and isinstance(self, REDQLoss):
+            # It has no method for this term, which is the first that it reduces.
+            terms, sizes = self._evaluation.measure(lambda: forward(tensordict))
+            return terms, sizes[0]
+        terms = forward(tensordict)
+        assert self._evaluation.forward_pass is not None
+        return terms, self._evaluation.forward_pass.policy_size
 
     def _make_relative(
         self, added: TensorDictBase, size: Tensor | None, own: Tensor, tensordict: TensorDictBase

@@ -52,7 +52,7 @@ class Regularization:
         self.method, self.ramp_updates, self.updates = method, ramp_updates, 0
         if ramp_updates is not None:
             check_positive_int("ramp_updates", ramp_updates)
-            loss.ramp(end=float(loss.regularizer_gain))
+            loss.ramp()
         self._sums: dict[str, Tensor] = {}
         self._batches = 0
         self._set_progress()
