@@ -113,7 +113,7 @@ class ExperimentConfig:
         default=1,
         ge=1,
         le=1024,
-        description="number of PyTorch threads; more do not speed up small networks",
+        description="number of PyTorch threads; more speed up large layers only",
         json_schema_extra=CHANGES_NO_NUMBERS,
     )
     compile: bool = Field(
