@@ -798,9 +798,21 @@ class TestRecording:
         if often == 10:
             counts += torch.arange(100) % 3 - 1
         logged = flips.repeat_interleave(counts, 0)
-        with nullcontext() if often == 1 else pytest.warns(UserWarning, match=f"{often} times"):
+        told = f"every action {len(logged) / 100:.3g} times"
+        with nullcontext() if often == 1 else pytest.warns(UserWarning, match=told):
             found = diagnose_actions(logged, rate=20.0 * often)
-        assert torch.equal(found.actions, flips) and found.rate == pytest.approx(20.0)
+        assert torch.equal(found.actions, flips) and found.rate == pytest.approx(20.0, rel=2e-3)
+
+    @pytest.mark.parametrize("rate", [75.0, 120.0, 240.0])
+    def test_a_logger_whose_rate_is_no_multiple_of_the_policys(self, rate):
+        """A policy of 50 Hz; actions that return, of a bang-bang policy, are no repetitions."""
+        noise = torch.randn(200, 2, generator=torch.Generator().manual_seed(0))
+        places = (torch.arange(int(4 * rate)) * (50.0 / rate) + 1e-6).long()
+        with pytest.warns(UserWarning, match=f"every action {rate / 50:.3g} times"):
+            found = diagnose_actions(noise[places], rate=rate)
+        assert torch.equal(found.actions, noise) and found.rate == pytest.approx(50.0, rel=1e-2)
+        held = noise.sign()[places]
+        assert torch.equal(diagnose_actions(held).actions, held)
 
     def test_held_and_rounded_actions_are_no_repetitions(self):
         """A rest between movements, and a slow movement in few levels."""
@@ -833,6 +845,11 @@ class TestRecording:
         with pytest.raises(UserError, match=r"line 2: 'mode' must be a finite number, got 'walk'"):
             diagnose_recording(path)
 
+    def test_a_counter_of_steps_is_no_time(self, tmp_path):
+        path = table_file(tmp_path / "a.csv", "time,a", *(f"{i},{(-1) ** i}" for i in range(20)))
+        with pytest.warns(UserWarning, match="has steps of 1 s: if it counts the steps, multiply"):
+            diagnose_recording(path)
+
     def test_gaps_are_told(self, tmp_path):
         """The rate is that of the other steps."""
         times = [i / 10 + (0.5 if i > 3 else 0.0) for i in range(20)]
@@ -856,7 +873,10 @@ class TestRecording:
             (["time", *map(str, range(20))], r"at least 20 steps and one action, got \[20, 0\]"),
             (["a,time", "0,0", "0,1", "0,1", "0,2"], r"line 4: the column 'time' must increase"),
             (["a,step", *(f"{i % 2},{i}" for i in range(20))], "'step' increases in every row"),
-            (["a,time", *(f"{i % 2},{i}e7" for i in range(20))], "must be in seconds, got steps"),
+            (
+                ["a,time", *(f"{i % 2},{i}e7" for i in range(20))],
+                "steps of 1e.07: divide it, by 1e3 if",
+            ),
         ],
     )
     def test_what_is_no_table_of_actions_is_refused(self, tmp_path, lines, message):

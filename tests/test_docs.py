@@ -10,8 +10,11 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import gymnasium
+import numpy as np
 import pytest
 import torch
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from scipy.integrate import quad
 from tensordict import TensorDict
 from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
@@ -35,6 +38,7 @@ ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs"
 COMPONENTS = FOLDER / "components.md"
 DISTANCES = FOLDER / "distances.md"
+PLAIN = FOLDER / "plain_pytorch.md"
 # An HTML comment right before a block keeps it from being run.
 BLOCK = re.compile(r"(?P<skip><!-- no-test -->\s*)?^```python\n(?P<code>.*?)^```", re.M | re.S)
 PAGES = [
@@ -121,8 +125,7 @@ def test_the_guide_shows_the_table_of_presets() -> None:
 
 def test_the_function_without_torchrl_is_the_presets_penalty() -> None:
     """With the same random numbers; the gains that the page names are those of the presets."""
-    page = FOLDER / "plain_pytorch.md"
-    defined = run_blocks(page)
+    defined = run_blocks(PLAIN)
     mean, observation = defined["actor_mean"], torch.randn(32, 3)
     successor, ended = observation + 0.1 * torch.randn(32, 3), torch.arange(32) % 5 == 0
     done = ended.unsqueeze(-1)
@@ -143,7 +146,40 @@ def test_the_function_without_torchrl_is_the_presets_penalty() -> None:
     for kind in ("ppo", "sac", "td3"):
         chosen = PRESETS["l2c2"][kind].settings
         gains = f"lambda_min={chosen['lambda_min']:g}", f"lambda_max={chosen['lambda_max']:g}"
-        assert re.search(r"(\.0)?, ".join(map(re.escape, gains)), page.read_text())
+        assert re.search(r"(\.0)?, ".join(map(re.escape, gains)), PLAIN.read_text())
+
+
+class Counter(gymnasium.Env[np.ndarray, np.ndarray]):
+    """Its observation counts the steps of an episode, which has five."""
+
+    observation_space = gymnasium.spaces.Box(0.0, 5.0, (1,))
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))
+
+    def reset(self, **kwargs: Any) -> tuple[np.ndarray, dict[str, Any]]:
+        self.count = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        self.count += 1
+        return np.full(1, self.count, np.float32), 0.0, self.count == 5, False, {}
+
+
+@pytest.mark.parametrize("mode", ["NEXT_STEP", "SAME_STEP"])
+def test_no_reset_is_among_the_transitions_without_torchrl(mode: str) -> None:
+    """However Gymnasium's vector environments reset: the page's lines on a loop like CleanRL's."""
+    envs = SyncVectorEnv([Counter] * 2, autoreset_mode=AutoresetMode[mode])
+    steps, environments = 23, 2
+    obs, dones = torch.zeros(steps, environments, 1), torch.zeros(steps, environments)
+    next_obs, next_done = torch.tensor(envs.reset(seed=0)[0]), torch.zeros(environments)
+    for step in range(steps):
+        obs[step], dones[step] = next_obs, next_done
+        observed, _, terminated, truncated, _ = envs.step(np.zeros((environments, 1), np.float32))
+        next_obs, next_done = torch.tensor(observed), torch.tensor(terminated | truncated).float()
+    (lines,) = re.findall(r"^(successors = .*?)^batch", PLAIN.read_text(), re.M | re.S)
+    names = {"torch": torch, **locals()}
+    exec(lines, names)
+    moved = (names["successors"] - obs.flatten(0, 1))[names["ended"] == 0]
+    assert (moved == 1).all() and len(moved) >= 0.6 * steps * environments
 
 
 def test_the_quickstart_is_the_notebook() -> None:

@@ -26,6 +26,7 @@ GAP = 2.5  # times the median time step: a longer one is a gap
 Bounds = tuple[float, float]
 BEYOND = 0.5  # share of an action that may lie beyond its bounds, where a task would clip it
 EVEN = 0.9  # share of the actions that are repeated equally often, if a logger repeats them
+REPEATED = 1.3  # how often a logger that is faster than the policy repeats an action, at least
 
 
 def diagnose_actions(
@@ -90,8 +91,8 @@ def diagnose_actions(
     if repeated > 1:
         rate = rate and rate / repeated
         warnings.warn(
-            f"{name} has every action {repeated} times, as of a logger that is faster than the "
-            f"policy: one row of {repeated} is kept.",
+            f"{name} has every action {repeated:.3g} times, as of a logger that is faster than the "
+            "policy: every action is kept once.",
             stacklevel=2,
         )
     low, high, bounded = bounds_of(spec, actions)
@@ -161,19 +162,25 @@ def diagnose_recording(
     )
 
 
-def _without_repetitions(actions: Tensor) -> tuple[Tensor, int]:
-    """Actions of which each is kept once if all are repeated equally often, and how often."""
+def _without_repetitions(actions: Tensor) -> tuple[Tensor, float]:
+    """Actions of which each is kept once if all are repeated about equally often, and how often."""
     starts = torch.cat(
         (torch.zeros(1, dtype=torch.long), (actions.diff(dim=0) != 0).any(1).nonzero()[:, 0] + 1)
     )
     lengths = torch.cat((starts, torch.tensor([len(actions)]))).diff()
-    often = int(lengths.median())
+    often = lengths.median().item()
+    tolerance = often / 10
+    if len(actions[starts].unique(dim=0)) > len(starts) / 2:
+        # Few of the actions return: their repetitions are the logger's, whose rate may be no
+        # multiple of the policy's.
+        often = lengths[lengths <= 2 * often].float().mean().item()
+        tolerance = max(often / 4, 1.0)
     # An action may be held for several steps, and a step may take a row more or less.
-    held = (lengths / often).round()
-    even = ((lengths - held * often).abs() <= often / 10).float().mean()
-    if often < 2 or len(starts) < LEAST_STEPS or even < EVEN:
-        return actions, 1
-    return actions[starts].repeat_interleave(held.long().clamp_min(1), 0), often
+    held = (lengths / often).round().clamp_min(1)
+    even = ((lengths - held * often).abs() <= tolerance).float().mean()
+    if often < REPEATED or len(starts) < LEAST_STEPS or even < EVEN:
+        return actions, 1.0
+    return actions[starts].repeat_interleave(held.long(), 0), often
 
 
 def _spec(actions: int, bounds: Bounds | Sequence[Bounds] | None) -> TensorSpec:
@@ -280,7 +287,13 @@ def _rate(seconds: Tensor, path: Path, lines: Sequence[tuple[int, list[str]]]) -
     if not LIKELY[0] <= median <= LIKELY[1]:
         raise UserError(
             f"{path}: the column {TIME!r} must be in seconds, got steps of {median:g}: divide it, "
-            "for example by 1e9 if it has nanoseconds."
+            "by 1e3 if it has milliseconds, by 1e9 if it has nanoseconds."
+        )
+    if (steps == 1.0).all():
+        warnings.warn(
+            f"the column {TIME!r} of {path} has steps of 1 s: if it counts the steps, multiply it "
+            "by the seconds of a step, or leave it out. Frequencies are wrong otherwise.",
+            stacklevel=3,
         )
     gaps = (steps > GAP * median).nonzero()[:, 0]
     if len(gaps):

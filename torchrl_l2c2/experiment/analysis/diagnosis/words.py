@@ -411,17 +411,15 @@ def _movement(diagnosis: Diagnosis) -> Finding:
     """Finding about a policy whose actions have no fault."""
     changes = diagnosis.relative.diff(dim=0).abs()
     most = int(changes.mean(0).argmax())
-    change = changes[:, most].mean().item()
+    change, gain = changes[:, most].mean().item(), diagnosis.measures["previous_action_gain"]
     place = "" if diagnosis.is_recording else "in the first episode "
     several = changes.shape[1] > 1
     moves = f"{diagnosis.action_name(most)} changes most," if several else "the action changes"
     size = f"{change:.1%}" if change >= 0.0005 else "less than 0.1%"
-    numbers = (
-        f"{place}{moves} by {size} of its range per step, and its gain on the previous "
-        f"action is {diagnosis.measures['previous_action_gain']:.2f}"
-    )
+    numbers = f"{place}{moves} by {size} of its range per step"
     if change <= threshold("SMOOTH"):
         return Finding("smooth", f"It is smooth: {numbers}.", fault=False)
+    numbers += f", and its gain on the previous action is {gain:.2f}"
     where = _where(changes[:, most : most + 1])
     faults = ["flip", "chatter", *(["jump between its bounds"] if diagnosis.bounded else [])]
     text = (
