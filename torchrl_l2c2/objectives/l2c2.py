@@ -252,7 +252,7 @@ class L2C2Loss(RegularizedLoss):
         check_bool("skip_ends", skip_ends)
         self.skip_ends = self.skip_ends or skip_ends
         self._l2c2_distance = choose_policy_distance(policy_distance, hellinger_samples)
-        # The name alone, since a module would become part of the loss.
+        # Its name: a module would become part of the loss.
         named = isinstance(policy_distance, str)
         self._l2c2_distance_name = str(policy_distance) if named else "a function"
         self.l2c2_neighborhood = neighborhood
