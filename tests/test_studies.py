@@ -1027,7 +1027,7 @@ class TestStrength:
         assert f"where Sm is {ratios['lunarlander'][1.0]:.2f} of the baseline" in page
         assert f"with 0.66 and {ratios['hopper_v5'][0.3]:.2f} of its Sm" in page
         guide = " ".join((ROOT / "docs" / "strength.md").read_text().split())
-        assert "10 has half of the preset's Sm" in guide
+        assert "10 has half of the preset's [Sm](smoothness.md)" in guide
         assert ratios["hopper_v5"][10.0] / ratios["hopper_v5"][1.0] == pytest.approx(0.5, abs=0.05)
 
     def test_seeds_are_beside_their_own(self):
