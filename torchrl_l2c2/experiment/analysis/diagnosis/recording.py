@@ -171,7 +171,7 @@ def _without_repetitions(actions: Tensor) -> tuple[Tensor, float]:
     often = lengths.median().item()
     tolerance = often / 10
     if len(actions[starts].unique(dim=0)) > len(starts) / 2:
-        # Few of the actions return: their repetitions are the logger's, whose rate may be no
+        # Most actions differ, so equal rows in succession come from the logger. Its rate may be no
         # multiple of the policy's.
         often = lengths[lengths <= 2 * often].float().mean().item()
         tolerance = max(often / 4, 1.0)
