@@ -274,6 +274,8 @@ def _field_page(name: str, shown: pd.DataFrame) -> Page:
     first = [against_table(shown, OURS)] if name in ("hopper", "one_setting") else []
     tables = [field_table(shown), choice_table(shown), *pairwise_tables(shown)]
     groups = [g for g in field_groups(shown) if g.name in PICTURED and len(g.runs) > 2]
+    if len({group.name for group in groups}) < 2:
+        groups = []  # A picture of one method compares nothing.
     picture = f"![Return against Sm of the main settings, and the published results]({name}.svg)"
     texts = [
         *(table.markdown() for table in first),
