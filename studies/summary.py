@@ -58,6 +58,7 @@ class Benchmark(NamedTuple):
 BENCHMARKS = (
     Benchmark("Pendulum", "SAC", "sac_pendulum", "pendulum", OF_SAC, "30000 frames"),
     Benchmark("LunarLander", "SAC", "sac_lunarlander", "lunarlander", OF_SAC, "100000 frames"),
+    Benchmark("Hopper", "SAC", "sac_hopper", "hopper_v5", OF_SAC, "200000 frames"),
     Benchmark("Pendulum", "PPO", "field", "pendulum", OURS, "500000 frames"),
     Benchmark("LunarLander", "PPO", "field", "lunarlander", OURS, "500000 frames"),
     Benchmark("Hopper", "PPO", "hopper", "hopper_v5", OURS, MILLION),

@@ -568,7 +568,7 @@ class TestProse:
         rough = [
             side.scores("last_mean", "action_variation").mean() for _, side in benchmarks().values()
         ]
-        assert rough == sorted(rough, reverse=True) and len(rough) == 19
+        assert rough == sorted(rough, reverse=True) and len(rough) == 20
 
     def test_the_readmes_sentences(self):
         """The changes of rough and of smooth baselines, the losses of return, and untuned tasks."""
@@ -586,15 +586,16 @@ class TestProse:
                 group.scores("last_mean", "return").mean() for group in (ours, baseline)
             )
             higher.append(total > other)
-        assert len(smooth) == 5 and sum(higher) == 7 and len(higher) == 19
+        assert len(smooth) == 5 and sum(higher) == 7 and len(higher) == 20
         assert f"In the {len(rough)} roughest of" in readme
-        assert f"fell by {-max(rough):.0f} to {-min(rough):.1f}%, in twelve of them" in readme
+        assert f"fell by {-max(rough):.0f} to {-min(rough):.1f}%, in thirteen of them" in readme
         assert f"the other five it changed by {min(smooth):.0f} to {max(smooth):+.0f}%" in readme
-        # Thirteen with PPO on LunarLander, which is among the other five.
-        assert beyond["action_variation", True, False] == 13
+        # Fourteen with PPO on LunarLander, which is among the other five.
+        assert beyond["action_variation", True, False] == 14
         assert beyond["action_variation", False, True] == 0
         assert (
-            "was higher in seven and lower in twelve. Beyond seed noise, runs return more" in readme
+            "was higher in seven and lower in thirteen. Beyond seed noise, runs return more"
+            in readme
         )
         assert "more in five benchmarks and less in one" in readme
         assert beyond["return", True, False] == 5 and beyond["return", False, True] == 1
@@ -655,6 +656,22 @@ class TestProse:
             row = [f"{total:.0f} / {sm:.3f}" for total, sm in pairs]
             mean = "{:.1f} / {:.3f}".format(*np.mean(pairs, 0))
             assert f"| {' | '.join([frames, *row, mean])} |" in page
+
+    def test_sac_on_hopper(self):
+        """The returns seed by seed, and the changes of the means."""
+        page = (ROOT / "results" / "sac_hopper.md").read_text()
+        runs = records("sac_hopper").query("length == '200000 frames'").set_index("method")
+        start = " ".join(page.partition("<!-- results: start -->")[0].split())
+        for method, name in (("none", "the baseline returns"), ("l2c2", "L2C2"), ("cats", "CATS")):
+            *first, last = (f"{total:.0f}" for total in runs.loc[method, "last_mean_return"])
+            assert f"{name} {', '.join(first)} and {last}" in start
+        change = runs.groupby("method")[["last_mean_return", "last_mean_action_variation"]].mean()
+        change = 100 * (change / change.loc["none"] - 1)
+        totals, variations = (change[name].map("{:.0f}".format) for name in change)
+        assert f"changes its actions {variations['l2c2'][1:]}% less" in start
+        assert f"and CATS {variations['cats'][1:]}% less" in start
+        assert f"returns {totals['l2c2'][1:]}% less than the baseline" in start
+        assert f"and CATS {totals['cats']}% more" in start
 
     def test_cats_as_strong_as_l2c2(self):
         """Both at the same strength, on two tasks: means, and how probable a better run is."""
