@@ -673,6 +673,16 @@ class TestProse:
         assert f"returns {totals['l2c2'][1:]}% less than the baseline" in start
         assert f"and CATS {totals['cats']}% more" in start
 
+    def test_sac_on_hopper_for_longer(self):
+        page = (ROOT / "results" / "sac_hopper.md").read_text().partition("## After 500,000")[2]
+        runs = pd.concat([records("sac_hopper"), records("sac_hopper_500000")]).query("seed == 0")
+        names = {"none": "baseline", "l2c2": "L2C2, means 10, ramp"}
+        for run in runs[runs["method"].isin(names)].itertuples():
+            tested = f"{run.last_mean_return:.0f} | {run.last_mean_action_variation:.3f}"
+            frames = f"{int(run.length.split()[0]):,}"
+            sm = f"{run.last_mean_sm_asap:.3f}"
+            assert f"| {frames} | {names[run.method]} | {tested} | {sm} |" in page
+
     def test_cats_as_strong_as_l2c2(self):
         """Both at the same strength, on two tasks: means, and how probable a better run is."""
         page = (ROOT / "results" / "one_setting.md").read_text().partition("## CATS, as strong")[2]
