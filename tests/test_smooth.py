@@ -983,7 +983,7 @@ class TestRelativeParts:
         with pytest.warns(UserWarning, match="does not know the size of the action values"):
             loss.policy_regularizer(batch.copy())
 
-    @pytest.mark.parametrize("relative", [False, True])
+    @pytest.mark.parametrize("relative", [pytest.param(False, marks=pytest.mark.slow), True])
     def test_a_break_of_the_graph_changes_nothing(self, relative):
         """The penalty is added once, and has its size, where compiled code calls eager code."""
         torch._dynamo.reset()
@@ -1046,7 +1046,7 @@ class TestRelativeParts:
             near = Neighborhood(lambda_min=3.0, lambda_max=300.0, neighbors="line")
             smooth(sac(), neighborhood=near)
 
-    @pytest.mark.parametrize("make", [sac, td3, ddpg])
+    @pytest.mark.parametrize("make", [sac, td3, pytest.param(ddpg, marks=pytest.mark.slow)])
     def test_it_compiles_into_one_graph(self, make):
         torch._dynamo.reset()
         loss = smooth(seeded(make), **GIVEN).relative()

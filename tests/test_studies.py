@@ -683,6 +683,14 @@ class TestProse:
             frames = f"{int(run.length.split()[0]):,}"
             sm = f"{run.last_mean_sm_asap:.3f}"
             assert f"| {frames} | {names[run.method]} | {tested} | {sm} |" in page
+        longer = records("sac_hopper_500000").set_index("method")
+        less, more, sampled = (
+            100 * abs(longer.loc["l2c2", column] / longer.loc["none", column] - 1)
+            for column in ("last_mean_action_variation", "last_mean_return", "late_sampled_return")
+        )
+        text = " ".join(page.split())
+        assert f"actions {less:.0f}% less than the baseline's, and returns {more:.0f}% more" in text
+        assert f"with sampled actions, it returns {sampled:.0f}% less" in text
 
     def test_cats_as_strong_as_l2c2(self):
         """Both at the same strength, on two tasks: means, and how probable a better run is."""
