@@ -116,7 +116,7 @@ def make_part(
         if self._relative and is_measured:
             out, sizes = self._evaluation.measure(lambda: method(self, tensordict, *args, **kwargs))
             # A subclass may reduce other terms than the action values, before or after these.
-            size = torch.stack(sizes).max() if sizes else None
+            size = functools.reduce(torch.maximum, sizes) if sizes else None
         else:
             out = method(self, tensordict, *args, **kwargs)
         # Within forward, the penalty is added there.
