@@ -13,8 +13,9 @@ from torchrl.modules import (
     ProbabilisticActor,
     TanhNormal,
     ValueOperator,
+    set_recurrent_mode,
 )
-from torchrl.objectives import DDPGLoss, PPOLoss
+from torchrl.objectives import DDPGLoss, IQLLoss, PPOLoss, ReinforceLoss, SACLoss
 
 from torchrl_l2c2 import (
     ASAPLoss,
@@ -222,6 +223,18 @@ def critic():
     return ValueOperator(nn.Linear(OBSERVATION, 1), in_keys=["observation"])
 
 
+def others(base):
+    """The value functions of a loss, and its other arguments."""
+    action_value = ValueOperator(
+        nn.Bilinear(OBSERVATION, ACTION, 1), in_keys=["observation", "action"]
+    )
+    if base is SACLoss:
+        return {"qvalue_network": action_value, "target_entropy": -ACTION}
+    if base is IQLLoss:
+        return {"qvalue_network": action_value, "value_network": critic()}
+    return {"critic_network": critic()}
+
+
 @MODULES
 class TestLosses:
     def test_the_losss_own_terms_are_of_sequences(self, module):
@@ -235,6 +248,23 @@ class TestLosses:
         for key in ("loss_objective", "loss_critic"):
             assert terms[key] == own[key]
         assert terms["loss_l2c2_actor"] == loss.policy_regularizer(batch)["loss_l2c2_actor"] > 0
+
+    @pytest.mark.parametrize(
+        "base", [SACLoss, IQLLoss, ReinforceLoss, PPOLoss], ids=lambda base: base.__name__
+    )
+    @pytest.mark.parametrize(("make", "term"), [(CATSLoss, "cats"), (CAPSLoss, "caps_temporal")])
+    def test_the_next_recurrent_states_are_those_of_the_batch(self, module, base, make, term):
+        """In sequences, the policy of some losses writes zeros over most of them."""
+        agent = Agent(module, gaussian=True)
+        batch = rollout(agent)
+        loss = make(base(agent.actor, **others(base)), lambda_temporal=1.0)
+        expected = loss.policy_regularizer(batch.copy())[f"loss_{term}"]
+        with set_recurrent_mode(True):
+            assert loss(batch.copy())[f"loss_{term}"] == expected > 0
+            if hasattr(loss, "actor_loss"):
+                loss.fold()
+                _, metadata = loss.actor_loss(batch.copy())
+                assert metadata[f"penalty_{term}"] == expected
 
     def test_a_loss_that_shares_its_evaluation(self, module):
         """An evaluation of sequences is not one of single steps: it is not shared."""

@@ -179,6 +179,22 @@ class TestTheClass:
         loss.stillness_coeff = 0.0
         assert copy.deepcopy(L2C2Loss(loss))(batch)["loss_stillness"] == 0
 
+    @pytest.mark.parametrize("arguments", [(), ("base_loss",)])
+    def test_super_init_may_be_called(self, arguments):
+        """Most people write it; the loss's own constructor would fail or start anew."""
+
+        class Polite(Stillness):
+            def __init__(self, base_loss, coeff=1.0):
+                super(Stillness, self).__init__(*[base_loss for _ in arguments])
+                super().__init__(base_loss, coeff)
+
+        batch, base = transitions(4), ddpg()
+        assert (
+            Polite(base)(batch.copy())["loss_stillness"] == Stillness(base)(batch)["loss_stillness"]
+        )
+        with pytest.raises(TypeError, match="unexpected keyword argument 'typo'"):
+            RegularizedLoss(base, typo=1.0)
+
     def test_chains_pickle(self):
         """Also a class made of a class that was made is found again."""
         chain = CAPSLoss(Stillness(L2C2Loss(ddpg())))

@@ -24,6 +24,7 @@ from losses import (
     qvalue,
     transitions,
 )
+from tensordict import TensorDict
 from torch import nn
 from torchrl.modules import Actor, ValueOperator
 from torchrl.objectives import (
@@ -35,6 +36,7 @@ from torchrl.objectives import (
     DTLoss,
     GAILLoss,
     IQLLoss,
+    LossModule,
     REDQLoss,
     SACLoss,
     TD3Loss,
@@ -826,6 +828,130 @@ class TestPresets:
         }
 
 
+class AliasSAC(SACLoss):
+    """The name that DDPG has for this part."""
+
+    def loss_actor(self, tensordict):
+        return self.actor_loss(tensordict)
+
+
+class AliasDDPG(DDPGLoss):
+    """The name that TD3 has for this part."""
+
+    def actor_loss(self, tensordict):
+        return self.loss_actor(tensordict)
+
+
+class ClonesFirst(CQLLoss):
+    def actor_loss(self, tensordict):
+        return self.actor_bc_loss(tensordict)
+
+
+class OtherNames(SACLoss):
+    def actor_loss(self, batch):
+        return super().actor_loss(batch)
+
+
+class DelayedTD3(TD3Loss):
+    """Leaves out its policy's term in its first call."""
+
+    calls = 0
+
+    def forward(self, tensordict):
+        self.calls += 1
+        terms = super().forward(tensordict)
+        return terms.exclude("loss_actor") if self.calls == 1 else terms
+
+
+class Nameless(LossModule):
+    """A loss of one's own that lists no ``out_keys``."""
+
+    term = "loss_objective"
+
+    def __init__(self):
+        super().__init__()
+        self.convert_to_functional(deterministic_actor(), "actor_network")
+        self.convert_to_functional(qvalue(), "qvalue_network")
+
+    def _forward_value_estimator_keys(self, **kwargs):
+        pass
+
+    def forward(self, tensordict):
+        with self.actor_network_params.to_module(self.actor_network):
+            batch = self.actor_network(tensordict.select("observation"))
+        with self.qvalue_network_params.data.to_module(self.qvalue_network):
+            value = self.qvalue_network(batch)["state_action_value"]
+        return TensorDict({self.term: -value.mean()})
+
+
+class TestSubclasses:
+    """Losses of one's own, whose parts call each other or are missing in some calls."""
+
+    @pytest.mark.parametrize(
+        ("make", "part", "other"),
+        [
+            (lambda: AliasSAC(gaussian_actor(), qvalue()), "loss_actor", "actor_loss"),
+            (lambda: AliasDDPG(deterministic_actor(), qvalue()), "actor_loss", "loss_actor"),
+            (
+                lambda: ClonesFirst(gaussian_actor(), qvalue(), action_spec=BOUNDS),
+                "actor_loss",
+                "actor_bc_loss",
+            ),
+        ],
+        ids=["SAC", "DDPG", "CQL"],
+    )
+    def test_a_part_that_calls_another_has_the_penalty_once(self, make, part, other):
+        batch = seeded(transitions, 12, seed=1)
+        base = seeded(make)
+        relative = isinstance(base, DDPGLoss)
+        loss = smooth(base, "cats", lambda_temporal=1.0, ramp=None, relative=relative)
+        own, _ = seeded(getattr(base, other), batch.copy(), seed=2)
+        value, metadata = seeded(getattr(loss, part), batch.copy(), seed=2)
+        assert metadata["penalty_cats"] > 0
+        torch.testing.assert_close(value, own + metadata["penalty_cats"])
+        _, inner = seeded(getattr(loss, other), batch.copy(), seed=2)
+        assert metadata["penalty_cats"] == inner["penalty_cats"]
+
+    def test_the_batch_may_be_given_by_the_parts_own_name(self):
+        batch = seeded(transitions, 12, seed=1)
+        loss = smooth(seeded(lambda: OtherNames(gaussian_actor(), qvalue())), ramp=None)
+        batch = loss.neighbor_transform()(batch)
+        value, _ = seeded(loss.actor_loss, batch=batch.copy(), seed=2)
+        assert value == seeded(loss.actor_loss, batch.copy(), seed=2)[0]
+        with pytest.raises(TypeError, match=r"^actor_loss takes a batch as 'batch'"):
+            loss.actor_loss()
+
+    @pytest.mark.parametrize("fold", [False, True])
+    @pytest.mark.parametrize("relative", [False, True])
+    def test_without_the_policys_term_there_is_no_penalty(self, fold, relative):
+        """Delayed updates of the policy: the penalty does not train it in between."""
+        batch = seeded(transitions, 12, seed=1)
+        base = seeded(lambda: DelayedTD3(deterministic_actor(), qvalue(), bounds=(-1, 1)))
+        plain = set(base(batch.copy()).keys())
+        base.calls = 0
+        loss = smooth(base, "cats", lambda_temporal=1.0, ramp=None, fold=fold, relative=relative)
+        assert set(loss(batch.copy()).keys()) == plain
+        terms = loss(batch.copy())
+        assert terms["penalty_cats" if fold else "loss_cats"] > 0
+
+    @pytest.mark.parametrize("fold", [False, True])
+    def test_relative_to_the_term_of_a_loss_of_ones_own(self, fold):
+        """Its size is that of its mean, as it is not reduced by TorchRL."""
+        batch, base = seeded(transitions, 12, seed=1), seeded(Nameless)
+        size = base(batch.copy())["loss_objective"].detach().abs()
+        plain = smooth(base, "cats", lambda_temporal=1.0, relative=False, fold=fold)
+        loss = smooth(base, "cats", lambda_temporal=1.0, relative=True, fold=fold)
+        key = "penalty_cats" if fold else "loss_cats"
+        torch.testing.assert_close(loss(batch.copy())[key], size * plain(batch.copy())[key])
+
+    def test_a_loss_without_a_known_term_cannot_be_relative(self):
+        base = seeded(Nameless)
+        base.term = "loss_policy"
+        loss = smooth(base, "cats", lambda_temporal=1.0, relative=True, fold=False)
+        with pytest.raises(RuntimeError, match=r"relative to loss_actor, .* returns none of these"):
+            loss(seeded(transitions, 12, seed=1))
+
+
 def by_value():
     """The losses that train a policy by an action value."""
     names = ("SAC", "SAC-v1", "TQC", "DiscreteSAC", "DDPG", "TD3", "TD3BC", "REDQ", "CQL", "CrossQ")
@@ -1037,6 +1163,17 @@ class TestRelativeParts:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             smooth(make(), relative=relative, lambda_min=0.5, lambda_max=50.0)
+
+    @pytest.mark.parametrize("given", [{"policy_distance": "hellinger"}, {"neighbors": "box"}])
+    def test_a_distance_of_another_kind_needs_a_gain(self, given):
+        """Distances differ in size, and so do the mean gains of a box and a line."""
+        with pytest.warns(UserWarning, match=r"lambda_min=10\.0, .*: give lambda_min, too"):
+            smooth(sac(), **given)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            smooth(sac(), **given, lambda_min=20.0, lambda_max=2000.0)
+            smooth(sac(), policy_distance="mean", neighbors="line")
+            smooth(sac(), "cats")
 
     def test_a_neighborhood_of_other_neighbors_than_the_presets(self):
         with pytest.warns(UserWarning, match="neighbors='box' .* replaces the preset's 'line'"):

@@ -83,7 +83,7 @@ class Neighborhood:
     max_step: float | None = None
 
     def __post_init__(self) -> None:
-        hint = "To switch the regularization off, leave it out instead of setting its gain to 0."
+        hint = "For no regularization, do not wrap the loss, or choose strength=0."
         for name in ("sigma", "lambda_min", "lambda_max"):
             check_real(name, getattr(self, name), above=0, hint=hint)
         if self.neighbors not in ("box", "line"):

@@ -158,6 +158,15 @@ def _warn_of_mismatch(method: str, chosen: Preset, overrides: Mapping[str, Any])
             f"the mean gain: give the fields, such as lambda_min=..., or neighbors={usual!r}.",
             stacklevel=4,
         )
+    for setting in ("policy_distance", "neighbors"):
+        usual, given = chosen.settings.get(setting), overrides.get(setting)
+        differs = usual is not None and given is not None and given != usual
+        if differs and not overrides.keys() & {name, "neighborhood"}:
+            warnings.warn(
+                f"{setting}={given!r} is taken with the preset's {name}={chosen.settings[name]!r}, "
+                f"which was found with {usual!r}: give {name}, too.",
+                stacklevel=4,
+            )
     gain = overrides.get(name, getattr(near, name, chosen.settings[name]))
     relative = overrides.get("relative", chosen.relative)
     given = {"relative", name} <= overrides.keys() or not isinstance(gain, int | float)

@@ -95,12 +95,26 @@ class EvaluatedNetworks:
 
     def measure(self, call: Callable[[], Any]) -> tuple[Any, list[Tensor]]:
         """Calls a method of the loss; returns its result and the sizes of the reduced terms."""
-        sizes = self._sizes[_thread()] = []
+        outer = self.sizes
+        sizes: list[Tensor] = []
+        self._sizes[_thread()] = sizes
         try:
             result = call()
         finally:
-            del self._sizes[_thread()]
+            if outer is None:
+                del self._sizes[_thread()]
+            else:  # The method was called by another one.
+                self._sizes[_thread()] = outer
+                outer.extend(sizes)
         return result, sizes
+
+    def kept(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The batch as it is before the loss evaluates its networks on it.
+
+        In sequences, recurrent modules write zeros over most of the next recurrent states.
+        """
+        overwrites = any(spec.overwrites for spec in self.specs.values())
+        return tensordict.copy() if overwrites else tensordict
 
     def inspect(self, loss: LossModule, networks: Iterable[str]) -> None:
         """Inspects these networks; refuses networks that cannot be evaluated at other states."""

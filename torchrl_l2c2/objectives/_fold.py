@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable
+import inspect
+from collections.abc import Callable, Container, Iterable
 from typing import Any
 
 import torch
@@ -37,6 +38,17 @@ PARTS: dict[str, tuple[str, tuple[str, ...]]] = {
     "qvalue_v2_loss": ("value", ("loss_qvalue",)),
     "q_loss": ("value", ("loss_qvalue",)),
 }
+
+
+def find_policy_term(keys: Container[str]) -> str | None:
+    """Finds the term that trains the policy among a loss's keys; ``None``: there is none.
+
+    Examples:
+        >>> from torchrl_l2c2.objectives._fold import find_policy_term
+        >>> find_policy_term(["loss_qvalue", "loss_actor"])
+        'loss_actor'
+    """
+    return next((key for key in (*POLICY_LOSSES, *ALTERNATIVE_LOSSES) if key in keys), None)
 
 
 def fold_targets(term: str, trains_policy: bool, own: Iterable[str]) -> list[str]:
@@ -109,35 +121,17 @@ def make_part(
             is used.
     """
     is_measured = targets is POLICY_LOSSES  # Dynamo would compare copies.
+    name = list(inspect.signature(method).parameters)[1]
 
-    @functools.wraps(method)
-    def part(self: Any, tensordict: TensorDictBase, *args: Any, **kwargs: Any) -> Any:
-        size = None
-        if self._relative and is_measured:
-            out, sizes = self._evaluation.measure(lambda: method(self, tensordict, *args, **kwargs))
-            # A subclass may reduce other terms than the action values, before or after these.
-            size = functools.reduce(torch.maximum, sizes) if sizes else None
-        else:
-            out = method(self, tensordict, *args, **kwargs)
-        # Within forward, the penalty is added there.
-        if (shared := self._evaluation.forward_pass) is not None:
-            shared.policy_size = shared.policy_size if size is None else size
-            return out
-        if not torch.is_grad_enabled():
-            return out
-        if kind == "policy" and not is_compiling() and self.training:
-            self._watch.see_call(self, tensordict)
-            self._warn_of_changed_base()
-        if not self.folded:
-            if size is not None:
-                raise RuntimeError(
-                    f"{method.__name__} leaves out the penalty, and policy_regularizer would not "
-                    "make it relative to this term: call loss.fold() first, or call loss(batch), "
-                    "which returns the penalty as a term of its own."
-                )
-            self._watch.see_part(self, kind)
-            return out
-        regularize = self.policy_regularizer if kind == "policy" else self.value_regularizer
+    def measured(self: Any, *args: Any, **kwargs: Any) -> tuple[Any, Tensor | None]:
+        """The method's result, and the size of the action values if the penalty is relative."""
+        if not (self._relative and is_measured):
+            return method(self, *args, **kwargs), None
+        out, sizes = self._evaluation.measure(lambda: method(self, *args, **kwargs))
+        # A subclass may reduce other terms than the action values, before or after these.
+        return out, functools.reduce(torch.maximum, sizes) if sizes else None
+
+    def with_penalty(self: Any, out: Any, size: Tensor | None, tensordict: TensorDictBase) -> Any:
         value, *rest = out if isinstance(out, tuple) else (out,)
         metadata = rest[0] if rest and hasattr(rest[0], "update") else {}
         own = [key for key in self.out_keys_source if key.startswith("loss")] or list(targets)
@@ -147,11 +141,8 @@ def make_part(
                 f"{method.__name__} has no action values to which the penalty is relative: call "
                 "loss(batch) instead, or make the loss with relative=False and a gain."
             )
-        outer = self._evaluation.begin_forward_pass()
-        try:
-            added = regularize(tensordict)
-        finally:
-            self._evaluation.end_forward_pass(outer)
+        regularize = self.policy_regularizer if kind == "policy" else self.value_regularizer
+        added = regularize(tensordict)
         if self._relative and kind == "policy":
             self._make_relative(added, size, value, tensordict)
         for key, term in list(added.items()):
@@ -163,6 +154,38 @@ def make_part(
                 value = add_penalty(value, self._folded_value(key, term), str(returned))
                 metadata[penalty_key(key)] = term.detach()
         return (value, *rest) if isinstance(out, tuple) else value
+
+    @functools.wraps(method)
+    def part(self: Any, *args: Any, **kwargs: Any) -> Any:
+        # Within forward, or another part, the penalty is added there.
+        if (shared := self._evaluation.forward_pass) is not None:
+            out, size = measured(self, *args, **kwargs)
+            shared.policy_size = shared.policy_size if size is None else size
+            return out
+        if not torch.is_grad_enabled():
+            return method(self, *args, **kwargs)
+        given = args[0] if args else kwargs.get(name)
+        if given is None:
+            raise TypeError(f"{method.__name__} takes a batch as {name!r}, and none was given.")
+        tensordict = self._evaluation.kept(given)
+        self._evaluation.begin_forward_pass()
+        try:
+            out, size = measured(self, *args, **kwargs)
+            if kind == "policy" and not is_compiling() and self.training:
+                self._watch.see_call(self, given)
+                self._warn_of_changed_base()
+            if self.folded:
+                return with_penalty(self, out, size, tensordict)
+            if size is not None:
+                raise RuntimeError(
+                    f"{method.__name__} leaves out the penalty, and policy_regularizer would not "
+                    "make it relative to this term: call loss.fold() first, or call loss(batch), "
+                    "which returns the penalty as a term of its own."
+                )
+            self._watch.see_part(self, kind)
+            return out
+        finally:
+            self._evaluation.end_forward_pass(None)
 
     return part
 

@@ -50,6 +50,8 @@ class NetworkSpec:
             random numbers.
         has_dropout: whether the network has dropout layers.
         recurrent: inputs that carry the past, ``is_init`` among them; empty if feed-forward.
+        overwrites: whether the network writes over its inputs or their successors, as recurrent
+            modules do.
     """
 
     inputs: tuple[NestedKey, ...]
@@ -62,6 +64,7 @@ class NetworkSpec:
     rowwise: bool
     has_dropout: bool
     recurrent: tuple[NestedKey, ...]
+    overwrites: bool
 
 
 def inspect_network(loss: LossModule, network: str) -> NetworkSpec:
@@ -97,9 +100,11 @@ def inspect_network(loss: LossModule, network: str) -> NetworkSpec:
         output = _value_key(loss, network)
     masks = (m.out_keys[1] for m in net.modules() if isinstance(m, ConsistentDropoutModule))
     computed = made.union(actions, _parents(made), recurrent, of_policy, map(unravel_key, masks))
+    states = tuple(key for key in inputs if key not in computed and not _is_private(key))
+    written = {unravel_key(key) for key in net.out_keys}
     return NetworkSpec(
         inputs=tuple(key for key in inputs if key not in trunk),
-        states=tuple(key for key in inputs if key not in computed and not _is_private(key)),
+        states=states,
         trunk=tuple(trunk),
         trains_trunk=_trains_trunk(loss, network),
         output=output,
@@ -110,6 +115,10 @@ def inspect_network(loss: LossModule, network: str) -> NetworkSpec:
         ),
         has_dropout=any(map(drops_out, net.modules())),
         recurrent=tuple(dict.fromkeys(recurrent)),
+        overwrites=any(
+            unravel_key(key) in written or unravel_key(("next", key)) in written
+            for key in (*states, *recurrent)
+        ),
     )
 
 

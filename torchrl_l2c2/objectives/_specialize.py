@@ -47,7 +47,7 @@ class SpecializedLoss(LossMixin):
     ``Extension[type(loss)]``, a subclass of both classes that is made once for each pair. The
     object holds the networks, parameters and buffers of ``loss`` themselves, not copies, and
     ``loss`` stays as it was. When the ``__init__`` of ``Extension`` runs, the object already is the
-    loss; do not call another constructor. ``Extension`` defines a ``forward``.
+    loss, and ``super().__init__()`` does nothing. ``Extension`` defines a ``forward``.
 
     Args:
         base_loss (LossModule): the loss.
@@ -102,6 +102,9 @@ class SpecializedLoss(LossMixin):
         self = object.__new__(specialized)
         _adopt(self, base_loss)
         return self
+
+    def __init__(self, base_loss: LossModule | None = None) -> None:
+        """Does nothing: the object already is the loss, whose constructor was called before."""
 
     @classmethod
     def _made_methods(cls, original: type[LossModule]) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Set
 from difflib import get_close_matches
 from inspect import signature
 from textwrap import indent
@@ -33,7 +33,9 @@ from torchrl_l2c2.objectives._batch import (
 from torchrl_l2c2.objectives._evaluation import EvaluatedNetworks, Policy, SharedEvaluation
 from torchrl_l2c2.objectives._fold import (
     PARTS,
+    POLICY_LOSSES,
     add_penalty,
+    find_policy_term,
     fold_targets,
     make_part,
     penalty_key,
@@ -52,9 +54,6 @@ Made = TypeVar("Made")
 
 GAIN = "regularizer_gain"
 """Name of the coefficient that multiplies all added terms but the auxiliary ones."""
-
-RELATIVE_TO = "loss_actor"
-"""The term whose size multiplies penalties of the policy after :meth:`RegularizedLoss.relative`."""
 
 NOT_SETTINGS = ("fold", "ramp", "relative", "set_progress", "unfold")
 """Methods that could be taken for settings."""
@@ -87,8 +86,8 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
 
     A regularizer is a subclass that defines ``__init__`` and one or both of
     :meth:`policy_regularizer` and :meth:`value_regularizer`. When its ``__init__`` runs, the object
-    already is the loss; do not call another constructor. ``__init__`` declares the terms with
-    :meth:`declare_networks`, :meth:`declare_terms` and :meth:`register_coefficient`. The two
+    already is the loss, and ``super().__init__()`` does nothing. ``__init__`` declares the terms
+    with :meth:`declare_networks`, :meth:`declare_terms` and :meth:`register_coefficient`. The two
     methods compute the terms with :meth:`policies_at`, :meth:`values_at`, :meth:`transitions`,
     :meth:`reduce_term` and :meth:`scaled`. Regularizers can be nested.
 
@@ -209,10 +208,13 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             TensorDict: the base loss's output with the regularizer's terms and diagnostics. A
             folded penalty is part of the loss's own terms and is reported as ``penalty_*`` instead
             of ``loss_*``. Under ``torch.no_grad()`` a folded penalty is not computed: the terms are
-            the base loss's terms, and the regularizer's entries are NaN.
+            the base loss's terms, and the regularizer's entries are NaN. If the base loss leaves
+            out its policy's term in a call, as with delayed updates of the policy, the terms that
+            train the policy are left out, too.
 
         Raises:
             ValueError: the regularizer returns other ``loss_*`` keys than it declared.
+            RuntimeError: the penalty is relative, and the loss has no term that trains the policy.
         """
         if self._folded and not torch.is_grad_enabled():
             terms = super().forward(tensordict)
@@ -220,17 +222,23 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             for key in (*map(penalty_key, sorted(self.added_terms)), *self._diagnostics):
                 terms.set(key, unknown.clone())
             return terms
+        given = self._evaluation.kept(tensordict)
         outer = self._evaluation.begin_forward_pass()
         try:
             # The base loss draws its random numbers first: with one seed its terms stay the same.
             terms, size = self._forward_and_size(super().forward, tensordict)
-            added = self.policy_regularizer(tensordict)
-            if self._relative:
-                self._make_relative(added, size, terms.get(RELATIVE_TO), tensordict)
-            added.update(self.value_regularizer(tensordict))
+            found = find_policy_term(terms.keys())
+            # Updates of the policy may be delayed: its term is missing in some calls.
+            delayed = found is None and find_policy_term(self.out_keys_source) is not None
+            added = TensorDict() if delayed else self.policy_regularizer(given)
+            if self._relative and not delayed:
+                own = None if found is None else terms.get(found)
+                self._make_relative(added, size, own, given)
+            added.update(self.value_regularizer(given))
         finally:
             self._evaluation.end_forward_pass(outer)
-        self._check_declared(added)
+        declared = self.added_terms - self._policy_side if delayed else self.added_terms
+        self._check_declared(added, declared)
         if self._folded:
             self._add_penalties(terms, added)
         else:
@@ -402,10 +410,20 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         return terms, self._evaluation.forward_pass.policy_size
 
     def _make_relative(
-        self, added: TensorDictBase, size: Tensor | None, own: Tensor, tensordict: TensorDictBase
+        self,
+        added: TensorDictBase,
+        size: Tensor | None,
+        own: Tensor | None,
+        tensordict: TensorDictBase,
     ) -> None:
         """Multiplies policy terms by the size of the loss's own policy term."""
         if size is None:  # A loss that does not reduce it by _reduce_loss.
+            if own is None:
+                raise RuntimeError(
+                    f"the penalty is relative to {', '.join(POLICY_LOSSES)}, and "
+                    f"{type(self).__name__} returns none of these: give its policy's term such a "
+                    "name, or make the loss with relative=False and a gain."
+                )
             size = own.detach().abs().mean()
             size = size / tensordict.numel() if self._term_reduction == "sum" else size
         for key in self.policy_terms:
@@ -498,12 +516,12 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
                 terms.set(target, add_penalty(terms.get(target), folded, target))
             terms.set(penalty_key(key), value.detach())
 
-    def _check_declared(self, added: TensorDictBase) -> None:
+    def _check_declared(self, added: TensorDictBase, declared: Set[str]) -> None:
         """Refuses other terms than the declared ones, which would not be trained."""
         returned = {key for key in added.keys() if key.startswith("loss_")}
-        if returned != self.added_terms:
+        if returned != declared:
             raise ValueError(
-                f"Expected the declared terms {sorted(self.added_terms)} of {type(self).__name__}, "
+                f"Expected the declared terms {sorted(declared)} of {type(self).__name__}, "
                 f"got {sorted(returned)}. Give them the same names in declare_terms, and in "
                 "policy_regularizer or value_regularizer."
             )
