@@ -1183,7 +1183,10 @@ class TestRelativeParts:
             near = Neighborhood(lambda_min=3.0, lambda_max=300.0, neighbors="line")
             smooth(sac(), neighborhood=near)
 
-    @pytest.mark.parametrize("make", [sac, td3, pytest.param(ddpg, marks=pytest.mark.slow)])
+    # Compiling each takes ten seconds.
+    @pytest.mark.parametrize(
+        "make", [td3, *(pytest.param(make, marks=pytest.mark.slow) for make in (sac, ddpg))]
+    )
     def test_it_compiles_into_one_graph(self, make):
         torch._dynamo.reset()
         loss = smooth(seeded(make), **GIVEN).relative()
