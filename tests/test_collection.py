@@ -119,8 +119,9 @@ def test_an_episode_that_was_interrupted_is_not_gone_on_with(monkeypatch):
     assert len(episode) == 9 and episode["next", "done"].sum() == 1
 
 
-def test_an_episode_is_not_gone_on_with_between_its_updates(monkeypatch):
-    """Of an algorithm that learns after every frame, and is interrupted twice in a notebook."""
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+def test_an_episode_is_not_gone_on_with_between_its_updates(monkeypatch, error):
+    """Of an algorithm that learns after every frame, and is stopped in a notebook."""
     task = TaskConfig("pendulum", "Pendulum-v1", episodes=3, max_steps=9)
     run = Experiment(
         ExperimentConfig(
@@ -136,10 +137,10 @@ def test_an_episode_is_not_gone_on_with_between_its_updates(monkeypatch):
     def interrupted(frame):
         remember(frame)
         if next(calls) == 12:
-            raise KeyboardInterrupt
+            raise error
 
     monkeypatch.setattr(run.learner, "remember_frame", interrupted)
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(error):
         run.train()
     assert [row["frames"] for row in run.train()] == [9, 22, 31]  # 4 were lost
     assert {row["length"] for row in run.metrics} == {9}

@@ -132,8 +132,45 @@ class TestWords:
         noise = torch.randn(100, 1, generator=torch.Generator().manual_seed(0))
         action = 0.5 * torch.sin(2 * torch.pi * STEPS / 3.3).unsqueeze(-1)
         text = said(made_up(action, rate=33.0), "rough").text
-        assert "action[0] oscillates, which is shaking at 9.9 Hz, 0.3 of the control rate" in text
+        assert "action[0] oscillates, which is shaking at 10 Hz, 0.3 of the control rate" in text
         assert "moves like noise" in said(made_up(0.1 * action + 0.1 * noise), "rough").text
+
+    def test_a_slower_movement_is_not_taken_for_the_shaking(self):
+        """Of a joint that walks at 0.5 Hz, with noise or a tone of 18 Hz on top."""
+        seconds = torch.arange(1000) / 50
+        walk = 0.4 * torch.sin(torch.pi * seconds)
+        noise = torch.randn(1000, generator=torch.Generator().manual_seed(0))
+        text = said(made_up((walk + 0.08 * noise).unsqueeze(-1), rate=50.0), "rough").text
+        assert "moves like noise" in text
+        tone = 0.12 * torch.sin(36 * torch.pi * seconds + 0.3 * noise.cumsum(0) / 5)
+        text = said(made_up((walk + tone).unsqueeze(-1), rate=50.0), "rough").text
+        assert "oscillates, which is shaking at 18" in text
+
+    @pytest.mark.parametrize("steps", [200, 1000, 6000])
+    def test_a_frequency_that_varies_is_found_in_recordings_of_any_length(self, steps):
+        jitter = torch.randn(steps, generator=torch.Generator().manual_seed(0)).cumsum(0)
+        action = 0.2 * torch.sin(2 * torch.pi * 0.38 * torch.arange(steps) + 0.2 * jitter)
+        text = said(made_up(action.unsqueeze(-1), rate=50.0), "flips").text
+        assert "turns back nearly every step, which is shaking at 19" in text
+
+    def test_the_gain_is_that_of_the_action_that_is_named(self):
+        hip = 0.3 * torch.sin(2 * torch.pi * STEPS / 8)
+        knee = 0.9 * torch.sin(2 * torch.pi * STEPS / 100)
+        both = made_up(torch.stack((hip, knee), 1), action_names=("hip", "knee"))
+        gain = previous_action_gain(hip.unsqueeze(-1)).item()
+        assert gain < 0.9 < previous_action_gain(knee.unsqueeze(-1)).item()
+        assert f"hip changes most, by {both.relative.diff(dim=0).abs().mean(0)[0]:.1%}" in (
+            text := said(both, "moves").text
+        )
+        assert f"its gain on the previous action is {gain:.2f};" in text
+
+    def test_an_action_of_another_unit_that_counts_as_still_is_named(self):
+        tilt, speed = 0.02 * FLIPPING[:, 0], 5000 + 1000 * torch.sin(STEPS / 20)
+        found = diagnose_actions(torch.stack((tilt, speed), 1), action_names=["tilt", "speed"])
+        assert "counts as still, as with tilt: if the units differ, give bounds" in (
+            said(found, "units").text
+        )
+        assert not [each for each in findings(made_up(FLIPPING)) if each.kind == "units"]
 
     def test_what_has_no_frequency_of_its_own_flips(self):
         """The changes of white noise have a gain of -0.5, and a beat is none either."""
@@ -787,8 +824,8 @@ class TestRecording:
         steps = torch.arange(1000.0)
         actions = torch.stack([0.5 * (-1.0) ** steps, 0.3 + 1e-6 * (-1.0) ** steps], 1)
         actions[500, 0] = 50.0
-        (only,) = findings(diagnose_actions(actions))
-        assert only.text.startswith("action[0] flips")
+        first, units = findings(diagnose_actions(actions))
+        assert first.text.startswith("action[0] flips") and units.kind == "units"
 
     @pytest.mark.parametrize("often", [1, 2, 10])
     def test_a_faster_logger_does_not_hide_shaking(self, often):
@@ -813,6 +850,16 @@ class TestRecording:
         assert torch.equal(found.actions, noise) and found.rate == pytest.approx(50.0, rel=1e-2)
         held = noise.sign()[places]
         assert torch.equal(diagnose_actions(held).actions, held)
+
+    def test_lost_commands_are_no_repetitions(self):
+        """Half of the rows are those before: time would be stretched by what is left out."""
+        drawn = torch.Generator().manual_seed(0)
+        noise = torch.randn(2000, 1, generator=drawn)
+        kept = torch.rand(2000, generator=drawn) > 0.45
+        kept[0] = True
+        actions = noise[torch.where(kept, torch.arange(2000), 0).cummax(0).values]
+        found = diagnose_actions(actions, rate=50.0)
+        assert torch.equal(found.actions, actions) and found.rate == 50.0
 
     def test_held_and_rounded_actions_are_no_repetitions(self):
         """A rest between movements, and a slow movement in few levels."""
@@ -849,6 +896,14 @@ class TestRecording:
         path = table_file(tmp_path / "a.csv", "time,a", *(f"{i},{(-1) ** i}" for i in range(20)))
         with pytest.warns(UserWarning, match="has steps of 1 s: if it counts the steps, multiply"):
             diagnose_recording(path)
+
+    @pytest.mark.parametrize(("rate", "decimals"), [(400, 3), (300, 3), (60, 2), (30, 2), (15, 2)])
+    def test_times_may_be_rounded(self, tmp_path, rate, decimals):
+        """The median step is one of two lengths; a lost row now and then does not count."""
+        times = [i / rate for i in range(1000) if i % 100 != 50]
+        rows = [f"{t:.{decimals}f},{(-1) ** i}" for i, t in enumerate(times)]
+        path = table_file(tmp_path / "a.csv", "time,a", *rows)
+        assert diagnose_recording(path).rate == pytest.approx(rate, rel=0.01)
 
     def test_gaps_are_told(self, tmp_path):
         """The rate is that of the other steps."""

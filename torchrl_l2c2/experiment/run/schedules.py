@@ -24,7 +24,7 @@ def by_step(player: Player, learner: Learner, algorithm: OffPolicyConfig) -> Ite
                 frames.append(player.step())
                 learner.remember_frame(frames[-1])
                 _learn(learner, algorithm, 1, player.frames)
-        except KeyboardInterrupt:
+        except BaseException:
             player.discard_episode()
             raise
         yield player.measure(stack_frames(frames), player.frames)

@@ -23,6 +23,7 @@ LEAST_STEPS = 20  # Shorter recordings do not show what shakes.
 TIME = "time"  # the column of seconds
 LIKELY = (1e-5, 1.0)  # seconds from one step to the next
 GAP = 2.5  # times the median time step: a longer one is a gap
+LOST = 1.75  # times the median time step: from here on, a step may have lost a row
 Bounds = tuple[float, float]
 BEYOND = 0.5  # share of an action that may lie beyond its bounds, where a task would clip it
 EVEN = 0.9  # share of the actions that are repeated equally often, if a logger repeats them
@@ -169,16 +170,17 @@ def _without_repetitions(actions: Tensor) -> tuple[Tensor, float]:
     )
     lengths = torch.cat((starts, torch.tensor([len(actions)]))).diff()
     often = lengths.median().item()
-    tolerance = often / 10
+    tolerance, most_held = often / 10, math.inf
     if len(actions[starts].unique(dim=0)) > len(starts) / 2:
         # Most actions differ, so equal rows in succession come from the logger. Its rate may be no
         # multiple of the policy's.
         often = lengths[lengths <= 2 * often].float().mean().item()
-        tolerance = max(often / 4, 1.0)
+        # Some runs of lost packets are long.
+        tolerance, most_held = max(often / 4, 1.0), 1
     # An action may be held for several steps, and a step may take a row more or less.
     held = (lengths / often).round().clamp_min(1)
-    even = ((lengths - held * often).abs() <= tolerance).float().mean()
-    if often < REPEATED or len(starts) < LEAST_STEPS or even < EVEN:
+    even = ((lengths - held * often).abs() <= tolerance) & (held <= most_held)
+    if often < REPEATED or len(starts) < LEAST_STEPS or even.float().mean() < EVEN:
         return actions, 1.0
     return actions[starts].repeat_interleave(held.long(), 0), often
 
@@ -303,4 +305,5 @@ def _rate(seconds: Tensor, path: Path, lines: Sequence[tuple[int, list[str]]]) -
             "treat all steps as equally long.",
             stacklevel=3,
         )
-    return 1.0 / median
+    # Rounded times have steps of two lengths, and the median is one of them.
+    return 1.0 / steps[steps < LOST * median].mean().item()

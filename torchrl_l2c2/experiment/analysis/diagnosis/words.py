@@ -56,6 +56,8 @@ FULL = 2  # findings of one kind that each have a sentence
 LISTED_INPUTS = 8  # whose values are listed, in their order; of more, only some
 SELECTED_INPUTS = 4  # listed of more inputs: the action follows these most
 MOST_NAMES = 12  # of further actions with the same finding
+SLOW = 0.1  # lowest frequency of a tone, of the control rate
+TONE = 0.03  # half of the width of a tone, of the control rate
 TAIL = 1.4  # times the peak's height: a higher spectrum just below it is of a slower movement
 
 
@@ -90,7 +92,8 @@ def findings(diagnosis: Diagnosis) -> list[Finding]:
         return [*unlike, Finding("still", text), *_training(diagnosis)]
     found = list(_grouped(_actions(diagnosis)))
     found = [*found, *_steepest(diagnosis)] if found else [_movement(diagnosis)]
-    return [*unlike, *found, *_reasons(diagnosis), *_training(diagnosis)]
+    more = (*_reasons(diagnosis), *_training(diagnosis), *_other_units(diagnosis))
+    return [*unlike, *found, *more]
 
 
 def summary(diagnosis: Diagnosis) -> str:
@@ -163,6 +166,19 @@ def _unlike(diagnosis: Diagnosis) -> Iterator[Finding]:
             "another first episode with another seed."
         )
         yield Finding("unlike", text, fault=False)
+
+
+def _other_units(diagnosis: Diagnosis) -> Iterator[Finding]:
+    """Finding about actions that count as still because another one has a far larger span."""
+    width = diagnosis.high - diagnosis.low
+    small = ((width > 0.0) & (width < diagnosis.range)).nonzero()[:, 0].tolist()
+    if small and not diagnosis.bounded:
+        names = listed([diagnosis.action_name(number) for number in small], MOST_NAMES)
+        text = (
+            f"Less than a thousandth of the largest span counts as still, as with {names}: if the "
+            "units differ, give bounds."
+        )
+        yield Finding("units", text, fault=False)
 
 
 def _grouped(found: Iterable[tuple[str, Finding]]) -> Iterator[Finding]:
@@ -313,13 +329,22 @@ def _speed(share: float, rate: float | None) -> str:
 
 
 def _tone(action: Tensor) -> float | None:
-    """The frequency with most of the power, in cycles per step; ``None`` if there is none."""
+    """The frequency around which the fast movement has most of its power, in cycles per step.
+
+    ``None`` if there is none. Slower movement does not count: a joint that walks may shake, too.
+    """
     window = torch.hann_window(len(action), dtype=action.dtype)
     power = torch.fft.rfft((action - action.mean()) * window).abs().square()
-    peak = int(power.argmax())
-    if power[max(0, peak - 2) : peak + 3].sum() < 0.5 * power.sum():
+    power[: math.ceil(SLOW * len(action))] = 0.0
+    bins = torch.arange(len(power))
+    near = max(2, round(TONE * len(action)))
+    below = torch.cat((power.new_zeros(1), power.cumsum(0)))
+    sums = below[(bins + near + 1).clamp_max(len(power))] - below[(bins - near).clamp_min(0)]
+    most = int(sums.argmax())
+    if sums[most] <= 0.5 * below[-1]:
         return None
-    return peak / len(action)
+    around = slice(max(0, most - near), most + near + 1)
+    return float((bins[around] * power[around]).sum() / power[around].sum()) / len(action)
 
 
 def _steepest(diagnosis: Diagnosis) -> Iterator[Finding]:
@@ -411,7 +436,8 @@ def _movement(diagnosis: Diagnosis) -> Finding:
     """Finding about a policy whose actions have no fault."""
     changes = diagnosis.relative.diff(dim=0).abs()
     most = int(changes.mean(0).argmax())
-    change, gain = changes[:, most].mean().item(), diagnosis.measures["previous_action_gain"]
+    change = changes[:, most].mean().item()
+    gain = previous_action_gain(diagnosis.relative[:, most : most + 1]).item()
     place = "" if diagnosis.is_recording else "in the first episode "
     several = changes.shape[1] > 1
     moves = f"{diagnosis.action_name(most)} changes most," if several else "the action changes"
