@@ -357,20 +357,20 @@ def test_measures_of_batches_and_what_is_too_short(measure, least):
     [
         *(action_variation, action_rate, action_fluctuation_ratio, action_jerk),
         *(previous_action_gain, amplitude_spectrum, spectral_smoothness, roughness),
+        lambda actions: action_jerk(actions, 50.0),
         lambda actions: saturation(actions, -1.0, 1.0),
     ],
 )
 def test_labels_and_arrays_are_refused_and_half_precision_is_not(measure):
-    """Integers would be rounded to a number that means nothing."""
+    """Integers would be rounded to a number that means nothing.
+
+    In half precision, a rate to the power of three is infinite, and sums lose digits.
+    """
     torch.manual_seed(0)
     for given in (torch.ones(9, 2, dtype=torch.long), np.ones((9, 2))):
         told = f"must be a floating-point tensor, got {given.dtype}"
         with pytest.raises(TypeError, match=told):
             measure(given)
-    drawn = torch.randn(9, 2).bfloat16()
-    for half, full in zip(
-        torch.utils._pytree.tree_leaves(measure(drawn)),
-        torch.utils._pytree.tree_leaves(measure(drawn.float())),
-        strict=True,
-    ):
-        torch.testing.assert_close(half.float(), full, rtol=0.05, atol=0.05)
+    drawn = torch.randn(9, 2)
+    for half in (drawn.half(), drawn.bfloat16()):
+        torch.testing.assert_close(measure(half), measure(half.float()))

@@ -38,7 +38,7 @@ def action_variation(actions: Tensor, mask: Tensor | None = None) -> Tensor:
         >>> action_variation(torch.tensor([[0.0, 0.0], [3.0, 4.0], [3.0, 3.0]]))
         tensor(3.)
     """
-    check_episodes("action_variation", actions, 2)
+    actions = episodes_of("action_variation", actions, 2)
     change = torch.linalg.vector_norm(actions.diff(dim=-2), dim=-1)
     if mask is None:
         return change.mean(-1)
@@ -78,7 +78,7 @@ def action_rate(actions: Tensor) -> Tensor:
         >>> action_rate(torch.tensor([[0.0, 0.0], [3.0, 4.0], [3.0, 3.0]]))
         tensor(13.)
     """
-    check_episodes("action_rate", actions, 2)
+    actions = episodes_of("action_rate", actions, 2)
     return actions.diff(dim=-2).square().sum(-1).mean(-1)
 
 
@@ -107,7 +107,7 @@ def action_fluctuation_ratio(actions: Tensor) -> Tensor:
         >>> action_fluctuation_ratio(torch.tensor([[0.0, 0.0], [3.0, 4.0], [3.0, 3.0]]))
         tensor(2.)
     """
-    check_episodes("action_fluctuation_ratio", actions, 2)
+    actions = episodes_of("action_fluctuation_ratio", actions, 2)
     steps = actions.shape[-2]
     return action_variation(actions) * (steps - 1) / steps
 
@@ -138,7 +138,7 @@ def action_jerk(actions: Tensor, sampling_rate: float = 1.0) -> Tensor:
         >>> action_jerk(torch.arange(6.0).pow(3).unsqueeze(-1))
         tensor(6.)
     """
-    check_episodes("action_jerk", actions, 4)
+    actions = episodes_of("action_jerk", actions, 4)
     check_real("action_jerk: sampling_rate", sampling_rate, above=0)
     third = actions.diff(n=3, dim=-2)
     return sampling_rate**3 * torch.linalg.vector_norm(third, dim=-1).mean(-1)
@@ -172,7 +172,7 @@ def previous_action_gain(actions: Tensor) -> Tensor:
         >>> previous_action_gain(torch.tensor([[1.0], [-1.0], [1.0], [-1.0]]))
         tensor(-1.)
     """
-    check_episodes("previous_action_gain", actions, 2)
+    actions = episodes_of("previous_action_gain", actions, 2)
     # Constant actions first become zeros, whose mean has no rounding error.
     moved = actions - actions[..., :1, :]
     centered = moved - moved.mean(-2, keepdim=True)
@@ -210,7 +210,7 @@ def saturation(
         >>> saturation(torch.tensor([[-1.2], [0.0], [0.995], [0.5]]), -1.0, 1.0)
         tensor(0.5000)
     """
-    check_episodes("saturation", actions, 1)
+    actions = episodes_of("saturation", actions, 1)
     check_real("saturation: margin", margin, at_least=0)
     if any(hasattr(bound, "space") for bound in (low, high)):
         raise TypeError("saturation: low and high are bounds: pass spec.space.low, spec.space.high")
@@ -223,8 +223,16 @@ def saturation(
     return ends.where(~actions.isnan(), math.nan).mean((-2, -1))
 
 
-def check_episodes(name: str, actions: Tensor, least: int) -> None:
-    """Checks that actions are floating-point numbers of episodes with at least so many steps.
+def episodes_of(name: str, actions: Tensor, least: int) -> Tensor:
+    """Checks actions, and casts half precision, in which sums lose digits and powers overflow.
+
+    Args:
+        name: name of the measure, for messages.
+        actions: actions of whole episodes, ``[*B, T, A]``.
+        least: smallest number of steps.
+
+    Returns:
+        The actions, in single precision at least.
 
     Raises:
         TypeError: the actions are no floating-point tensor.
@@ -241,3 +249,4 @@ def check_episodes(name: str, actions: Tensor, least: int) -> None:
             f"{name}: actions must have shape [*B, T, A] with T of at least {least}, got "
             f"{tuple(actions.shape)}."
         )
+    return actions.float() if actions.itemsize < 4 else actions

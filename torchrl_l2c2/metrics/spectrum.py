@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrl_l2c2._checks import check_choice, check_real
-from torchrl_l2c2.metrics.actions import check_episodes
+from torchrl_l2c2.metrics.actions import episodes_of
 
 
 def amplitude_spectrum(actions: Tensor, sampling_rate: float = 1.0) -> tuple[Tensor, Tensor]:
@@ -47,10 +47,8 @@ def amplitude_spectrum(actions: Tensor, sampling_rate: float = 1.0) -> tuple[Ten
         >>> amplitude_spectrum(flipping)[1].squeeze(-1).tolist()
         [0.0, 0.0, 1.0]
     """
-    check_episodes("amplitude_spectrum", actions, 4)
+    actions = episodes_of("amplitude_spectrum", actions, 4)
     check_real("amplitude_spectrum: sampling_rate", sampling_rate, above=0)
-    if actions.itemsize < 4:  # The transform does not take half precision.
-        actions = actions.float()
     steps = actions.shape[-2]
     # Without the constant part, whose rounding errors would look like motion.
     moved = actions - actions[..., :1, :]
@@ -106,7 +104,7 @@ def spectral_smoothness(actions: Tensor, form: Literal["caps", "asap"] = "caps")
         tensor(0.)
     """
     check_choice("spectral_smoothness: form", form, ("caps", "asap"))
-    check_episodes("spectral_smoothness", actions, 4)
+    actions = episodes_of("spectral_smoothness", actions, 4)
     bins = actions.shape[-2] // 2
     frequencies, amplitudes = amplitude_spectrum(actions)
     frequencies, amplitudes = frequencies[:bins], amplitudes[..., :bins, :]
@@ -146,7 +144,7 @@ def roughness(actions: Tensor) -> Tensor:
         >>> roughness(torch.tensor([[1.0], [-1.0], [1.0], [-1.0]]))
         tensor(0.5000)
     """
-    check_episodes("roughness", actions, 4)
+    actions = episodes_of("roughness", actions, 4)
     frequencies, amplitudes = amplitude_spectrum(actions)
     moving, weights = amplitudes[..., 1:, :], frequencies[1:].unsqueeze(-1)
     return ((moving * weights).sum(-2) / moving.sum(-2)).mean(-1)
