@@ -392,6 +392,29 @@ def test_what_another_experiment_went_on_with_is_not_written_over(tmp_path):
     assert contents(tmp_path) == before
 
 
+def test_out_of_order_calls_are_refused_and_write_nothing(tmp_path):
+    """Results without training would make the folder unusable; a closed run has no lock."""
+    task = replace(SWINGUP, episodes=1)
+    run = Experiment(small(task=task), tmp_path)
+    result = run.test()
+    before = contents(tmp_path)
+    with pytest.raises(ValueError, match=r"no episode yet: call train\(\) before finish"):
+        run.finish(result)
+    assert contents(tmp_path) == before
+    run.train()
+    run.close()
+    before = contents(tmp_path)
+    for call in (run.train, run.save, partial(run.finish, result)):
+        with pytest.raises(ValueError, match="this experiment was closed: create a new one"):
+            call()
+    assert contents(tmp_path) == before
+    again = Experiment(small(task=task), tmp_path)
+    shutil.rmtree(tmp_path)
+    with pytest.raises(OtherRunError, match="which this run has written, is missing"):
+        again.train(2)
+    assert not tmp_path.exists()
+
+
 def test_fewer_episodes_than_there_are_are_refused(trained):
     """Nothing is changed, and the run can be continued as it was or for longer."""
     before = contents(trained)

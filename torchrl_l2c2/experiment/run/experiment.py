@@ -15,6 +15,7 @@ from torchrl_l2c2.experiment.agents.build import make_agent
 from torchrl_l2c2.experiment.agents.optimizers import anneal
 from torchrl_l2c2.experiment.collect.player import Episode, Player, make_collector
 from torchrl_l2c2.experiment.envs.environments import TEST_SEED, make_env
+from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.learn.compilation import compiler_available
 from torchrl_l2c2.experiment.learn.learner import Learner, untrained_reason
 from torchrl_l2c2.experiment.learn.replay import make_replay
@@ -112,6 +113,7 @@ class Experiment:
             collector = make_collector(config, env, self.agent, compile=self._compile)
             self.player = Player(collector, self.agent, config.task.env_id)
         self.metrics: list[dict[str, float]] = []
+        self._closed = False
         self._late_tests = LateTests(config.task, config.seed, self.agent.policy, self._compile)
         try:
             self._best_policy = BestPolicy(config, self.agent.policy, self.folder)
@@ -142,6 +144,7 @@ class Experiment:
             list: A dictionary of metrics per episode.
 
         Raises:
+            ValueError: If the experiment was closed.
             FloatingPointError: If the environment, the policy, a loss or a parameter has NaN or
                 infinity; states where, and the last good checkpoint.
             SimulatorError: If the environment fails; states the frame and the last good checkpoint.
@@ -155,6 +158,7 @@ class Experiment:
             UserWarning: If no update was made or all actions were random, or the regularizer's
                 gradients are too small for any effect.
         """
+        self._check_open()
         task = self.config.task if episodes is None else self.config.task.for_episodes(episodes)
         full, budget = self.config.task.budget, task.budget
         check_length(budget, full, self._spent(budget))
@@ -211,7 +215,11 @@ class Experiment:
 
         Returns:
             Path: Path of the checkpoint; ``None`` without a folder.
+
+        Raises:
+            ValueError: If the experiment was closed.
         """
+        self._check_open()
         if self.folder is None:
             return None
         self.learner.check_parameters()
@@ -289,12 +297,15 @@ class Experiment:
             FinishedRun: The finished run, read from the folder.
 
         Raises:
-            ValueError: If the experiment has no folder.
+            ValueError: If the experiment has no folder, was not trained or was closed.
         """
+        self._check_open()
         if self.folder is None:
-            raise ValueError(
+            raise UserError(
                 "this experiment has no folder: create it with Experiment(..., folder)."
             )
+        if not self.metrics:
+            raise UserError("this experiment has no episode yet: call train() before finish().")
         save_policy(self.agent.policy, self.folder / "policy.pt")
         tests = {"mean": result, "sampled": sampled}
         written = {name: test.to_dict() for name, test in tests.items() if test is not None}
@@ -304,11 +315,19 @@ class Experiment:
         return write_evaluation(self.folder, self.config, written)
 
     def close(self) -> None:
-        """Closes environments, log and lock. The experiment cannot be used afterwards."""
+        """Closes environments, log and lock. Training cannot continue afterwards."""
+        self._closed = True
         self.player.collector.shutdown()
         self._late_tests.close()
         self._log.close()
         self._unlock()
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise UserError(
+                "this experiment was closed: create a new one, which continues from the last "
+                "checkpoint if it has the same folder."
+            )
 
     def _start(self, folder: Path, allow_other_versions: bool) -> None:
         self._unlock = lock_folder(make_folder(folder), self)

@@ -77,9 +77,16 @@ class MetricsLog:
         """Checks that no other object has written to the file.
 
         Raises:
-            OtherRunError: If the file's size has changed.
+            OtherRunError: If the file is missing, or its size has changed.
         """
-        size = self.path.stat().st_size if self.path is not None and self.path.exists() else 0
+        if self.path is None:
+            return
+        if self._size and not self.path.exists():
+            raise OtherRunError(
+                f"{self.path}, which this run has written, is missing: restore the folder, or "
+                "create a new Experiment, which starts again."
+            )
+        size = self.path.stat().st_size if self.path.exists() else 0
         if size != self._size:
             raise OtherRunError(
                 f"{self.path} has {size} bytes, but {self._size} after this run's last write: "
