@@ -311,6 +311,11 @@ class TestWords:
         assert f"by {size:.1%} of its range" in found.text and "throughout" in found.text
         assert kinds(made_up(slow + 0.1 * fast, rate=rate)) == ["smooth"]
 
+    def test_what_has_no_slower_movement_oscillates(self):
+        action = 0.3 * torch.sin(2 * torch.pi * 9 * torch.arange(500.0) / 50).unsqueeze(-1)
+        text = said(made_up(action, action_names=["knee"], rate=50.0), "chatters").text
+        assert text.startswith("knee oscillates, which is shaking at about 9 Hz")
+
     def test_a_tenth_of_an_episode_may_chatter(self):
         """It stands still otherwise; the sentence has the steps."""
         actions = torch.zeros(1000, 1)
@@ -887,6 +892,8 @@ class TestRecording:
         assert diagnose_recording(path, columns=["knee"]).actions.shape == (20, 1)
         with pytest.raises(UserError, match="no column 'hip': choose from step, mode, knee"):
             diagnose_recording(path, columns=["hip"])
+        with pytest.raises(UserError, match="the column 'knee' was chosen twice: name it once"):
+            diagnose_recording(path, columns=["knee", "knee"])
         with pytest.raises(UserError, match=r"line 2: 'mode' must be a finite number, got 'walk'"):
             diagnose_recording(path)
 
@@ -922,6 +929,8 @@ class TestRecording:
             (["a,b", "0,1", "0"], r"line 3: expected 2 cells as in the first line, got 1"),
             (["a", "0", "x"], r"line 3: 'a' must be a finite number, got 'x'"),
             (["a", "0", "nan"], r"line 3: 'a' must be a finite number, got 'nan': leave"),
+            (["a;b", "0,5;1"], r"line 2: 'a' .*, got '0,5': write a decimal point instead"),
+            (["a b", "0.5 1"], r"got '0.5 1': separate the columns by commas, semicolons or tabs"),
             (["a", "0", "1", "0"], r"at least 20 steps and one action, got \[3, 1\]"),
             (["time", *map(str, range(20))], r"at least 20 steps and one action, got \[20, 0\]"),
             (["a,time", "0,0", "0,1", "0,1", "0,2"], r"line 4: the column 'time' must increase"),

@@ -146,6 +146,8 @@ def diagnose_recording(
     chosen = [each for each in header if each != TIME] if columns is None else list(columns)
     if missing := [each for each in chosen if each not in header]:
         raise UserError(f"{path} has no column {missing[0]!r}: choose from {', '.join(header)}.")
+    if double := [each for each in chosen if chosen.count(each) > 1]:
+        raise UserError(f"the column {double[0]!r} was chosen twice: name it once.")
     actions = {each: _numbers(path, header.index(each), each, lines) for each in chosen}
     for each, values in actions.items():
         if columns is None and len(values) >= LEAST_STEPS and (values.diff() > 0.0).all():
@@ -262,10 +264,19 @@ def _numbers(path: Path, place: int, name: str, lines: Sequence[tuple[int, list[
         if value is None or not math.isfinite(value):
             raise UserError(
                 f"{path}, line {number}: {name!r} must be a finite number, got {cells[place]!r}: "
-                "leave such lines out, or choose other columns with --columns."
+                f"{_remedy(cells[place])}."
             )
         values.append(value)
     return torch.tensor(values, dtype=torch.float64)
+
+
+def _remedy(cell: str) -> str:
+    """What to do about a cell that is no number."""
+    if "," in cell and _number(cell.replace(",", ".")) is not None:
+        return "write a decimal point instead of the comma"
+    if len(cell.split()) > 1 and all(_number(part) is not None for part in cell.split()):
+        return "separate the columns by commas, semicolons or tabs"
+    return "leave such lines out, or choose other columns with --columns"
 
 
 def _number(text: str) -> float | None:

@@ -58,6 +58,7 @@ SELECTED_INPUTS = 4  # listed of more inputs: the action follows these most
 MOST_NAMES = 12  # of further actions with the same finding
 SLOW = 0.1  # lowest frequency of a tone, of the control rate
 TONE = 0.03  # half of the width of a tone, of the control rate
+BESIDE = 0.3  # of the fast part: a slower movement that is smaller is none
 TAIL = 1.4  # times the peak's height: a higher spectrum just below it is of a slower movement
 
 
@@ -253,11 +254,12 @@ def _chatters(name: str, action: Tensor, rate: float | None) -> Iterator[Finding
     if sizes[most] < threshold("CHATTERS") or peak is None:
         return
     speed = f"{peak:.2g} of the control rate" if rate is None else f"{peak * rate:.3g} Hz"
-    size = fast[places[most]].square().mean().sqrt()
     place = places[most]
+    size, slow = fast[place].square().mean().sqrt(), (action - fast)[place].std(correction=0)
+    does = "chatters around a slower movement" if slow > BESIDE * size else "oscillates"
     text = (
-        f"{name} chatters around a slower movement, which is shaking at about {speed}: its fast "
-        f"part moves by {size:.1%} of its range (root mean square), "
+        f"{name} {does}, which is shaking at about {speed}: its fast part moves by {size:.1%} of "
+        "its range (root mean square), "
         + (f"in steps {place.start} to {place.stop - 1}." if most else "throughout the episode.")
     )
     yield Finding("chatters", text)
