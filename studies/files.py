@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,8 +15,9 @@ from torchrl_l2c2.experiment.run.files import write_atomically
 ROOT = Path(__file__).parents[1]
 
 
+@functools.cache
 def records(*names: str) -> pd.DataFrame:
-    """The records of these files in ``results/``."""
+    """The records of these files in ``results/``; the table is shared, so do not change it."""
     return merge(*(read_records(ROOT / "results" / f"{name}.csv") for name in names))
 
 

@@ -5,6 +5,7 @@ It has the README's table and the tables of ``docs/results.md``; ``studies.fores
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -86,6 +87,7 @@ BENCHMARKS = (
 algorithm and settings on its noisy tasks. TD3 and rsl_rl are added to them, from their records."""
 
 
+@functools.cache
 def benchmarks() -> dict[tuple[str, str], Pair]:
     """The runs of every benchmark by task and algorithm, the roughest baseline first."""
     found = {(each.task, each.algorithm): _groups(each) for each in BENCHMARKS}
