@@ -13,6 +13,7 @@ import processes
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.envs import GymEnv, RenameTransform, SerialEnv, TransformedEnv
 
 from torchrl_l2c2 import make_actor
 from torchrl_l2c2.experiment import (
@@ -290,6 +291,24 @@ def test_nan_in_a_test_episode_gives_no_result():
         evaluate_policy(policy, env, 2, max_steps=5)
     with pytest.raises(FloatingPointError, match=r"'next', 'reward'.*frame 3"):
         LateTests(task, 0, policy, compile_policy=False).play(1)
+
+
+def test_policies_are_played_where_they_read_one_observation_of_one_environment():
+    """Of any name; a batch's measures would be along another dimension."""
+    env = GymEnv("Pendulum-v1", max_episode_steps=20)
+    actor = make_actor(3, env.action_spec, in_keys=["policy"])
+    named = TransformedEnv(env, RenameTransform(["observation"], ["policy"]))
+    result = evaluate_policy(actor, named, 2, sampled=True)
+    assert result.lengths == [20, 20] and all(map(math.isfinite, result.summary().values()))
+    with pytest.raises(ValueError, match=r"policy reads 'policy', and the environment has \['obs"):
+        evaluate_policy(actor, env, 2)
+    for number in (1, 2):
+        with pytest.raises(
+            ValueError, match=rf"a single environment, got a batch of \({number},\)"
+        ):
+            evaluate_policy(actor, SerialEnv(number, lambda: GymEnv("Pendulum-v1")), 2)
+    with pytest.raises(TypeError, match="policy must be an actor of TorchRL"):
+        evaluate_policy(torch.nn.Linear(3, 1), env, 2)
 
 
 def broken_after(experiment, frames, outcome):

@@ -3,6 +3,7 @@
 import os
 from itertools import pairwise
 from pathlib import Path
+from typing import ClassVar
 
 import gymnasium
 import numpy as np
@@ -18,6 +19,33 @@ from torchrl_l2c2.experiment.run.policies import load_policy
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
 pytest.importorskip("pygame")
 ROOT = Path(__file__).parents[1]
+
+
+class Drawn(gymnasium.Env):
+    """Draws what it is told to."""
+
+    metadata: ClassVar = {"render_modes": ["rgb_array"], "render_fps": 30}
+    observation_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+    picture = staticmethod(lambda step: None)
+
+    def __init__(self, render_mode=None):
+        self.render_mode = render_mode
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        return np.zeros(2, np.float32), 0.0, False, False, {}
+
+    def render(self):
+        return type(self).picture(self.steps)
+
+
+gymnasium.register("Canvas-v0", Drawn)
 
 
 class Bare(gymnasium.Env):
@@ -104,6 +132,71 @@ def test_the_pictures_are_those_of_the_test_episode(pendulum):
     first = load_policy(pendulum)[1].reset()["observation"]
     assert np.array_equal(first.numpy(), episode["observation"][0].numpy())
     assert dict(os.environ) == before
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory):
+    return trained(tmp_path_factory.mktemp("drawn"), "Canvas-v0")
+
+
+def frames_of(path):
+    frames = imageio_ffmpeg.read_frames(str(path))
+    width, height = next(frames)["size"]
+    return [np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in frames]
+
+
+def test_every_state_has_its_own_picture(drawn, tmp_path, monkeypatch):
+    """Also if the task draws all of them into one array, here with opacity and odd sides."""
+    canvas = np.full((31, 41, 4), 255, np.uint8)
+
+    def onto_the_canvas(step):
+        canvas[..., :3] = 10 * step
+        return canvas
+
+    monkeypatch.setattr(Drawn, "picture", staticmethod(onto_the_canvas))
+    seen = frames_of(record_video(drawn, tmp_path / "video.mp4"))
+    assert len(seen) == 21 and seen[0].shape == (32, 42, 3)
+    for step, frame in enumerate(seen):
+        assert abs(frame.astype(float) - 10 * step).max() < 5
+
+
+@pytest.mark.parametrize(
+    ("picture", "message"),
+    [
+        (lambda step: None, r"return an array \[H, W, 3\] of uint8, got NoneType"),
+        (lambda step: [np.zeros((8, 8, 3), np.uint8)], "of uint8, got list"),
+        (lambda step: np.zeros((8, 8, 3)), r"got float64 of shape \(8, 8, 3\)"),
+        (lambda step: np.zeros((8, 8), np.uint8), r"got uint8 of shape \(8, 8\)"),
+        (
+            lambda step: np.zeros((8 + step, 8, 3), np.uint8),
+            r"have one size, got \(8, 8\) and then \(9, 8\)",
+        ),
+    ],
+)
+def test_what_is_no_picture_is_refused(drawn, tmp_path, monkeypatch, capsys, picture, message):
+    """The encoder would write other pictures. The page of ``diagnose`` leaves them out."""
+    monkeypatch.setattr(Drawn, "picture", staticmethod(picture))
+    with pytest.raises(SystemExit, match=f"^error: .* of Canvas-v0 .*{message}"):
+        main([str(drawn), "--output", str(tmp_path / "video.mp4")])
+    assert not list(tmp_path.iterdir())
+    diagnose.main([str(drawn), "--episodes", "1", "--output", str(tmp_path / "page.html")])
+    assert "<video" not in (tmp_path / "page.html").read_text()
+
+
+def test_a_missing_graphics_library_is_one_line_with_its_remedy(drawn, monkeypatch, capsys):
+    """Any other error in a user's own drawing has its traceback."""
+
+    def without(step):
+        raise RuntimeError("an OpenGL platform library\nhas not been loaded")
+
+    monkeypatch.setattr(Drawn, "picture", staticmethod(without))
+    with pytest.raises(SystemExit, match=r"Canvas-v0 could not draw .*loaded\. Set MUJOCO_GL=egl"):
+        main([str(drawn)])
+    assert "Traceback" not in capsys.readouterr().err
+    monkeypatch.setattr(Drawn, "picture", staticmethod(lambda step: {}["canvas"]))
+    with pytest.raises(SystemExit, match="Canvas-v0 could not draw its pictures: KeyError"):
+        main([str(drawn)])
+    assert "Traceback" in capsys.readouterr().err
 
 
 def test_an_encoder_that_cannot_write_is_one_line(tmp_path, monkeypatch):

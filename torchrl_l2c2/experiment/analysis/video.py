@@ -76,8 +76,9 @@ def record_video(
 
     Raises:
         ImportError: If the ``video`` extra is missing.
-        ValueError: If the task does not render, ``episodes`` is below 1, or the file has another
-            ending.
+        ValueError: If the task does not render pictures of bytes in one size, ``episodes`` is below
+            1, or the file has another ending.
+        SimulatorError: If the task or the policy fails.
         FileNotFoundError: If the folder has no run, or no policy yet.
         OSError: If the file cannot be written.
     """
@@ -147,18 +148,19 @@ def write_video(path: Path, pictures: Sequence[Picture], rate: float) -> None:
     import imageio_ffmpeg
 
     height, width, _ = pictures[0].shape
+    odd = (0, height % 2), (0, width % 2), (0, 0)  # The encoder takes even sides only.
     partial = path.with_name(f".partial_{path.name}")
     writer = imageio_ffmpeg.write_frames(
         str(partial),
-        (width, height),
+        (width + width % 2, height + height % 2),
         fps=rate,
-        macro_block_size=2,  # an odd side is stretched by a pixel, which the encoder needs
+        macro_block_size=2,
         ffmpeg_log_level="quiet",
     )
     try:
         writer.send(None)
         for picture in pictures:
-            writer.send(np.ascontiguousarray(picture))
+            writer.send(np.ascontiguousarray(np.pad(picture, odd, "edge")))
         writer.close()
         os.replace(partial, path)
     except OSError:

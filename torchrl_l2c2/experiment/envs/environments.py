@@ -45,10 +45,11 @@ def simulator_errors(what: str) -> Iterator[None]:
     Raises:
         SimulatorError: If the block raises an error or tries to end the process.
         CompilerError: If the policy could not be compiled; it is not converted.
+        UserError: If the task draws no pictures that can be recorded; it is not converted.
     """
     try:
         yield
-    except CompilerError:
+    except (CompilerError, SimulatorError, UserError):
         raise
     except (Exception, SystemExit) as error:
         message = " ".join(str(error).split())  # One line, as in a sweep's summary.

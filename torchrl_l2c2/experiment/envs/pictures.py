@@ -6,8 +6,10 @@ import math
 from typing import Any, NamedTuple
 
 import gymnasium
+import numpy as np
 
 from torchrl_l2c2.experiment.envs.spaces import Env
+from torchrl_l2c2.experiment.errors import SimulatorError, UserError
 
 QUICK_SIZE = 320  # Width and height in pixels.
 USUAL_RATE = 30.0  # Steps per second for simulators whose rate is unknown.
@@ -61,19 +63,52 @@ class PictureRecorder(gymnasium.Wrapper[Any, Any, Any, Any]):
         rate = control_rate(self.env) or USUAL_RATE
         self.every = max(1, round(rate / self._drawing.rate))
         self._last = rate * self._drawing.seconds
-        self._steps, self._pictures = 0, [self.env.render()]
+        self._steps, self._pictures = 0, []
+        self._draw()
         return result
 
     def step(self, action: Any) -> Any:
         result = self.env.step(action)
         self._steps += 1
         if self._steps <= self._last and self._steps % self.every == 0:
-            self._pictures.append(self.env.render())
+            self._draw()
         return result
 
     def pictures(self) -> list[Any]:
         """Returns the pictures of the current episode, arrays ``[H, W, 3]`` of uint8."""
         return list(self._pictures)
+
+    def _draw(self) -> None:
+        """Adds a copy of the task's picture: some tasks draw all pictures into one array.
+
+        Raises:
+            SimulatorError: If the task fails.
+            UserError: If there is no graphics library, or no picture of bytes in the size of the
+                first one.
+        """
+        task = getattr(self.env.unwrapped.spec, "id", type(self.env.unwrapped).__name__)
+        try:
+            picture: Any = self.env.render()
+        except Exception as error:
+            cause = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            what = f"{task} could not draw its pictures: {cause}"
+            if "OpenGL" in cause:
+                raise UserError(f"{what}. Set MUJOCO_GL=egl, or MUJOCO_GL=osmesa.") from None
+            raise SimulatorError(what) from error
+        of_bytes = isinstance(picture, np.ndarray) and picture.dtype == np.uint8
+        if not of_bytes or picture.ndim != 3 or picture.shape[2] not in (3, 4):
+            shape, dtype = getattr(picture, "shape", None), getattr(picture, "dtype", None)
+            found = type(picture).__name__ if shape is None else f"{dtype} of shape {shape}"
+            raise UserError(
+                f"render() of {task} must return an array [H, W, 3] of uint8, got {found}."
+            )
+        picture = picture[..., :3].copy()  # without a fourth channel, the opacity
+        if self._pictures and picture.shape != self._pictures[0].shape:
+            raise UserError(
+                f"pictures of {task} must have one size, got {self._pictures[0].shape[:2]} and "
+                f"then {picture.shape[:2]}."
+            )
+        self._pictures.append(picture)
 
 
 def control_rate(env: Any) -> float | None:

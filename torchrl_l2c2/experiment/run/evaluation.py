@@ -11,8 +11,8 @@ from functools import partial
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
@@ -64,7 +64,7 @@ class Evaluation:
     Attributes:
         returns: Sums of rewards. Larger is better.
         action_variations: Mean L2 norm of the change of the mean action per step, the paper's "L2
-            norm of temporal actions". Smaller is smoother.
+            norm of temporal actions". Smaller is smoother. 0 for an episode of one step.
         lengths: Numbers of steps.
         measures: Other measures of the mean actions (``torchrl_l2c2.metrics``) by name, including
             ``saturation`` for bounded actions and ``noise_sensitivity`` (noise of 0.01) for
@@ -110,8 +110,10 @@ def evaluate_policy(
 
     Args:
         policy (TensorDictModule): Policy that is deterministic under
-            ``ExplorationType.DETERMINISTIC``, for single observations and for batches.
-        env (EnvBase): One Gymnasium environment, as for :class:`EpisodeCollector`.
+            ``ExplorationType.DETERMINISTIC``, for single observations and for batches. It reads one
+            observation.
+        env (EnvBase): A single environment. One of Gymnasium, as for :class:`EpisodeCollector`, is
+            faster.
         episodes (int): Number of episodes, at least 1. More episodes give a more precise mean.
 
     Keyword Args:
@@ -129,7 +131,9 @@ def evaluate_policy(
         FloatingPointError: If the environment or the policy returns NaN or infinity; states the
             key and the frame.
         SimulatorError: If the environment or the policy raises an error; states the episode.
-        ValueError: If ``episodes`` is below 1.
+        TypeError: If the policy is no actor of TorchRL, or the environment is not one of TorchRL.
+        ValueError: If ``episodes`` is below 1, the environment is a batch of several, or the policy
+            reads several entries, or one that the environment does not have.
 
     Examples:
         >>> from torchrl.envs import GymEnv
@@ -141,6 +145,7 @@ def evaluate_policy(
     """
     if episodes < 1:
         raise UserError(f"episodes must be at least 1, got {episodes}.")
+    key, action_key = observation_key(policy, env), env.action_key
     returns: list[float] = []
     variations: list[float] = []
     lengths: list[int] = []
@@ -161,17 +166,20 @@ def evaluate_policy(
         leave=False,
     )
     for episode in bar:
-        check_finite(episode, sum(lengths), test=True)
-        actions = mean_actions(policy, episode) if sampled else episode["action"]
+        check_finite(episode, sum(lengths), test=True, observation=key, action=action_key)
+        taken = episode[action_key]
+        actions = _mean_actions(policy, episode, key, action_key) if sampled else taken
         returns.append(_return(episode))
         variations.append(_variation(actions))
-        clipped = getattr(policy, "clip_action", lambda samples: samples)(episode["action"])
+        clipped = getattr(policy, "clip_action", lambda samples: samples)(taken)
         played = {"": actions, "sampled_": clipped} if sampled else {"": actions}
         for prefix, kind in played.items():
             for name, value in measure(kind, env.action_spec).items():
                 measures.setdefault(prefix + name, []).append(value)
         if env.action_spec.dtype.is_floating_point:
-            measures.setdefault("noise_sensitivity", []).append(_sensitivity(policy, episode))
+            measures.setdefault("noise_sensitivity", []).append(
+                _sensitivity(policy, episode, key, action_key)
+            )
         lengths.append(len(episode))
         bar.set_postfix_str(f"return {statistics.fmean(returns):.1f}")
     return Evaluation(returns, variations, lengths, measures)
@@ -208,6 +216,39 @@ def evaluate_task(
         return evaluate_policy(policy, env, episodes, max_steps=time_limit(task), **options)
 
 
+def observation_key(policy: TensorDictModule, env: EnvBase) -> NestedKey:
+    """Returns the key of the observation that a policy reads.
+
+    Raises:
+        TypeError: If the policy is no actor of TorchRL, or the environment is not one of TorchRL.
+        ValueError: If the environment is a batch of several, or the policy reads several entries,
+            or one that the environment does not have.
+    """
+    if not isinstance(policy, TensorDictModuleBase):
+        raise TypeError(
+            f"policy must be an actor of TorchRL, got {policy!r}: torchrl.modules.Actor(network) "
+            "makes one of a network."
+        )
+    if not isinstance(env, EnvBase):
+        raise TypeError(
+            f"env must be an environment of TorchRL, got {env!r}: torchrl.envs.GymEnv(id) makes "
+            "one, GymWrapper(env) one of Gymnasium's."
+        )
+    if env.batch_size:
+        raise UserError(
+            f"env must be a single environment, got a batch of {tuple(env.batch_size)}: pass one "
+            "of these."
+        )
+    if len(keys := list(policy.in_keys)) != 1:
+        raise UserError(
+            f"the policy must read one observation, this one reads {keys}: join them with "
+            "torchrl.envs.CatTensors."
+        )
+    if keys[0] not in (there := list(env.observation_spec.keys(True, True))):
+        raise UserError(f"the policy reads {keys[0]!r}, and the environment has {there}.")
+    return keys[0]
+
+
 def _known_mean(values: list[float]) -> float:
     return statistics.fmean([v for v in values if not math.isnan(v)] or [math.nan])
 
@@ -237,21 +278,26 @@ def measure(actions: Tensor, spec: TensorSpec) -> dict[str, float]:
 
 
 @torch.no_grad()
-def mean_actions(policy: TensorDictModule, episode: TensorDictBase) -> Tensor:
+def _mean_actions(
+    policy: TensorDictModule, episode: TensorDictBase, key: NestedKey, action_key: NestedKey
+) -> Tensor:
     """Returns the policy's mean actions ``[T, A]`` at the states of an episode."""
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        actions: Tensor = policy(episode.select("observation"))["action"]
+        actions: Tensor = policy(episode.select(key))[action_key]
     return actions
 
 
-def _sensitivity(policy: TensorDictModule, episode: TensorDictBase) -> float:
+def _sensitivity(
+    policy: TensorDictModule, episode: TensorDictBase, key: NestedKey, action_key: NestedKey
+) -> float:
     """Returns the sensitivity to noise, with the same noise at every call."""
 
     def act(observation: Tensor) -> Tensor:
-        return mean_actions(policy, TensorDict({"observation": observation}, observation.shape[:1]))
+        seen = TensorDict({key: observation}, observation.shape[:1])
+        return _mean_actions(policy, seen, key, action_key)
 
     generator = torch.Generator().manual_seed(0)
-    return noise_sensitivity(act, episode["observation"], NOISE, generator=generator).item()
+    return noise_sensitivity(act, episode[key], NOISE, generator=generator).item()
 
 
 class LateTests:

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase, ExplorationType, GymWrapper, set_exploration_type
@@ -20,7 +20,7 @@ from torchrl_l2c2.experiment.envs.environments import untransformed
 from torchrl_l2c2.experiment.envs.frames import check_finite
 from torchrl_l2c2.experiment.envs.pictures import control_rate
 from torchrl_l2c2.experiment.errors import UserError
-from torchrl_l2c2.experiment.run.evaluation import LEAST_STEPS, measure
+from torchrl_l2c2.experiment.run.evaluation import LEAST_STEPS, measure, observation_key
 from torchrl_l2c2.metrics import (
     action_variation,
     change_with_held_input,
@@ -239,7 +239,7 @@ def diagnose(
     check_positive_int("episodes", episodes)
     if not isinstance(noise_scale, Tensor):
         check_real("noise_scale", noise_scale, above=0)
-    key = _observed(policy, env)
+    key = observation_key(policy, env)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         played = [env.rollout(max_steps, policy).detach() for _ in range(episodes)]
     lengths = [len(episode) for episode in played]
@@ -315,30 +315,6 @@ def check_names(argument: str, names: Sequence[str], count: int, of: str) -> Non
         raise UserError(
             f"{argument} must have a name for each of the {count} {of}, got {len(names)} names."
         )
-
-
-def _observed(policy: TensorDictModule, env: EnvBase) -> NestedKey:
-    if not isinstance(policy, TensorDictModuleBase):
-        raise TypeError(
-            f"policy must be an actor of TorchRL, got {policy!r}: torchrl.modules.Actor(network) "
-            "makes one of a network."
-        )
-    if not isinstance(env, EnvBase):
-        raise TypeError(
-            f"env must be an environment of TorchRL, got {env!r}: torchrl.envs.GymEnv(id) makes "
-            "one, GymWrapper(env) one of Gymnasium's."
-        )
-    if env.batch_size:
-        raise ValueError(
-            f"Expected one environment, got a batch of {tuple(env.batch_size)}: pass a single "
-            "environment."
-        )
-    if len(keys := list(policy.in_keys)) != 1:
-        raise ValueError(
-            f"the policy must read one observation, this one reads {keys}: join them with "
-            "torchrl.envs.CatTensors."
-        )
-    return keys[0]
 
 
 def _act(
