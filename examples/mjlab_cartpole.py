@@ -3,6 +3,10 @@
 ``python examples/mjlab_cartpole.py Mjlab-Cartpole-Balance-L2C2`` trains it, and
 ``Mjlab-Cartpole-Balance`` the baseline. ``--agent.algorithm.regularizer-cfg.strength 2`` doubles
 the penalty. Needs mjlab.
+
+It trains on one GPU, or on a CPU. For several GPUs mjlab starts further processes, which know only
+tasks of installed packages: register the task in a package with an entry point of the group
+``mjlab.tasks``.
 """
 
 from __future__ import annotations
@@ -33,6 +37,7 @@ class L2C2AlgorithmCfg(RslRlPpoAlgorithmCfg):
 def register_with_l2c2(task: str) -> None:
     """Registers a task again, with ``-L2C2`` behind its name."""
     agent = load_rl_cfg(task)
+    agent.experiment_name += "_l2c2"  # The baseline's runs have a folder of their own.
     settings = asdict(agent.algorithm)
     del settings["class_name"]
     agent.algorithm = L2C2AlgorithmCfg(**settings)

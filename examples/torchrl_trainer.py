@@ -53,6 +53,12 @@ def main(frames: int) -> None:
         enable_logging=False,
         progress_bar=False,
     )
+
+    def set_progress() -> None:
+        loss.set_progress(trainer.collected_frames / trainer.total_frames)
+
+    loss.set_progress(0.0)  # before the first batch; the penalty grows from 0
+    trainer.register_op("post_steps", set_progress)
     trainer.train()
 
     test_env = GymEnv("Pendulum-v1")

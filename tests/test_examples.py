@@ -6,6 +6,7 @@ import math
 import re
 import runpy
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
@@ -50,7 +51,8 @@ def test_it_trains_and_says_what_it_learned(
     """It ends well, with a return and an action variation that are numbers."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", [str(example), *filter(None, [FRAMES.get(example.stem)])])
-    with torch.random.fork_rng():
+    with torch.random.fork_rng(), warnings.catch_warnings():
+        warnings.filterwarnings("error", ".*(set_progress|differentiated)")
         runpy.run_path(str(example), run_name="__main__")
     told = dict(re.findall(r"^([a-z_ ]+) (\S+)$", capsys.readouterr().out, re.M))
     assert {"return", "action variation"} <= told.keys()

@@ -762,10 +762,11 @@ def test_the_pages_configuration_builds(monkeypatch: pytest.MonkeyPatch) -> None
     assert chosen == {"beta": 0.0} and regularization.loss.added_terms == {"loss_l2c2_actor"}
 
 
+@pytest.mark.parametrize("kind", ["MLPModel", "RNNModel"])
 def test_the_pages_recording_is_one_episode_of_mean_actions(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    kind: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """With a name for each action, up to the first reset."""
+    """With a name for each action, up to the first reset, whatever the policy saw before."""
     monkeypatch.syspath_prepend(EXAMPLE.parent)
     from rsl_rl.runners import OnPolicyRunner
     from rsl_rl_points import NoisyPoints
@@ -773,14 +774,22 @@ def test_the_pages_recording_is_one_episode_of_mean_actions(
     page = (EXAMPLE.parents[1] / "docs" / "rsl_rl.md").read_text()
     told: dict[str, Any] = {}
     exec(re.findall(r"^```python\n(.*?)^```", page, re.M | re.S)[2], told)
-    env, path = NoisyPoints(2), tmp_path / "sim.csv"
-    policy = OnPolicyRunner(env, runner_config()).get_inference_policy()
-    first = policy(env.get_observations())[0].tolist()
-    told["record"](policy, env, path, dt=0.1, steps=1000)
-    header, *rows = path.read_text().splitlines()
+    config = runner_config()
+    if kind == "RNNModel":
+        config["actor"] |= {"class_name": kind, "rnn_type": "gru", "rnn_hidden_dim": 8}
+    policy = OnPolicyRunner(NoisyPoints(2), config).get_inference_policy()
+    path, tables = tmp_path / "sim.csv", []
+    for _ in range(2):
+        torch.manual_seed(0)
+        env = NoisyPoints(2)
+        policy.reset()
+        first = policy(env.get_observations())[0].tolist()
+        told["record"](policy, env, path, dt=0.1, steps=1000)
+        header, *rows = path.read_text().splitlines()
+        tables.append([[float(cell) for cell in row.split(",")] for row in rows])
     assert header == "time,action0" and 4 < len(rows) < 1000
-    assert [float(cell) for cell in rows[0].split(",")] == pytest.approx([0.0, *first])
-    assert float(rows[3].split(",")[0]) == pytest.approx(0.3)
+    assert tables[0][0] == pytest.approx([0.0, *first])
+    assert tables[0] == tables[1] and tables[0][3][0] == pytest.approx(0.3)
 
 
 def test_the_runners_iterations_are_the_ramp(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -819,6 +828,27 @@ def test_settings_beside_the_algorithm_are_refused(monkeypatch: pytest.MonkeyPat
     config = {**runner_config(), "regularizer_cfg": {"strength": 2.0}}
     with pytest.raises(ValueError, match="regularizer_cfg in the algorithm's configuration, got"):
         OnPolicyRunner(NoisyPoints(2), config)
+
+
+def test_what_neighbors_cannot_move_in_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before rsl_rl's message, or one with names that its users do not write."""
+    monkeypatch.syspath_prepend(EXAMPLE.parent)
+    from rsl_rl.runners import DistillationRunner, OnPolicyRunner
+    from rsl_rl_points import NoisyPoints
+
+    class Flagged(NoisyPoints):
+        def get_observations(self) -> TensorDict:
+            seen: TensorDict = super().get_observations()
+            return seen.set("flag", torch.ones(self.num_envs, 1, dtype=torch.long))
+
+    config = {**runner_config(), "obs_groups": {"actor": ["flag"], "critic": ["policy"]}}
+    with pytest.raises(TypeError, match=r"of floating-point numbers among \['flag'\]"):
+        OnPolicyRunner(Flagged(2), config)
+    config = runner_config()
+    config |= {"student": config.pop("actor"), "teacher": config.pop("critic")}
+    config["obs_groups"] = {"student": ["policy"], "teacher": ["policy"]}
+    with pytest.raises(ValueError, match=r"an actor and a critic, got .*'student', 'teacher'\]"):
+        DistillationRunner(NoisyPoints(2), config)
 
 
 def test_the_runner_builds_it_by_its_name(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

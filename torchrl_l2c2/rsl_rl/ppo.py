@@ -135,6 +135,12 @@ class RegularizedPPO(PPO):
                 "Expected regularizer_cfg in the algorithm's configuration, got it next to that, "
                 "where it has no effect. Move it next to class_name."
             )
+        if "actor" not in cfg:
+            raise ValueError(
+                f"Expected the configuration of an actor and a critic, got {sorted(cfg)}. Train "
+                "with OnPolicyRunner; a DistillationRunner takes a teacher that was trained with "
+                "this class, and rsl_rl's own Distillation as its algorithm."
+            )
         # In place: rsl_rl 5.4 writes entries into it, which its runner reads.
         cfg["algorithm"].setdefault("max_iterations", cfg.get("max_iterations"))
         algorithm = PPO.construct_algorithm(obs, env, cfg, device)
@@ -148,6 +154,11 @@ class RegularizedPPO(PPO):
         stored = self.storage.observations
         _check_groups(stored.keys(), [loss.l2c2_neighbor_key])
         groups = [group for group in _groups(loss) if stored[group].is_floating_point()]
+        if not groups:
+            raise TypeError(
+                f"Expected an observation group of floating-point numbers among {[*_groups(loss)]},"
+                " which the regularized networks read. Neighbors move in these; integers stay."
+            )
         generator = torch.Generator(self.device).manual_seed(torch.initial_seed())
         return loss.neighbor_transform(generator, loss.l2c2_moved_keys or groups)
 

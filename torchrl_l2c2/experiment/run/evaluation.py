@@ -133,7 +133,7 @@ def evaluate_policy(
         SimulatorError: If the environment or the policy raises an error; states the episode.
         TypeError: If the policy is no actor of TorchRL, or the environment is not one of TorchRL.
         ValueError: If ``episodes`` is below 1, the environment is a batch of several, or the policy
-            reads several entries, or one that the environment does not have.
+            reads several entries, or an entry that the environment lacks.
 
     Examples:
         >>> from torchrl.envs import GymEnv
@@ -222,7 +222,7 @@ def observation_key(policy: TensorDictModule, env: EnvBase) -> NestedKey:
     Raises:
         TypeError: If the policy is no actor of TorchRL, or the environment is not one of TorchRL.
         ValueError: If the environment is a batch of several, or the policy reads several entries,
-            or one that the environment does not have.
+            or an entry that the environment lacks.
     """
     if not isinstance(policy, TensorDictModuleBase):
         raise TypeError(
