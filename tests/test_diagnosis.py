@@ -153,6 +153,16 @@ class TestWords:
         text = said(made_up(action.unsqueeze(-1), rate=50.0), "flips").text
         assert "turns back nearly every step, which is shaking at 19" in text
 
+    @pytest.mark.parametrize("steps", [20, 30, 50, 80])
+    def test_short_recordings_of_noise_have_no_frequency(self, steps):
+        """In 95 of 100; a clear oscillation of 30 steps has one."""
+        generator = torch.Generator().manual_seed(0)
+        noise = 0.2 * torch.randn(100, steps, 1, generator=generator)
+        texts = [found.text for each in noise for found in findings(made_up(each))]
+        assert sum("oscillates" in text or "nearly every step" in text for text in texts) <= 5
+        sine = 0.5 * torch.sin(2 * torch.pi * torch.arange(30.0) / 3.3).unsqueeze(-1)
+        assert "oscillates, which is shaking at 0.3" in said(made_up(sine), "rough").text
+
     def test_the_gain_is_that_of_the_action_that_is_named(self):
         hip = 0.3 * torch.sin(2 * torch.pi * STEPS / 8)
         knee = 0.9 * torch.sin(2 * torch.pi * STEPS / 100)
@@ -800,7 +810,8 @@ class TestRun:
             raise error
 
         monkeypatch.setattr("torchrl_l2c2.experiment.analysis.diagnosis.run.play_pictures", missing)
-        assert diagnose_run(run, episodes=1).pictures == []
+        with pytest.warns(UserWarning, match=f"there is no video: {error}"):
+            assert diagnose_run(run, episodes=1).pictures == []
 
 
 def table_file(path, *lines):

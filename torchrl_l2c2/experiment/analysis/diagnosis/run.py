@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
+import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -82,6 +83,9 @@ def diagnose_run(
 
     Raises:
         FileNotFoundError: the folder holds no run, or no policy yet.
+
+    Warns:
+        UserWarning: pictures were wanted, and the task draws none; says why.
     """
     folder = Path(folder)
     policy, env, max_steps = load_policy(folder, seed=seed, noise_scale=noise_scale, best=best)
@@ -221,6 +225,7 @@ def _pictures(
             folder, 1, seed=seed, noise_scale=noise_scale, best=best, drawing=DRAWING
         )
     # The task draws no pictures, or a package is missing.
-    except (ValueError, DependencyNotInstalled, SimulatorError):
+    except (ValueError, DependencyNotInstalled, SimulatorError) as error:
+        warnings.warn(f"there is no video: {error}", stacklevel=3)
         return [], 1
     return played.pictures, played.every

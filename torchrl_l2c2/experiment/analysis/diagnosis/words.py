@@ -58,6 +58,7 @@ SELECTED_INPUTS = 4  # listed of more inputs: the action follows these most
 MOST_NAMES = 12  # of further actions with the same finding
 SLOW = 0.1  # lowest frequency of a tone, of the control rate
 TONE = 0.03  # half of the width of a tone, of the control rate
+SHORT = 10  # steps; over the length, it is added to the half of the power that a tone must have
 BESIDE = 0.3  # of the fast part: a slower movement that is smaller is none
 TAIL = 1.4  # times the peak's height: a higher spectrum just below it is of a slower movement
 
@@ -334,6 +335,7 @@ def _tone(action: Tensor) -> float | None:
     """The frequency around which the fast movement has most of its power, in cycles per step.
 
     ``None`` if there is none. Slower movement does not count: a joint that walks may shake, too.
+    The shorter a recording of noise, the more of its power lies by chance around one frequency.
     """
     window = torch.hann_window(len(action), dtype=action.dtype)
     power = torch.fft.rfft((action - action.mean()) * window).abs().square()
@@ -343,7 +345,7 @@ def _tone(action: Tensor) -> float | None:
     below = torch.cat((power.new_zeros(1), power.cumsum(0)))
     sums = below[(bins + near + 1).clamp_max(len(power))] - below[(bins - near).clamp_min(0)]
     most = int(sums.argmax())
-    if sums[most] <= 0.5 * below[-1]:
+    if sums[most] <= (0.5 + SHORT / len(action)) * below[-1]:
         return None
     around = slice(max(0, most - near), most + near + 1)
     return float((bins[around] * power[around]).sum() / power[around].sum()) / len(action)
