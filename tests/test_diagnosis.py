@@ -532,6 +532,11 @@ class TestMeasured:
         )
         found = diagnose(both, GymWrapper(Stroll()), episodes=1)
         assert found.held.tolist() == pytest.approx([0.5**0.5] * 2, rel=1e-4)
+        assert found.noise_inputs.tolist() == pytest.approx([0.5, 0.5], abs=0.1)
+        # Of noise in the second coordinate, which moves the small action by half of its change.
+        noise = torch.tensor([0.0, 0.05])
+        found = diagnose(both, GymWrapper(Stroll()), episodes=1, noise_scale=noise)
+        assert found.noise_share == pytest.approx(2 * 0.05**2 / (2 * 0.1**2), rel=0.5)
 
     def test_noise_passes_through_the_inputs_by_their_squared_slopes(self):
         """Of 2 and 1: four fifths and one fifth."""

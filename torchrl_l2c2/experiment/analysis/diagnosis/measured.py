@@ -87,8 +87,8 @@ class Diagnosis:
         noise_scale: standard deviation of the noise on observations, of all coordinates or of each,
             ``[*F]``.
         noise_action: root mean square change of the action by this noise.
-        noise_share: mean squared change of the action per step that this noise causes, divided by
-            the whole mean squared change.
+        noise_share: mean squared change of the actions' relative positions per step that this noise
+            causes, divided by the whole mean squared change.
         noise_inputs: share of each coordinate in this squared change, if only it has noise,
             ``[F]``; the shares have the sum 1; empty for more than 512 coordinates.
         spread: standard deviation of the policy's samples, clipped into their bounds, relative to
@@ -264,13 +264,20 @@ def diagnose(
     near = Neighborhood() if neighborhood is None else neighborhood
     steepness = _steepness(first, key, env.action_key, act, value, near, num_neighbors, generator)
     states, successors = first[key], first["next", key]
+    width = (high - low).clamp_min(torch.finfo(low.dtype).eps)
+
+    def relative(observation: Tensor) -> Tensor:  # Actions may have different units.
+        return act(observation) / width
+
+    before = generator.get_state()
     sensitivity = noise_sensitivity(act, states, noise_scale, generator=generator).item()
-    change = actions.diff(dim=0).square().sum(-1).mean().item()
+    generator.set_state(before)
+    passed_on = noise_sensitivity(relative, states, noise_scale, generator=generator).item()
+    change = (actions.diff(dim=0) / width).square().sum(-1).mean().item()
     held, noise_inputs = UNKNOWN, UNKNOWN
     if coordinates <= MOST_INPUTS:
-        width = (high - low).clamp_min(torch.finfo(low.dtype).eps)
-        held = change_with_held_input(lambda seen: act(seen) / width, states, successors).flatten()
-        noise_inputs = _noise_by_input(act, states, noise_scale, generator)
+        held = change_with_held_input(relative, states, successors).flatten()
+        noise_inputs = _noise_by_input(relative, states, noise_scale, generator)
     return Diagnosis(
         name=name,
         measures=_means(played, env),
@@ -287,7 +294,7 @@ def diagnose(
         noise_scale=noise_scale,
         noise_action=math.sqrt(2 * sensitivity),
         # Two independent draws differ by twice the variance of one.
-        noise_share=4 * sensitivity / change if change else 0.0,
+        noise_share=4 * passed_on / change if change else 0.0,
         noise_inputs=noise_inputs,
         spread=_spread(policy, states, key, env, low, high, seed),
         rate=control_rate(env) if isinstance(untransformed(env), GymWrapper) else None,
