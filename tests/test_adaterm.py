@@ -236,6 +236,14 @@ def test_dtypes_and_devices_may_be_mixed_in_one_group():
         assert p.dtype == mixed[i].dtype
 
 
+def test_settings_of_other_optimizers_are_refused():
+    """A group that should decay would not; one without decay is as meant."""
+    p = nn.Parameter(torch.ones(2))
+    with pytest.raises(TypeError, match=r"'nu_min'\], got \['weight_decay'\], which would have no"):
+        AdaTerm([{"params": [p], "weight_decay": 0.5}])
+    AdaTerm([{"params": [p], "weight_decay": 0.0, "name": "actor"}])
+
+
 def test_parameters_without_gradient_keep_value_and_state():
     """They are skipped, and go on from where they were when a gradient comes."""
     a, b = nn.Parameter(torch.ones(2)), nn.Parameter(torch.ones(2))

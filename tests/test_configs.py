@@ -445,6 +445,15 @@ def test_smooth_reads_methods_and_nested_keys():
     assert loss.l2c2_moved_keys == ["observation"]
 
 
+def test_a_neighborhood_is_shared_with_a_smoothed_loss():
+    """As a node, by its name: OmegaConf makes a configuration of what it instantiated."""
+    near = ["+neighborhood@near=l2c2", "near.lambda_min=10", "near.lambda_max=1000"]
+    near += ["near.neighbors=line", "+loss.overrides.neighborhood=${near}"]
+    loss = instantiate(with_networks(composed("+loss=smooth", *SAC, *near)).loss)
+    expected = Neighborhood(lambda_min=10.0, lambda_max=1000.0, neighbors="line")
+    assert loss.l2c2_neighborhood == expected
+
+
 @pytest.mark.parametrize(
     "overrides,message",
     [

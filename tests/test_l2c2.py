@@ -279,6 +279,24 @@ class TestThePenalty:
             warnings.simplefilter("error")
             other.policy_regularizer(scaled)
 
+    def test_a_maximum_over_fewer_neighbors_is_told(self):
+        """It would be smaller; a mean over fewer neighbors is as large."""
+        torch.manual_seed(0)
+        batch = NeighborTransform(NEAR)(transitions(6))
+        base = DDPGLoss(deterministic_actor(), qvalue())
+        largest = L2C2Loss(base, NEAR, num_samples=8, over_neighbors="max")
+        with pytest.warns(
+            UserWarning, match=r"num_samples=1, and L2C2.* largest penalty of 8: append"
+        ):
+            largest.policy_regularizer(batch)
+        mean = L2C2Loss(base, NEAR, num_samples=8)
+        again = L2C2Loss(base, NEAR, num_samples=8, over_neighbors="max")
+        own = again.neighbor_transform()(batch.exclude("neighbor"))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            mean.policy_regularizer(batch)
+            again.policy_regularizer(own)
+
     @pytest.mark.parametrize(
         "other", [Neighborhood(), Neighborhood(lambda_min=0.2, neighbors="line")]
     )

@@ -146,6 +146,28 @@ class Misspelled(Stillness):
         return terms if self.also else terms.exclude("loss_stillness")
 
 
+class Undeclared(Stillness):
+    """Declares no networks."""
+
+    def __init__(self, base_loss: LossModule) -> None:
+        self.register_coefficient("stillness_coeff", 1.0)
+        self.declare_terms(policy=["loss_stillness"])
+
+
+class Silent(Stillness):
+    """Forgets to return its terms."""
+
+    def policy_regularizer(self, tensordict):
+        super().policy_regularizer(tensordict)
+
+
+class Flat(Stillness):
+    """Gives states without their first dimension."""
+
+    def policy_regularizer(self, tensordict):
+        self.policies_at(tensordict, tensordict.select("observation"))
+
+
 class Doubled(Stillness):
     """A regularizer with a forward of its own."""
 
@@ -335,6 +357,20 @@ class TestTheClass:
         message = r"declared terms \['loss_l2c2_actor', .*, 'loss_stillness'\] of .*stilness'\]\."
         with pytest.raises(ValueError, match=message):
             loss(with_neighbors(transitions(4)))
+
+    @pytest.mark.parametrize(
+        ("regularizer", "error", "message"),
+        [
+            (Undeclared, TypeError, r"call self.declare_networks\(\['actor_network'\]\) in"),
+            (Silent, TypeError, "policy_regularizer of Silent.* must return .*, got None"),
+            (Flat, ValueError, r"the shape \[K, \*B\] with the batch's \[4\], got \[4\]: states"),
+        ],
+    )
+    @pytest.mark.parametrize("method", ["forward", "loss_actor"])
+    def test_beginners_mistakes_are_told(self, regularizer, error, message, method):
+        loss = regularizer(ddpg()).fold()
+        with pytest.raises(error, match=message):
+            getattr(loss, method)(transitions(4))
 
     def test_methods_are_not_hidden_by_chance(self):
         """A loss whose own method has the name of one of ours would break: it is refused."""
@@ -628,6 +664,19 @@ class TestWhatIsRefused:
         with_neighbors(batch, in_keys=["other"])
         with pytest.raises(KeyError, match=r"inputs of actor_network.*'other'.*in_keys"):
             loss(batch)
+
+    @pytest.mark.parametrize("call", ["forward", "loss_actor", "policy_regularizer"])
+    def test_a_batch_without_a_batch_size(self, call):
+        """It would be one state; a single transition is one."""
+        batch = transitions(4)
+        batch.batch_size = []
+        loss = L2C2Loss(ddpg(), NEAR).fold()
+        message = r"size \[\], and \('next', 'reward'\) has the shape \[4, 1\]: .* batch_size=\[4\]"
+        with pytest.raises(ValueError, match=message):
+            getattr(loss, call)(batch)
+        with torch.no_grad():
+            loss(batch)
+        assert loss(transitions(4)[0])["penalty_l2c2_actor"] > 0
 
     def test_neighbors_without_distances(self):
         """An entry that NeighborTransform did not write."""

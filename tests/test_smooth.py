@@ -25,6 +25,7 @@ from losses import (
     transitions,
 )
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.modules import Actor, ValueOperator
 from torchrl.objectives import (
@@ -1052,6 +1053,27 @@ class TestRelativeParts:
         plain, relative = (seeded(loss, batch.copy(), seed=2) for loss in (plain, relative))
         expected = 100 * plain["loss_cats"]
         torch.testing.assert_close(relative["loss_cats"], expected, rtol=1e-3, atol=0.0)
+
+    @pytest.mark.parametrize("agents", [1, 4])
+    def test_several_agents_are_no_ensemble(self, agents):
+        """A sum over agents has as many penalties as action values: their ratio is a mean's."""
+        keys = [("agents", name) for name in ("observation", "action", "state_action_value")]
+        batch, ended = seeded(transitions, 12, seed=1), torch.zeros(12, agents, 1, dtype=torch.bool)
+        there = {"observation": torch.randn(12, agents, 3), "reward": torch.zeros(12, agents, 1)}
+        there |= {"done": ended, "terminated": ended}
+        here = {"observation": torch.randn(12, agents, 3), "action": torch.randn(12, agents, 1)}
+        batch = TensorDict({"agents": here, "next": {"agents": there}}, [12])
+        found = []
+        for reduction in ("mean", "sum"):
+            torch.manual_seed(0)
+            actor = TensorDictModule(nn.Linear(3, 1), keys[:1], keys[1:2])
+            value = ValueOperator(nn.Bilinear(3, 1, 1), in_keys=keys[:2], out_keys=keys[2:])
+            base = DDPGLoss(actor, value, reduction=reduction)
+            names = {name: ("agents", name) for name in ("reward", "done", "terminated")}
+            base.set_keys(state_action_value=keys[2], **names)
+            terms = CATSLoss(base, 0.04).relative()(batch.copy())
+            found.append(terms["loss_cats"] / terms["loss_actor"])
+        torch.testing.assert_close(*found)
 
     @pytest.mark.parametrize("first", [True, False])
     def test_a_subclass_with_a_term_of_its_own(self, first):

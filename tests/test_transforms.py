@@ -200,6 +200,16 @@ def test_reproducible_with_a_generator(prefetch):
     assert not (first[0] == first[1]).any()
 
 
+def test_what_cannot_move_is_named():
+    """A loss that reads a mask makes a transform that would move it."""
+    mask = torch.ones(4, 2, dtype=torch.bool)
+    near = {"observation": torch.zeros(4, 3), "mask": mask}
+    batch = TensorDict({**near, "next": dict(near)}, [4])
+    transform = NeighborTransform(NEAR, in_keys=["observation", "mask"])
+    with pytest.raises(TypeError, match=r"'mask' is torch.bool: name .* in in_keys \(or moved_key"):
+        transform(batch)
+
+
 @pytest.mark.parametrize("form", ["state_dict", "files"])
 def test_generator_is_saved_with_the_buffer(form, tmp_path):
     """A restored buffer goes on with the neighbors that would have come next."""

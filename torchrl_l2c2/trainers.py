@@ -12,7 +12,7 @@ from typing import Any, Literal, Optional, get_args, get_origin, get_type_hints
 
 import torch
 from hydra.core.config_store import ConfigStore
-from omegaconf import MISSING, ListConfig
+from omegaconf import MISSING, ListConfig, OmegaConf
 from torchrl.objectives import LossModule
 from torchrl.trainers.algorithms.configs.common import (
     ConfigBase,
@@ -42,6 +42,10 @@ def _make_smooth_loss(
     normalized = {key: _normalize_hydra_key(value) for key, value in overrides.items()}
     if "moved_keys" in normalized:
         normalized["moved_keys"] = _listed(overrides["moved_keys"])
+    if "neighborhood" in normalized and OmegaConf.is_config(overrides):
+        # OmegaConf keeps dataclasses as configurations.
+        objects: Any = OmegaConf.to_object(overrides)
+        normalized["neighborhood"] = objects["neighborhood"]
     loss = base_loss(**networks) if networks else base_loss
     return smooth(loss, method, strength, fold, **normalized)
 

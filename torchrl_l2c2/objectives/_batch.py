@@ -64,6 +64,28 @@ def check_evaluates_states(loss: LossModule) -> None:
         )
 
 
+def check_batch_size(tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> None:
+    """Refuses a batch without a batch size, which would be taken for a single state.
+
+    Args:
+        tensordict (TensorDictBase): the batch, ``[*B]``.
+        keys: keys of rewards and ends, ``[*B, 1]``. Nested keys are left out: they may have a
+            dimension of agents.
+
+    Raises:
+        ValueError: the batch size is ``[]``, and such an entry has further dimensions.
+    """
+    if tensordict.batch_dims:
+        return
+    for key in keys:
+        entry = tensordict.get(next_key(key), None) if isinstance(key, str) else None
+        if entry is not None and entry.ndim > 1:
+            raise ValueError(
+                f"the batch has the batch size [], and {next_key(key)!r} has the shape "
+                f"{list(entry.shape)}: give TensorDict(..., batch_size={list(entry.shape[:-1])})."
+            )
+
+
 def check_reads_next(loss: LossModule) -> None:
     """Refuses losses that are not trained on states with a successor.
 

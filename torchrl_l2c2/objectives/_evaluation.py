@@ -134,6 +134,7 @@ class EvaluatedNetworks:
         With ``rows``, indices ``[M]`` in the flattened batch, it evaluates only these states and
         the other states, ``[K, M]``. The same holds for :meth:`values_at`.
         """
+        self._check_declared(POLICY_NETWORK)
         actor, spec = getattr(loss, POLICY_NETWORK), self.specs[POLICY_NETWORK]
         keys = actor.dist_params_keys if spec.stochastic else [spec.output]
         here, there = self._outputs_at(loss, POLICY_NETWORK, tensordict, states, keys, rows)
@@ -148,6 +149,7 @@ class EvaluatedNetworks:
         network: str = POLICY_NETWORK,
     ) -> Policy:
         """Evaluates the policy, or a copy, at other states only, ``[K, *B]``, without the cache."""
+        self._check_declared(POLICY_NETWORK)
         rows = self._rows(POLICY_NETWORK, tensordict, states, with_batch=False)
         if network == POLICY_NETWORK:
             self._check_repeatable(loss, network, rows)
@@ -164,6 +166,7 @@ class EvaluatedNetworks:
         rows: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Values at the batch's states, ``[1, *B, ...]``, and at others, ``[K, *B, ...]``."""
+        self._check_declared(network)
         key = self.specs[network].output
         if key is None:
             # Not earlier: set_keys may be called after the wrapping.
@@ -214,6 +217,12 @@ class EvaluatedNetworks:
             self.forward_pass.at_others[network] = states, there
         self.forward_pass.at_batch[network] = here
         return here
+
+    def _check_declared(self, network: str) -> None:
+        if network not in self.specs:
+            raise TypeError(
+                f"{network} is not declared: call self.declare_networks([{network!r}]) in __init__."
+            )
 
     def _policy(self, loss: LossModule, outputs: TensorDictBase) -> Policy:
         spec = self.specs[POLICY_NETWORK]
@@ -299,6 +308,11 @@ class EvaluatedNetworks:
     ) -> TensorDictBase:
         """A network's inputs at the batch's and the other states, ``[(1 + K) * B0, ...]``."""
         spec, batch = self.specs[network], tensordict.batch_size
+        if states.batch_size[1:] != batch:
+            raise ValueError(
+                f"states must have the shape [K, *B] with the batch's {list(batch)}, got "
+                f"{list(states.batch_size)}: states[None] has one state for each row."
+            )
         if lacking := [key for key in spec.recurrent if tensordict.get(key, None) is None]:
             raise KeyError(
                 f"{network} is recurrent, and the batch has no {lacking}: keep the recurrent state "

@@ -141,8 +141,7 @@ def make_part(
                 f"{method.__name__} has no action values to which the penalty is relative: call "
                 "loss(batch) instead, or make the loss with relative=False and a gain."
             )
-        regularize = self.policy_regularizer if kind == "policy" else self.value_regularizer
-        added = regularize(tensordict)
+        added = self._terms_of(kind, tensordict)
         if self._relative and kind == "policy":
             self._make_relative(added, size, value, tensordict)
         for key, term in list(added.items()):

@@ -179,8 +179,8 @@ class TermWatch:
     ) -> None:
         """Warns of neighbors that were drawn before a transform changed the observations.
 
-        On a line, also of neighbors of another neighborhood. Observations with neighbors are
-        floating point.
+        Also of another number of them for ``over_neighbors="max"``, and on a line of neighbors of
+        another neighborhood. Observations with neighbors are floating point.
         """
         if (
             is_compiling()
@@ -189,6 +189,15 @@ class TermWatch:
         ):
             return
         self._warned.add("neighbors")
+        distance = neighbors.get("distance", None)
+        drawn, wanted = distance.shape[-1] if distance is not None else 0, loss.l2c2_num_samples
+        if drawn != wanted and loss.l2c2_over_neighbors == "max":
+            warnings.warn(
+                f"the neighbors in the batch were drawn with num_samples={drawn}, and "
+                f"{type(loss).__name__} takes the largest penalty of {wanted}: append the "
+                "transform that loss.neighbor_transform() returns.",
+                stacklevel=5,
+            )
         for key, there in neighbors.items(include_nested=True, leaves_only=True):
             here, successor = batch.get(key, None), batch.get(next_key(key), None)
             if here is None or successor is None or here.shape != successor.shape:
@@ -205,7 +214,6 @@ class TermWatch:
                     stacklevel=5,
                 )
                 return
-            distance = neighbors.get("distance", None)
             if distance is None or not near.on_line:
                 continue
             if _is_elsewhere(here, successor, there, distance.movedim(-1, 0), near):

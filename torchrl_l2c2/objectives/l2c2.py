@@ -343,7 +343,8 @@ class L2C2Loss(RegularizedLoss):
                 :class:`~torchrl_l2c2.NeighborTransform`. Defaults to torch's global generator.
             in_keys (str or sequence of NestedKey, optional): observations to move. Defaults to the
                 loss's ``moved_keys``, or else every observation that the regularized networks read.
-                Pass it if one of these, such as a goal, has no successor in the batch.
+                Pass it if one of these, such as a goal, has no successor in the batch, or is no
+                floating-point number, such as a mask.
 
         Returns:
             NeighborTransform: the transform.

@@ -40,6 +40,10 @@ class LCPLoss(RegularizedLoss):
     It does not depend on the width of the policy, and works for deterministic policies. One random
     sign vector :math:`v` for each state gives an unbiased estimate.
 
+    With several agents whose policies read their own states, the terms are of each agent. If each
+    policy reads the states of all agents, ``"log_prob"`` has the gradient of the summed logarithms,
+    divided by the number of agents; ``"mean"`` is of each agent's mean.
+
     .. note:: The loss cannot be passed to ``torch.compile``, because it differentiates twice. (The
         experiment compiles its updates in another way, and supports it.) A narrow policy has a
         steep likelihood: as the policy's scale falls, the same slope of its mean costs more.

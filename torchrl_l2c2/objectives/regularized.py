@@ -21,6 +21,7 @@ from torchrl.objectives import DiscreteIQLLoss, IQLLoss, LossModule, REDQLoss
 from torchrl_l2c2._checks import as_number, check_of_each, check_real
 from torchrl_l2c2.objectives._batch import (
     as_masked,
+    check_batch_size,
     check_evaluates_states,
     check_reads_next,
     draw_rows,
@@ -213,7 +214,8 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             train the policy are left out, too.
 
         Raises:
-            ValueError: the regularizer returns other ``loss_*`` keys than it declared.
+            ValueError: the regularizer returns other ``loss_*`` keys than it declared, or the batch
+                has no batch size.
             RuntimeError: the penalty is relative, and the loss has no term that trains the policy.
         """
         if self._folded and not torch.is_grad_enabled():
@@ -230,11 +232,11 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             found = find_policy_term(terms.keys())
             # Updates of the policy may be delayed: its term is missing in some calls.
             delayed = found is None and find_policy_term(self.out_keys_source) is not None
-            added = TensorDict() if delayed else self.policy_regularizer(given)
+            added = TensorDict() if delayed else self._terms_of("policy", given)
             if self._relative and not delayed:
                 own = None if found is None else terms.get(found)
                 self._make_relative(added, size, own, given)
-            added.update(self.value_regularizer(given))
+            added.update(self._terms_of("value", given))
         finally:
             self._evaluation.end_forward_pass(outer)
         declared = self.added_terms - self._policy_side if delayed else self.added_terms
@@ -262,6 +264,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         Warns:
             UserWarning: once, in a direct call, if the penalty is relative.
         """
+        self._check_batch_size(tensordict)
         self._watch.see_regularizer(self, of_policy=True)
         return TensorDict()
 
@@ -271,8 +274,23 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         Args:
             tensordict (TensorDictBase): the batch that ``forward`` or ``value_loss`` takes.
         """
+        self._check_batch_size(tensordict)
         self._watch.see_regularizer(self)
         return TensorDict()
+
+    def _terms_of(self, kind: str, tensordict: TensorDictBase) -> TensorDictBase:
+        """The result of :meth:`policy_regularizer` or :meth:`value_regularizer`.
+
+        Raises:
+            TypeError: it is no TensorDict.
+        """
+        terms = getattr(self, f"{kind}_regularizer")(tensordict)
+        if not isinstance(terms, TensorDictBase):
+            raise TypeError(
+                f"{kind}_regularizer of {type(self).__name__} must return a TensorDict with its "
+                f"terms, got {terms!r}."
+            )
+        return terms
 
     # Folding and the gain.
 
@@ -525,6 +543,10 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
                 f"got {sorted(returned)}. Give them the same names in declare_terms, and in "
                 "policy_regularizer or value_regularizer."
             )
+
+    def _check_batch_size(self, tensordict: TensorDictBase) -> None:
+        keys = [getattr(self.tensor_keys, name, name) for name in ("reward", "done")]
+        check_batch_size(tensordict, keys)
 
     def _folded_value(self, key: str, term: Tensor) -> Tensor:
         """A term as it is added to another: an auxiliary term adds its gradient but no value."""
@@ -1038,8 +1060,11 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         if (sizes := self._evaluation.sizes) is not None:
             mean = {**kwargs, "reduction": "mean"}
             size = super()._reduce_loss(loss.detach().abs(), tensordict, **mean)
-            if self._term_reduction == "sum" and tensordict is not None:  # over an ensemble, too
-                size = size * (loss.numel() / tensordict.numel())
+            of_ensemble = tensordict is not None and (
+                isinstance(self, REDQLoss) or loss.shape[: tensordict.ndim] != tensordict.shape
+            )
+            if self._term_reduction == "sum" and of_ensemble:  # The sum is over its networks, too.
+                size = size * len(loss)
             sizes.append(size)
         return super()._reduce_loss(loss, tensordict, **kwargs)
 

@@ -15,6 +15,8 @@ from torchrl_l2c2._checks import check_real
 TINY = torch.finfo(torch.float32).tiny
 SUPPORTED_DTYPES = (torch.float32, torch.float64)
 SETTINGS = {"lr", "beta", "eps", "nu_min"}
+OF_OTHERS = {"amsgrad", "betas", "maximize", "momentum", "nesterov", "weight_decay"}
+"""Settings of torch's optimizers that AdaTerm does not have."""
 
 
 class AdaTerm(Optimizer):
@@ -116,9 +118,15 @@ class AdaTerm(Optimizer):
                 ``nu_min``.
 
         Raises:
-            TypeError: a parameter is neither float32 nor float64, or a setting is no real number.
+            TypeError: a parameter is neither float32 nor float64, a setting is no real number, or
+                it belongs to another optimizer, such as ``weight_decay``.
             ValueError: a setting outside its range.
         """
+        if foreign := sorted(key for key in OF_OTHERS if param_group.get(key)):
+            raise TypeError(
+                f"AdaTerm: the settings of a group are {sorted(SETTINGS)}, got {foreign}, which "
+                "would have no effect: leave it out."
+            )
         _check_settings({**self.defaults, **param_group})
         super().add_param_group(param_group)
         group = self.param_groups[-1]

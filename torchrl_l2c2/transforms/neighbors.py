@@ -120,6 +120,12 @@ def _transitions(tensordict: TensorDictBase, in_keys: Sequence[NestedKey]) -> Tr
                     f"a neighborhood needs {name!r}, which the tensordict lacks; it has "
                     f"{listed(tensordict)}. Store it, or choose other in_keys (or moved_keys)."
                 )
+            if not entry.is_floating_point():
+                raise TypeError(
+                    f"only floating-point numbers have neighbors, and {name!r} is {entry.dtype}: "
+                    "name the observations to move in in_keys (or moved_keys), such as "
+                    "loss.neighbor_transform(in_keys=['observation'])."
+                )
     return transitions
 
 
