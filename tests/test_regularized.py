@@ -516,6 +516,16 @@ class TestAttributes:
             loss.cats_lambda_temporal = 5.0
             loss.anything = 5.0
 
+    def test_a_setting_of_another_method_is_told(self):
+        loss, other = CATSLoss(ddpg()), CATSLoss(ddpg())
+        with pytest.warns(
+            UserWarning, match="'l2c2_coeff' has no effect .* it is a setting of L2C2Loss"
+        ):
+            loss.l2c2_coeff = 0.0
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            other.cats_lambda_temporal = 0.0
+
     def test_load_hooks_outlive_the_wrapped_loss(self):
         """Hooks of the plain loss that name their module work when only the new one is left."""
         loss = L2C2Loss(IQLLoss(gaussian_actor(), qvalue(), critic(), num_qvalue_nets=1))

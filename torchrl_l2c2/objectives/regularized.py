@@ -49,7 +49,7 @@ from torchrl_l2c2.objectives._networks import (
 )
 from torchrl_l2c2.objectives._specialize import SpecializedLoss, find_selections
 from torchrl_l2c2.objectives._watch import TermWatch
-from torchrl_l2c2.presets import NEIGHBORHOOD_FIELDS
+from torchrl_l2c2.presets import METHODS, NEIGHBORHOOD_FIELDS
 
 Made = TypeVar("Made")
 
@@ -575,7 +575,10 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         self._coefficients[name].fill_(number)
 
     def _warn_of_typo(self, name: str, value: Any) -> None:
-        """Warns of a new attribute with the name of a setting, or nearly the name of a gain."""
+        """Warns of a new attribute with the name of a setting, or nearly the name of a gain.
+
+        Also of a setting of another method.
+        """
         if name.startswith("_") or hasattr(self, name):
             return
         setting = name.removeprefix("l2c2_")  # Other settings with this prefix are attributes.
@@ -599,6 +602,17 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
                 f"effect. Make the loss with {setting}={value!r}.",
                 stacklevel=3,
             )
+        elif absent := self._absent_method(name):
+            warnings.warn(
+                f"{name!r} has no effect on a {type(self).__name__}: it is a setting of {absent}.",
+                stacklevel=3,
+            )
+
+    def _absent_method(self, name: str) -> str | None:
+        """The class of this package that an attribute's prefix names, if the loss is none."""
+        parts = {part.__name__ for part in type(self).__mro__}
+        named = (kind for method, kind in METHODS.items() if name.startswith(f"{method}_"))
+        return next((kind for kind in named if kind not in parts), None)
 
     def _made_with(self) -> set[str]:
         """Names of the settings with which this package's regularizers are made."""
