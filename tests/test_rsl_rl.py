@@ -830,6 +830,28 @@ def test_settings_beside_the_algorithm_are_refused(monkeypatch: pytest.MonkeyPat
         OnPolicyRunner(NoisyPoints(2), config)
 
 
+def test_a_teacher_that_was_trained_with_it_is_distilled(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """By rsl_rl's own Distillation, which loads the checkpoint."""
+    monkeypatch.syspath_prepend(EXAMPLE.parent)
+    from rsl_rl.runners import DistillationRunner, OnPolicyRunner
+    from rsl_rl_points import NoisyPoints
+
+    runner = OnPolicyRunner(NoisyPoints(2), runner_config())
+    torch.save(runner.alg.save() | {"iter": 0, "infos": None}, path := tmp_path / "model.pt")
+    config = runner_config()
+    network = config.pop("actor")
+    del config["critic"]
+    config |= {"algorithm": {"class_name": "Distillation"}, "student": network, "teacher": network}
+    config["obs_groups"] = {"student": ["policy"], "teacher": ["policy"]}
+    distilled = DistillationRunner(NoisyPoints(2), copy.deepcopy(config))
+    distilled.load(str(path))
+    trained, loaded = (part.state_dict() for part in (runner.alg.actor, distilled.alg.teacher))
+    assert trained.keys() == loaded.keys()
+    assert all(torch.equal(weight, loaded[name]) for name, weight in trained.items())
+
+
 def test_what_neighbors_cannot_move_in_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """Before rsl_rl's message, or one with names that its users do not write."""
     monkeypatch.syspath_prepend(EXAMPLE.parent)
