@@ -118,6 +118,9 @@ class TestByHand:
         again.load_state_dict(gain.state_dict())
         assert again.value == gain.value != 1.0
         assert again.step(0.9) == gain.step(0.9)
+        with pytest.raises(ValueError, match=r"value must be in \[0.001, 1000\], got 1000000000"):
+            again.load_state_dict({"value": 1e9})
+        assert again.value == gain.value
 
     @pytest.mark.parametrize("measured", ["a", None, True])
     def test_what_is_measured_is_a_number(self, measured):

@@ -130,6 +130,41 @@ def test_local_lipschitz_refuses_shapes_that_do_not_fit():
         local_lipschitz(state, neighbor, output, neighbor_output, reduction="sum")
 
 
+def test_gradients_are_finite_where_a_neighbor_or_a_step_does_not_count():
+    """A neighbor that is its state, as beyond ``max_step``, and padding that is NaN."""
+    weight, state = torch.ones(2, 1, requires_grad=True), torch.zeros(1, 2)
+    neighbor = torch.tensor([[[0.0, 0.0], [1.0, 1.0]]])
+    local_lipschitz(state, neighbor, state @ weight, neighbor @ weight).sum().backward()
+    assert weight.grad.tolist() == [[1.0], [1.0]]
+    actions = torch.tensor([[[0.0], [2.0], [5.0], [torch.nan]]], requires_grad=True)
+    action_variation(actions, torch.tensor([[True, True, True, False]])).sum().backward()
+    assert actions.grad.flatten().tolist() == [-0.5, 0.0, 0.5, 0.0]
+
+
+def test_policies_in_half_precision_are_measured_in_single_precision():
+    """The squares of small changes would be 0."""
+    torch.manual_seed(0)
+    seen = torch.randn(1000, 3).half()
+    later = seen + 0.1 * torch.randn_like(seen)
+
+    def policy(observations):
+        return observations @ torch.full((3, 1), 1e-3, dtype=observations.dtype)
+
+    expected = 0.5 * 3 * (1e-3 * 0.05) ** 2
+    assert noise_sensitivity(policy, seen, 0.05).item() == pytest.approx(expected, rel=0.2)
+    held = change_with_held_input(policy, seen, later)
+    assert held.tolist() == pytest.approx([(2 / 3) ** 0.5] * 3, rel=0.1)
+
+
+def test_bounds_of_another_precision_are_reached():
+    double = torch.tensor([[0.1], [-0.1]], dtype=torch.float64)
+    assert saturation(double, -0.1, 0.1, margin=0.0) == 1.0
+    wide = torch.tensor([0.7], dtype=torch.float64)
+    assert saturation(torch.tensor([[0.7], [-0.7]]), -wide, wide, margin=0.0) == 1.0
+    with pytest.raises(ValueError, match="low must be at most high, got nan"):
+        saturation(double, math.nan, 1.0)
+
+
 def test_differences_by_hand():
     """Of 0, 1, 4, 10: changes 1, 3, 6; second ones 2, 3; a third one of 1."""
     actions = torch.tensor([[0.0], [1.0], [4.0], [10.0]])

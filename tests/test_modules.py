@@ -188,6 +188,13 @@ def test_the_scale_mapping_can_be_chosen():
         torch.testing.assert_close(td["scale"], torch.full((2, 2), expected))
 
 
+@pytest.mark.parametrize("number", ["0", "-1", "0.005", "nan", "inf"])
+def test_an_initial_scale_below_the_smallest_is_refused(number):
+    """It would stay at 0.01 with hardly a gradient, or be NaN."""
+    with pytest.raises(ValueError, match=r"any number above 0\.01 as the initial scale, got"):
+        make_actor(3, 2, scale_mapping=f"biased_softplus_{number}")
+
+
 def test_several_observations_are_concatenated():
     """Also nested ones, in the order of the keys."""
     torch.manual_seed(0)
@@ -279,7 +286,7 @@ def test_compiled_they_give_the_same_numbers():
         (
             lambda: make_actor(3, 1, scale_mapping="square"),
             ValueError,
-            "scale_mapping='square' is unknown",
+            "as the initial scale, got 'square'",
         ),
         (lambda: make_critic(2.5), TypeError, "observation_size must be "),
     ],

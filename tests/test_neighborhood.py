@@ -143,10 +143,22 @@ def test_shapes(shape, batch_dims, neighbor_shape, distance_shape):
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
 def test_dtype_is_that_of_the_state(dtype):
-    """Neighbors and distances come in the state's dtype, also where the successor's is another."""
+    """Also where the successor's is another. Distances have single precision at least."""
     neighbor, distance = Neighborhood().sample(torch.zeros(4, 2, dtype=dtype), torch.ones(4, 2))
     assert neighbor.dtype == dtype
-    assert distance.dtype == dtype
+    assert distance.dtype == torch.promote_types(dtype, torch.float32)
+
+
+def test_half_precision_has_finite_gains_and_right_steps():
+    """At the state itself, where the gain is the largest; a step's square may overflow."""
+    near = Neighborhood(lambda_min=1.0, lambda_max=1e5, neighbors="line", max_step=1000.0)
+    state, uniform = torch.zeros(2, 2).half(), torch.full((2, 1), 0.5).half()
+    far = torch.tensor([[300.0, 300.0], [900.0, 900.0]]).half()
+    neighbor, distance = near.place(state, far, uniform)
+    assert torch.equal(neighbor[:, 0], state)
+    torch.testing.assert_close(near.gain(distance), torch.tensor([[1e5], [0.0]]))
+    near = Neighborhood(max_step=5e-5)
+    assert near.sample(state, state + 1e-4)[1].isinf().all()  # a step of 1.4e-4
 
 
 def test_generator_decides_the_draw():

@@ -190,6 +190,8 @@ class TestKLDivergence:
     def test_of_two_normals(self):
         """ln(t/s) + (s^2 + m^2) / (2 t^2) - 1/2, from the one at s to the one at s~."""
         p, q = d.Normal(torch.tensor([0.0]), 1.0), d.Normal(torch.tensor([3.0]), 2.0)
+        near = kl_divergence(d.Normal(torch.tensor(1e-4), 1.0), d.Normal(torch.tensor(0.0), 1.0))
+        assert near.item() == pytest.approx(5e-9)
         expected = math.log(2.0) + (1 + 9) / 8 - 0.5
         assert kl_divergence(p, q).item() == pytest.approx(expected)
         backward = math.log(0.5) + (4 + 9) / 2 - 0.5
@@ -345,3 +347,5 @@ class TestChoice:
         distance = choose_policy_distance(lambda p, q: (p.mean - q.mean).abs())
         with pytest.raises(ValueError, match=r"shape \(4,\), got \(4, 2\)"):
             distance(p, p)
+        with pytest.raises(TypeError, match=r"must return a tensor, got 1.0\."):
+            choose_policy_distance(lambda p, q: 1.0)(p, p)

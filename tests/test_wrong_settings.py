@@ -152,6 +152,7 @@ def test_a_folder_that_hydra_cannot_make_ends_in_a_line(tmp_path):
             "sigma is not a setting; did you mean regularizer.sigma? --help lists every setting.",
         ),
         ("outputs=~/runs", "Shells do not expand ~ here: write $HOME."),
+        ("+seed=1", "Or add a second + to add or override 'seed': '++seed=1'"),
     ],
 )
 def test_what_cannot_be_composed_ends_with_what_was_meant(settings_of, line, meant):

@@ -25,7 +25,7 @@ def kl_divergence(
     .. math::
         D(p \Vert q) = \int p(a) \ln\frac{p(a)}{q(a)}\, da
 
-    It lies in ``[0, inf)`` and is not symmetric. Squashing both policies in the same way does not
+    It lies in ``[0, inf]`` and is not symmetric. Squashing both policies in the same way does not
     change it. Closed forms come from torch; the heads of composite policies add up. A pair without
     a closed form is estimated from actions of :math:`p`:
 
@@ -33,7 +33,9 @@ def kl_divergence(
         \mathbb E_{a \sim p}\left[r - 1 - \ln r\right], \qquad r = q(a) / p(a),
 
     No term is negative (Schulman, "Approximating KL divergence", 2020: k3). The estimate and its
-    gradient into both policies are unbiased.
+    gradient into both policies are unbiased, if each policy has all actions of the other: it is
+    too small for bounds that differ. Between categorical policies that are nearly the same, the
+    closed form may be negative by rounding.
 
     Args:
         p: one policy, batch shape ``[*B]``.
@@ -88,7 +90,7 @@ def kl_divergence(
 def _normal_kl(p: Normal, q: Normal) -> Tensor:
     """The closed form that torch has, too; torch's look-up of it does not compile."""
     ratio, apart = (p.scale / q.scale).square(), ((p.loc - q.loc) / q.scale).square()
-    return 0.5 * (ratio + apart - 1 - ratio.log())
+    return 0.5 * (apart + (ratio - 1 - ratio.log()))
 
 
 def _categorical_kl(

@@ -98,7 +98,8 @@ class TargetGain:
             raise ValueError(
                 f"Expected the state of a gain, with {list(self.state_dict())}, got {list(state)}."
             )
-        check_real("value", state["value"], above=0)
+        lowest, highest = self._first / self.limit, self._first * self.limit
+        check_real("value", state["value"], at_least=lowest, at_most=highest)
         self.value = state["value"]
 
 

@@ -181,10 +181,14 @@ def make_actor(
         )
     try:
         extractor = NormalParamExtractor(scale_mapping)
+        *_, bias = scale_mapping.rpartition("biased_softplus_")
+        if bias != scale_mapping:  # the initial scale, of which 0.01 is the smallest
+            check_real("the number in scale_mapping", float(bias), above=0.01)
     except (NotImplementedError, ValueError) as error:
         raise ValueError(
-            f"make_actor: scale_mapping={scale_mapping!r} is unknown to NormalParamExtractor: it "
-            "has 'exp', 'expln', 'softplus', 'relu' and 'biased_softplus_1.0', of any number."
+            f"make_actor: scale_mapping must be 'exp', 'expln', 'softplus', 'relu' or "
+            "'biased_softplus_1.0', with any number above 0.01 as the initial scale, got "
+            f"{scale_mapping!r}."
         ) from error
     network = NormalNetwork(_body(observation_size, hidden, 2 * size, squish_b), extractor)
     return ProbabilisticActor(

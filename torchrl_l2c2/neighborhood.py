@@ -164,8 +164,8 @@ class Neighborhood:
 
         Returns:
             The neighbors, shape ``[*B, K, *F]`` in the dtype of ``state``, and their distances,
-            shape ``[*B, K]``; infinite for steps longer than ``max_step`` and for successors that
-            are not finite.
+            shape ``[*B, K]``, in single precision at least. Distances are infinite for steps longer
+            than ``max_step`` and for successors that are not finite.
 
         Raises:
             TypeError: if the states are not floating point, or ``num_samples`` is no integer.
@@ -246,6 +246,9 @@ class Neighborhood:
                 f"{tuple(state.shape)} with {batch_dims} batch dimensions, got "
                 f"{tuple(uniform.shape)}."
             )
+        dtype = state.dtype
+        if state.itemsize < 4:  # Half precision has no small distances and no long steps.
+            state, next_state, uniform = state.float(), next_state.float(), uniform.float()
         # On a line, the numbers may come from an entry of another dtype.
         u = ((2.0 * uniform - 1.0) * self.radius).to(state.dtype)
         displacement = (next_state - state).to(state.dtype)
@@ -262,7 +265,7 @@ class Neighborhood:
             displacement = displacement.masked_fill(too_long, 0.0)
         u = u.reshape(*u.shape, *(1 for _ in features)) if self.on_line else u
         neighbor = state.unsqueeze(batch_dims) + displacement.unsqueeze(batch_dims) * u
-        return neighbor, distance
+        return neighbor.to(dtype), distance
 
 
 def _check_states(state: Tensor, next_state: Tensor, batch_dims: int) -> None:

@@ -72,6 +72,8 @@ def choose_policy_distance(
 
 def _checked(distance: PolicyDistance, p: Distribution, q: Distribution) -> Tensor:
     found = distance(p, q)
+    if not isinstance(found, Tensor):
+        raise TypeError(f"policy_distance must return a tensor, got {found!r}.")
     if found.shape != p.batch_shape:
         raise ValueError(
             "policy_distance must return one number for each pair of policies, a tensor of shape "

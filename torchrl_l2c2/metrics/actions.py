@@ -39,9 +39,8 @@ def action_variation(actions: Tensor, mask: Tensor | None = None) -> Tensor:
         tensor(3.)
     """
     actions = episodes_of("action_variation", actions, 2)
-    change = torch.linalg.vector_norm(actions.diff(dim=-2), dim=-1)
     if mask is None:
-        return change.mean(-1)
+        return torch.linalg.vector_norm(actions.diff(dim=-2), dim=-1).mean(-1)
     if mask.shape != actions.shape[:-1] or mask.dtype != torch.bool:
         raise ValueError(
             f"action_variation: mask must be boolean of shape {tuple(actions.shape[:-1])}, got "
@@ -50,6 +49,9 @@ def action_variation(actions: Tensor, mask: Tensor | None = None) -> Tensor:
     pairs = mask[..., 1:] & mask[..., :-1]
     if not pairs.any(-1).all():
         raise ValueError("action_variation: an episode has no two successive steps in its mask.")
+    # Padding may be NaN, and so would be the gradient of a masked difference.
+    shown = torch.where(mask.unsqueeze(-1), actions, 0.0)
+    change = torch.linalg.vector_norm(shown.diff(dim=-2), dim=-1)
     return torch.where(pairs, change, 0.0).sum(-1) / pairs.sum(-1)
 
 
@@ -214,8 +216,11 @@ def saturation(
     check_real("saturation: margin", margin, at_least=0)
     if any(hasattr(bound, "space") for bound in (low, high)):
         raise TypeError("saturation: low and high are bounds: pass spec.space.low, spec.space.high")
-    low, high = torch.as_tensor(low), torch.as_tensor(high)
-    if bool((low > high).any()):
+    # Bounds of another precision would not be reached exactly.
+    low, high = (
+        torch.as_tensor(bound, dtype=actions.dtype, device=actions.device) for bound in (low, high)
+    )
+    if not bool((low <= high).all()):
         raise ValueError(f"saturation: low must be at most high, got {low} and {high}.")
     width = margin * (high - low)
     width = width.where(width.isfinite(), 0.0)
@@ -249,4 +254,9 @@ def episodes_of(name: str, actions: Tensor, least: int) -> Tensor:
             f"{name}: actions must have shape [*B, T, A] with T of at least {least}, got "
             f"{tuple(actions.shape)}."
         )
-    return actions.float() if actions.itemsize < 4 else actions
+    return in_single(actions)
+
+
+def in_single(tensor: Tensor) -> Tensor:
+    """Casts half precision, in which squares overflow or become 0, to single precision."""
+    return tensor.float() if tensor.itemsize < 4 else tensor

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchrl_l2c2._checks import check_choice, check_real
+from torchrl_l2c2.metrics.actions import in_single
 
 
 def local_lipschitz(
@@ -67,7 +68,7 @@ def local_lipschitz(
     distance = (neighbor - state.unsqueeze(-2)).abs().amax(-1)
     change = torch.linalg.vector_norm(neighbor_output - output.unsqueeze(-2), dim=-1)
     moved = distance != 0.0  # A NaN neighbor counts, and makes the result NaN.
-    quotient = torch.where(moved, change / distance, 0.0)
+    quotient = torch.where(moved, change / distance.where(moved, 1.0), 0.0)
     if reduction == "mean":
         return quotient.sum(-1) / moved.sum(-1)
     return torch.where(moved.any(-1), quotient.amax(-1), torch.nan)
@@ -149,7 +150,7 @@ def noise_sensitivity(
             "under ExplorationType.DETERMINISTIC."
         )
     scale = torch.as_tensor(scale).to(observations)
-    change = policy(observations + scale * noise) - actions
+    change = in_single(policy(observations + scale * noise)) - in_single(actions)
     batch = change.shape[:-1]
     if (not batch and observations.ndim > 1) or observations.shape[: len(batch)] != batch:
         raise ValueError(
@@ -201,13 +202,13 @@ def change_with_held_input(
             f"[N, *F], got {tuple(observations.shape)} and {tuple(next_observations.shape)}."
         )
     before, after = observations.flatten(1), next_observations.flatten(1)
-    action = policy(observations)
-    whole = (policy(next_observations) - action).square().sum(-1).mean()
+    action = in_single(policy(observations))
+    whole = (in_single(policy(next_observations)) - action).square().sum(-1).mean()
     changes = []
     for coordinate in range(before.shape[1]):
         held = after.clone()
         held[:, coordinate] = before[:, coordinate]
-        change = policy(held.view_as(next_observations)) - action
+        change = in_single(policy(held.view_as(next_observations))) - action
         changes.append(change.square().sum(-1).mean())
     return (torch.stack(changes) / whole).sqrt().view(observations.shape[1:])
 

@@ -252,7 +252,8 @@ def one_line_message(error: Exception) -> str:
             f"quotes: 'name=\"a b\"'.{home}"
         )
     message = " ".join(str(error).split())
-    if isinstance(error, (ValueError, ConfigCompositionException)):
+    named = any(word in message for word in ("group", *GROUPS))
+    if named and isinstance(error, (ValueError, ConfigCompositionException)):
         message += (
             f". Each of {', '.join(GROUPS)} takes one name (regularizer=none for none); -m runs "
             "several."
