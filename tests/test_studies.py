@@ -570,6 +570,18 @@ class TestProse:
         ]
         assert rough == sorted(rough, reverse=True) and len(rough) == 20
 
+    def test_what_the_other_time_limit_shows_on_hopper(self):
+        """The number of seeds that all methods have, and the order of L2C2 and the baseline."""
+        runs = records("hopper_terminated")
+        seeds = set.intersection(*(set(of["seed"]) for _, of in runs.groupby("method")))
+        page = " ".join((ROOT / "results" / "paper.md").read_text().split())
+        number = {4: "Four", 5: "Five"}[len(seeds)]
+        assert f"{number} seeds of six have run. In the late policies each run of L2C2" in page
+        runs = runs[runs["seed"].isin(seeds)].set_index("method")
+        late, last = (runs[f"{test}_sampled_return"] for test in ("late", "last"))
+        assert late["l2c2"].max() < late["none"].min()
+        assert last["l2c2"].max() > last["none"].min()
+
     def test_the_readmes_sentences(self):
         """The changes of rough and of smooth baselines, the losses of return, and untuned tasks."""
         readme = " ".join((ROOT / "README.md").read_text().split())
