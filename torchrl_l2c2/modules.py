@@ -186,7 +186,7 @@ def make_actor(
             check_real("the number in scale_mapping", float(bias), above=0.01)
     except (NotImplementedError, ValueError) as error:
         raise ValueError(
-            f"make_actor: scale_mapping must be 'exp', 'expln', 'softplus', 'relu' or "
+            "make_actor: scale_mapping must be 'exp', 'expln', 'softplus', 'relu' or "
             "'biased_softplus_1.0', with any number above 0.01 as the initial scale, got "
             f"{scale_mapping!r}."
         ) from error

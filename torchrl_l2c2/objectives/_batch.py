@@ -65,18 +65,16 @@ def check_evaluates_states(loss: LossModule) -> None:
 
 
 def check_batch_size(tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> None:
-    """Refuses a batch without a batch size, which would be taken for a single state.
+    """Refuses a whole batch with the batch size ``[]``, which would be taken for a single state.
 
     Args:
-        tensordict (TensorDictBase): the batch, ``[*B]``.
+        tensordict (TensorDictBase): a batch with the batch size ``[]``.
         keys: keys of rewards and ends, ``[*B, 1]``. Nested keys are left out: they may have a
             dimension of agents.
 
     Raises:
-        ValueError: the batch size is ``[]``, and such an entry has further dimensions.
+        ValueError: such an entry has further dimensions.
     """
-    if tensordict.batch_dims:
-        return
     for key in keys:
         entry = tensordict.get(next_key(key), None) if isinstance(key, str) else None
         if entry is not None and entry.ndim > 1:

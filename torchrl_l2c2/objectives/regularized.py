@@ -545,8 +545,9 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             )
 
     def _check_batch_size(self, tensordict: TensorDictBase) -> None:
-        keys = [getattr(self.tensor_keys, name, name) for name in ("reward", "done")]
-        check_batch_size(tensordict, keys)
+        if not tensordict.batch_dims:
+            keys = (getattr(self.tensor_keys, name, name) for name in ("reward", "done"))
+            check_batch_size(tensordict, keys)
 
     def _folded_value(self, key: str, term: Tensor) -> Tensor:
         """A term as it is added to another: an auxiliary term adds its gradient but no value."""
@@ -1074,11 +1075,11 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         if (sizes := self._evaluation.sizes) is not None:
             mean = {**kwargs, "reduction": "mean"}
             size = super()._reduce_loss(loss.detach().abs(), tensordict, **mean)
-            of_ensemble = tensordict is not None and (
-                isinstance(self, REDQLoss) or loss.shape[: tensordict.ndim] != tensordict.shape
-            )
-            if self._term_reduction == "sum" and of_ensemble:  # The sum is over its networks, too.
-                size = size * len(loss)
+            if self._term_reduction == "sum" and tensordict is not None:
+                by_row = loss.shape[: tensordict.ndim] == tensordict.shape
+                # Agents have a penalty each. An ensemble's networks, in front, share one.
+                if not by_row or isinstance(self, REDQLoss):
+                    size = size * (loss.numel() / tensordict.numel())
             sizes.append(size)
         return super()._reduce_loss(loss, tensordict, **kwargs)
 

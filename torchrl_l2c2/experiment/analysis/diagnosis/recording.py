@@ -271,7 +271,7 @@ def _numbers(path: Path, place: int, name: str, lines: Sequence[tuple[int, list[
 
 
 def _remedy(cell: str) -> str:
-    """What to do about a cell that is no number."""
+    """Names the remedy for a cell that is no number."""
     if "," in cell and _number(cell.replace(",", ".")) is not None:
         return "write a decimal point instead of the comma"
     if len(cell.split()) > 1 and all(_number(part) is not None for part in cell.split()):
