@@ -1075,6 +1075,18 @@ class TestRelativeParts:
             found.append(terms["loss_cats"] / terms["loss_actor"])
         torch.testing.assert_close(*found)
 
+    def test_a_term_that_is_reduced_already_has_its_size_per_row(self):
+        class Reducing(DDPGLoss):
+            def loss_actor(self, tensordict):
+                value, metadata = super().loss_actor(tensordict)
+                return self._reduce_loss(value, tensordict), metadata
+
+        batch, found = seeded(transitions, 12, seed=1), []
+        for kind in (DDPGLoss, Reducing):
+            base = seeded(lambda kind=kind: kind(deterministic_actor(), qvalue(), reduction="sum"))
+            found.append(seeded(CATSLoss(base).relative(), batch.copy(), seed=2)["loss_cats"])
+        torch.testing.assert_close(*found)
+
     @pytest.mark.parametrize("first", [True, False])
     def test_a_subclass_with_a_term_of_its_own(self, first):
         """Before or after the action values: the size is the values', not that term's."""
