@@ -6,9 +6,9 @@ file for every run, deployment and condition; lines that the file has are skippe
 
 from __future__ import annotations
 
+import argparse
 import csv
 import math
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from itertools import product
@@ -209,4 +209,8 @@ def main(folder: Path, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    parser = argparse.ArgumentParser(prog="python -m studies.filters", description=__doc__)
+    parser.add_argument("folder", type=Path, help="folder of runs")
+    parser.add_argument("file", type=Path, help="CSV file that gets the lines")
+    chosen = parser.parse_args()
+    main(chosen.folder, chosen.file)

@@ -6,9 +6,9 @@ for each of them. Lines of other runs stay.
 
 from __future__ import annotations
 
+import argparse
 import csv
 import math
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -77,4 +77,8 @@ def table(path: Path) -> str:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    parser = argparse.ArgumentParser(prog="python -m studies.half_cheetah", description=__doc__)
+    parser.add_argument("folder", type=Path, help="folder of runs")
+    parser.add_argument("file", type=Path, help="CSV file that gets the lines")
+    chosen = parser.parse_args()
+    main(chosen.folder, chosen.file)

@@ -6,6 +6,7 @@ are skipped.
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import os
 import sys
@@ -39,7 +40,9 @@ def recorded(path: Path, task: str) -> tuple[Group, Group]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Makes the runs that the file lacks."""
-    (file,) = sys.argv[1:] if arguments is None else arguments
+    parser = argparse.ArgumentParser(prog="python -m studies.rsl_rl", description=__doc__)
+    parser.add_argument("file", type=Path, help="CSV file that gets the lines")
+    chosen = parser.parse_args(arguments)
     sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
     import rsl_rl_gymnasium
     import rsl_rl_l2c2
@@ -51,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
             return rsl_rl_gymnasium.train(CLASSES[method], task, seed, ITERATIONS[task])
 
-    add_runs(Path(file), product(SEEDS, ITERATIONS, METHODS), silent)
+    add_runs(chosen.file, product(SEEDS, ITERATIONS, METHODS), silent)
 
 
 if __name__ == "__main__":

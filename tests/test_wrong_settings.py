@@ -76,6 +76,10 @@ def settings_of():
         ("regularizer.lambda_min=low", "regularizer.lambda_min must be a valid number, got 'low'."),
         ("regularizer.num_samples=0", "regularizer.num_samples must be greater than or equal to 1"),
         ("regularizer=caps regularizer.mean=mode", "regularizer.mean must be 'loc' or 'action'"),
+        (
+            "algorithm=sac algorithm.target_entropy=low",
+            "algorithm.target_entropy must be a valid number or 'scaled', got 'low'.",
+        ),
         ("algorithm.reward_scale=0", "algorithm.reward_scale must be greater than 0, got 0."),
         ("algorithm.beta=0.9", "algorithm.kappa must be below 0.222222 with beta=0.9, got 0.5."),
         ("algorithm.gamma=1", "algorithm.gamma must be less than 1, got 1."),

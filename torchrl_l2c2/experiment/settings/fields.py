@@ -150,7 +150,8 @@ def _constant(kind: dict[str, Any]) -> list[Any]:
 
 def _first_error(error: ValidationError, cls: type) -> SettingError:
     """Converts pydantic's first error into one line."""
-    first = error.errors(include_url=False, include_context=True)[0]
+    errors = error.errors(include_url=False, include_context=True)
+    first = errors[0]
     where, given = [str(part) for part in first["loc"]], first["input"]
     name = next((part for part in where if part in {f.name for f in dataclasses.fields(cls)}), "")
     if first["type"] == "value_error":
@@ -163,6 +164,8 @@ def _first_error(error: ValidationError, cls: type) -> SettingError:
         return SettingError(where[0], f"is not a setting; choose from {known}.", cls.__name__)
     if first["type"] == "missing":  # A tuple is too short.
         return SettingError(name, f"must have more entries, got {list(given)}.", cls.__name__)
-    allowed = first["msg"].replace("Input should be", "must be", 1)
-    allowed = allowed.replace("a valid tuple", "a list")
+    # A setting that may be of several types has an error for each.
+    same = [each["msg"] for each in errors if each["input"] is given and each["loc"][0] == where[0]]
+    allowed = " or ".join(part.removeprefix("Input should be ") for part in dict.fromkeys(same))
+    allowed = "must be " + allowed.replace("a valid tuple", "a list")
     return SettingError(name, f"{allowed}, got {given!r}.", cls.__name__)
