@@ -633,6 +633,10 @@ class TestMeasured:
         found = made_up(policy_lipschitz=constants, observations=observations)
         assert found.worst(2) == [30, 70] and 90 not in found.worst(5)
 
+    def test_a_short_episode_does_not_show_how_an_action_shakes(self):
+        (found,) = findings(diagnose(linear(1.0), GymWrapper(Walk())))
+        assert found.kind == "short" and "has 10 steps, and fewer than 20" in found.text
+
     def test_what_cannot_be_diagnosed_is_refused(self):
         """An id, a batch of environments, two observations, an episode that is hardly one."""
         with pytest.raises(TypeError, match=r"environment of TorchRL, got 'Walk-v0': .*GymEnv"):
@@ -642,6 +646,9 @@ class TestMeasured:
         two = TensorDictModule(lambda a, b: a, ["observation", "other"], ["action"])
         with pytest.raises(ValueError, match=r"reads \['observation', 'other'\]"):
             diagnose(two, GymWrapper(Walk()))
+        recurrent = TensorDictModule(lambda a, b: a, ["observation", "is_init"], ["action"])
+        with pytest.raises(ValueError, match=r"a recurrent policy.* diagnose_actions"):
+            diagnose(recurrent, GymWrapper(Walk()))
         with pytest.raises(ValueError, match="3 steps is too short"):
             diagnose(linear(1.0), GymWrapper(Walk()), max_steps=3)
         with pytest.raises(FloatingPointError, match="action is not finite at frame 1 of a test"):

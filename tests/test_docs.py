@@ -29,6 +29,7 @@ from torchrl.objectives import ClipPPOLoss, SACLoss
 import torchrl_l2c2
 from torchrl_l2c2 import affinities, smooth
 from torchrl_l2c2.experiment.analysis.diagnosis import diagnose_actions, findings
+from torchrl_l2c2.experiment.analysis.diagnosis.measured import FEWEST_STEPS
 from torchrl_l2c2.experiment.analysis.diagnosis.words import threshold
 from torchrl_l2c2.experiment.cli import diagnose as diagnose_command
 from torchrl_l2c2.experiment.learn.learner import MEASURE_AFTER, WARN_BELOW
@@ -240,6 +241,7 @@ def test_the_pages_have_the_thresholds_of_diagnose() -> None:
         "stands still": [threshold("STILL")],
         "smooth": [threshold("SMOOTH")],
         "the episodes differ": [threshold("UNLIKE")],
+        "too short": [FEWEST_STEPS],
     }.items():
         assert {f"{each:g}" for each in thresholds} <= set(re.findall(r"-?[\d.]*\d", rows[finding]))
     assert f"at least {threshold('CONCENTRATED'):g} of a change" in page

@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 from jupyter_client import KernelManager
 from nbclient import NotebookClient
+from nbclient.exceptions import CellExecutionError
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
 NAMES = ["idea.ipynb", "quickstart.ipynb", "results.ipynb", "shaking.ipynb"]
@@ -201,3 +202,22 @@ def test_the_page_of_the_idea_is_its_notebook() -> None:
     written = (docs / "idea.md").read_text()
     assert written == made["page"](notebook, drawing) and "SLIDERS" not in written
     assert all((docs / f"idea_{number + 1}.png").exists() for number in range(len(drawing)))
+
+
+@pytest.mark.parametrize(
+    ("chosen", "told"),
+    [
+        ("task == 'pendulum'", "several tasks or settings"),
+        ("algorithm == 'sac'", "No runs of"),
+    ],
+)
+def test_only_runs_that_compare_are_pooled(
+    chosen: str, told: str, monkeypatch: pytest.MonkeyPatch, kernel: KernelManager
+) -> None:
+    """Another file may have several tasks, algorithms and settings of a method."""
+    notebook = stored("results.ipynb")
+    for cell in code(notebook):
+        cell.source = cell.source.replace("results/hopper.csv", "results/field.csv")
+        cell.source = cell.source.replace("task == 'hopper_v5' and algorithm == 'ppo'", chosen)
+    with pytest.raises(CellExecutionError, match=told):
+        run(notebook, monkeypatch, timeout=60, kernel=kernel)

@@ -27,6 +27,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.collectors.utils import split_trajectories
+from torchrl.envs import GymEnv
 from torchrl.modules import (
     Actor,
     BatchRenorm1d,
@@ -794,6 +795,48 @@ def test_returns_of_several_steps_are_told_once():
         assert all(
             each.startswith("the next observations") and "up to 3 steps" in each for each in found
         )
+
+
+class TestEndsWithoutObservation:
+    """TorchRL's GymEnv of several environments stores 0 as the next observation of an end."""
+
+    def warned(self, batch):
+        loss = smooth(base_loss())
+        messages = told_by(lambda: [loss(batch.copy()) for _ in range(3)])
+        return [each for each in messages if "ends of episodes" in each]
+
+    def batch(self):
+        batch = batch_of(8)
+        batch["next", "done"][[2, 5]] = True
+        batch["next", "observation"][[2, 5]] = 0.0
+        return batch
+
+    def test_is_told_once(self):
+        (message,) = self.warned(self.batch())
+        assert message.startswith("the next 'observation' is 0 at all 2 ends of episodes")
+
+    def test_other_zeros_are_not(self):
+        """Of one end only, of some ends, of rows that do not end, of states that are 0."""
+        changes = {
+            "one": lambda batch: batch["next", "done"][2:3].fill_(False),
+            "some": lambda batch: batch["next", "observation"][5, 0].fill_(0.1),
+            "within": lambda batch: batch["next", "done"].fill_(False),
+            "still": lambda batch: batch["observation"][2].fill_(0.0),
+        }
+        for change in changes.values():
+            change(batch := self.batch())
+            assert not self.warned(batch)
+
+    @pytest.mark.filterwarnings("ignore")
+    def test_is_what_torchrl_stores(self):
+        """If this fails, TorchRL stores the last observation: the warning can go."""
+        env = GymEnv("CartPole-v1", num_envs=2)
+        try:
+            rollout = env.rollout(60, break_when_any_done=False)
+        finally:
+            env.close()
+        ends = rollout["next", "done"].squeeze(-1)
+        assert ends.sum() > 1 and not rollout["next", "observation"][ends].any()
 
 
 def test_a_limit_that_leaves_out_everything_is_told_once():

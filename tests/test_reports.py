@@ -323,6 +323,20 @@ class TestGroups:
         (note,) = found.notes
         assert note.startswith("1 unreadable: ") and str(tmp_path / "bad" / named) in note
 
+    def test_a_finished_run_without_its_settings_is_told(self, tmp_path):
+        make_run(tmp_path / "run", make_config(), 1.0, 0.1)
+        (tmp_path / "run" / "config.json").unlink()
+        (note,) = find_runs([tmp_path]).notes
+        assert note.startswith("1 unreadable: ") and "config.json" in note
+
+    def test_without_a_commit_the_packages_version_tells_runs_apart(self, tmp_path):
+        """Of an installed package, which is in no git checkout."""
+        for seed, version in enumerate(("0.1.0", "0.2.0")):
+            make_run(tmp_path / version, make_config(seed=seed), 1.0, 0.1)
+            known = {"torchrl-l2c2": version, "commit": ""}
+            (tmp_path / version / "versions.json").write_text(json.dumps(known))
+        assert "runs of more than one commit (0.1.0, 0.2.0) are pooled" in sweep_summary([tmp_path])
+
     def test_a_measure_that_could_not_be_taken_is_no_number(self, tmp_path):
         """Of test episodes that are too short, where evaluation.json has null."""
         make_run(tmp_path / "run", make_config(), 1.0, 0.1)

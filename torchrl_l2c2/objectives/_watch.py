@@ -49,6 +49,7 @@ class TermWatch:
         self._calls += 1
         if self._calls == 1 and loss._followed:
             _warn_of_several_steps(batch)
+            _warn_of_zeros(loss, batch)
         if self._calls in (1, PATIENCE) and hasattr(loss, "asap_predictor"):
             self._see_predictor(loss)
         if self._calls == PATIENCE and loss._ramp is not None and not self.progress_set:
@@ -210,7 +211,9 @@ class TermWatch:
                 warnings.warn(
                     f"the neighbors in the batch are not near its {key!r}, so the penalty of "
                     f"{type(loss).__name__} is wrong: append neighbor_transform() after all "
-                    "transforms that change observations, such as ObservationNorm.",
+                    "transforms that change observations, such as ObservationNorm. In a buffer "
+                    "that relabels goals after its transforms, leave it out: then the loss draws "
+                    "the neighbors.",
                     stacklevel=5,
                 )
                 return
@@ -269,6 +272,29 @@ def _warn_of_several_steps(batch: TensorDictBase) -> None:
             "strength.",
             stacklevel=5,
         )
+
+
+def _warn_of_zeros(loss: Any, batch: TensorDictBase) -> None:
+    """Warns if the last next observation of every episode is 0, as with ``GymEnv(num_envs=2)``."""
+    done = batch.get(next_key(getattr(loss.tensor_keys, "done", "done")), None)
+    if done is None:
+        return
+    ends = done.reshape(*batch.batch_size, -1).any(-1)
+    read = (loss._evaluation.specs[name].states for name in loss._followed)
+    for key in {key for states in read for key in states}:
+        here, successor = (batch.get(each, None) for each in (key, next_key(key)))
+        if here is None or successor is None or int(ends.sum()) < 2:
+            continue
+        if not successor[ends].any() and here[ends].flatten(1).any(1).all():
+            warnings.warn(
+                f"the next {key!r} is 0 at all {int(ends.sum())} ends of episodes in the batch, as "
+                "TorchRL's GymEnv(..., num_envs=2) stores it with Gymnasium 1. It then stores a "
+                "step across the reset, too. Values and penalties of both are wrong: use "
+                "ParallelEnv, or GymWrapper(gymnasium.make_vec(...)) with "
+                "AutoresetMode.SAME_STEP.",
+                stacklevel=5,
+            )
+            return
 
 
 def _forget(pending: set[str], key: str, gradient: Tensor) -> None:

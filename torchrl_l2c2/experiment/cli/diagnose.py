@@ -80,7 +80,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="FOLDER",
         help="run folders, folders that contain runs, or CSV files of recorded actions: a column "
         "for each action, a row for each control step, and optionally a column named time, in "
-        "seconds",
+        "seconds. Every run is compared with the first one, which in a folder is a baseline",
     )
     add("--names", nargs="+", help="names of the runs (default: the settings that differ)")
     add(

@@ -240,6 +240,11 @@ def observation_key(policy: TensorDictModule, env: EnvBase) -> NestedKey:
             "of these."
         )
     if len(keys := list(policy.in_keys)) != 1:
+        if "is_init" in keys:
+            raise UserError(
+                f"a recurrent policy, which reads {keys}, cannot be evaluated here: play it with "
+                "env.rollout, and pass the recorded actions to diagnose_actions."
+            )
         raise UserError(
             f"the policy must read one observation, this one reads {keys}: join them with "
             "torchrl.envs.CatTensors."

@@ -60,7 +60,7 @@ class Record:
         last_sampled_return: Mean over the last policy's test episodes with sampled actions.
         policy_scale: Mean scale of the late policies.
         seconds: Duration of training: all frames divided by the last call's frames per second.
-        commit: Commit of the code, empty outside of a git checkout.
+        commit: Commit of the code; outside of a git checkout, the version of this package.
     """
 
     task: str
@@ -192,7 +192,7 @@ class FinishedRun:
             updates=int(end["updates"]),
             torch=self.versions.get("torch", ""),
             torchrl=self.versions.get("torchrl", ""),
-            commit=self.versions.get("commit", ""),
+            commit=self.versions.get("commit") or self.versions.get("torchrl-l2c2", ""),
             differences=write_differences(differences(self.config)),
             **{name: float(f"{value:.6g}") for name, value in numbers.items()},
         )

@@ -33,6 +33,7 @@ Value = Callable[[Tensor, Tensor], Tensor]
 """Observations ``[N, *F]`` and actions ``[N, *A]`` to values, ``[N]`` or of several heads."""
 
 UNKNOWN = torch.empty(0)
+FEWEST_STEPS = 20  # that show how an action shakes
 LOCKED = 1e-3  # of the largest span: smallest span that an action's change is relative to
 SAMPLES = 16  # actions drawn at a state to see how far they spread
 SAMPLED_STATES = 256

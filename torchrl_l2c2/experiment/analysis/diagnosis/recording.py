@@ -14,12 +14,16 @@ import torch
 from torch import Tensor
 from torchrl.data import Bounded, TensorSpec, Unbounded
 
-from torchrl_l2c2.experiment.analysis.diagnosis.measured import Diagnosis, bounds_of, check_names
+from torchrl_l2c2.experiment.analysis.diagnosis.measured import (
+    FEWEST_STEPS,
+    Diagnosis,
+    bounds_of,
+    check_names,
+)
 from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.run.evaluation import measure
 from torchrl_l2c2.metrics import action_variation
 
-LEAST_STEPS = 20  # Shorter recordings do not show what shakes.
 TIME = "time"  # the column of seconds
 LIKELY = (1e-5, 1.0)  # seconds from one step to the next
 GAP = 2.5  # times the median time step: a longer one is a gap
@@ -72,10 +76,10 @@ def diagnose_actions(
         >>> findings(found)[0].text[:66]
         'knee flips from step to step, which is shaking at 25 Hz, half the '
     """
-    if actions.ndim != 2 or len(actions) < LEAST_STEPS or not actions.shape[1]:
+    if actions.ndim != 2 or len(actions) < FEWEST_STEPS or not actions.shape[1]:
         raise UserError(
-            f"{name}: actions must have the shape [T, A] with at least {LEAST_STEPS} steps and one "
-            f"action, got {list(actions.shape)}."
+            f"{name}: actions must have the shape [T, A] with at least {FEWEST_STEPS} steps and "
+            f"one action, got {list(actions.shape)}."
         )
     check_names("action_names", action_names, actions.shape[1], "actions")
     spec = _spec(actions.shape[1], bounds)
@@ -150,7 +154,7 @@ def diagnose_recording(
         raise UserError(f"the column {double[0]!r} was chosen twice: name it once.")
     actions = {each: _numbers(path, header.index(each), each, lines) for each in chosen}
     for each, values in actions.items():
-        if columns is None and len(values) >= LEAST_STEPS and (values.diff() > 0.0).all():
+        if columns is None and len(values) >= FEWEST_STEPS and (values.diff() > 0.0).all():
             raise UserError(
                 f"{path}: {each!r} increases in every row, which no action does. If it is the time "
                 f"in seconds, name it {TIME!r}; otherwise leave it out, or name the actions with "
@@ -182,7 +186,7 @@ def _without_repetitions(actions: Tensor) -> tuple[Tensor, float]:
     # An action may be held for several steps, and a step may take a row more or less.
     held = (lengths / often).round().clamp_min(1)
     even = ((lengths - held * often).abs() <= tolerance) & (held <= most_held)
-    if often < REPEATED or len(starts) < LEAST_STEPS or even.float().mean() < EVEN:
+    if often < REPEATED or len(starts) < FEWEST_STEPS or even.float().mean() < EVEN:
         return actions, 1.0
     return actions[starts].repeat_interleave(held.long(), 0), often
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchrl_l2c2.experiment.analysis.diagnosis.measured import Diagnosis
+from torchrl_l2c2.experiment.analysis.diagnosis.measured import FEWEST_STEPS, Diagnosis
 from torchrl_l2c2.metrics import action_variation, previous_action_gain, roughness, saturation
 
 # Value and meaning; the signals that they were calibrated on are in tests/test_diagnosis.py.
@@ -84,6 +84,12 @@ def findings(diagnosis: Diagnosis) -> list[Finding]:
     Args:
         diagnosis (Diagnosis): Result of :func:`~.measured.diagnose`.
     """
+    if (steps := len(diagnosis.actions)) < FEWEST_STEPS:
+        text = (
+            f"The first episode has {steps} steps, and fewer than {FEWEST_STEPS} do not show how "
+            "an action shakes. Choose a longer one, with another seed or a larger max_steps."
+        )
+        return [Finding("short", text), *_training(diagnosis)]
     unlike = list(_unlike(diagnosis))
     if (diagnosis.relative.std(0) <= threshold("STILL")).all():
         at = ", ".join(f"{value:.3g}" for value in diagnosis.actions.mean(0).tolist())

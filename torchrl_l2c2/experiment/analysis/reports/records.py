@@ -105,7 +105,7 @@ def walk_runs(folders: Iterable[str | Path]) -> Iterator[Path]:
                 inner.clear()
                 continue
             walked.add(real)
-            if "config.json" in files:
+            if not {"config.json", "evaluation.json"}.isdisjoint(files):
                 yield Path(place)
 
 
