@@ -58,4 +58,5 @@ def play(folder: Path, episodes: int) -> None:
 if __name__ == "__main__":
     if len(sys.argv) < 2 or not Path(sys.argv[1], "contract.json").exists():
         sys.exit("Usage: python examples/onnx_policy.py RUN/export [EPISODES]")
+    sys.path.insert(0, "")  # A task of your own may be in a module of this folder.
     play(Path(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 1)

@@ -279,6 +279,19 @@ class TestThePenalty:
             warnings.simplefilter("error")
             other.policy_regularizer(scaled)
 
+    def test_a_transform_with_another_max_step_is_told(self):
+        """All observations are known; only the transform leaves transitions out."""
+        torch.manual_seed(0)
+        batch = NeighborTransform(replace(NEAR, max_step=1.0))(transitions(6))
+        assert batch["neighbor", "distance"].isinf().any()
+        loss = L2C2Loss(DDPGLoss(deterministic_actor(), qvalue()), NEAR)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            loss.policy_regularizer(batch)
+            loss.policy_regularizer(batch)
+        (message,) = (str(each.message) for each in told)
+        assert message.startswith("the neighbors in the batch are of another neighborhood")
+
     def test_a_maximum_over_fewer_neighbors_is_told(self):
         """It would be smaller; a mean over fewer neighbors is as large."""
         torch.manual_seed(0)

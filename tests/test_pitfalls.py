@@ -52,6 +52,7 @@ from torchrl_l2c2 import (
     smooth,
 )
 from torchrl_l2c2.gains import gradient_shares
+from torchrl_l2c2.policy_distances import mean_distance
 
 NEAR = Neighborhood(sigma=1.0, lambda_min=2.0, lambda_max=20.0)
 
@@ -795,6 +796,38 @@ def test_returns_of_several_steps_are_told_once():
         assert all(
             each.startswith("the next observations") and "up to 3 steps" in each for each in found
         )
+
+
+class TestTermsThatTrainNothing:
+    """A distance of one's own without a gradient, or with negative numbers."""
+
+    def told(self, distance, fold=True, freeze=False):
+        base = PPOLoss(seeded(gaussian_actor), seeded(critic))
+        loss = smooth(base, lambda_min=1.0, lambda_max=9.0, policy_distance=distance, ramp=None)
+        if not fold:
+            loss.unfold()
+        if freeze:
+            for parameter in loss.actor_network_params.values(True, True):
+                parameter.requires_grad_(False)
+        batch = seeded(on_policy, 8)
+
+        def train():
+            for _ in range(60):
+                terms = loss(batch.copy())
+                sum(v for k, v in terms.items() if k.startswith("loss_")).backward()
+
+        return [each for each in told_by(train) if "preset" not in each]
+
+    @pytest.mark.parametrize("fold", [True, False])
+    def test_no_gradient_is_told_once(self, fold):
+        (message,) = self.told(lambda p, q: mean_distance(p, q).detach(), fold)
+        assert message.startswith("['loss_l2c2_actor'] of L2C2Loss[PPOLoss] has no gradient")
+        assert not self.told(mean_distance, fold)
+        assert not self.told(mean_distance, freeze=True)
+
+    def test_negative_numbers_are_told_once(self):
+        (message,) = self.told(lambda p, q: -mean_distance(p, q))
+        assert message.startswith("policy_distance returned -") and "at least 0" in message
 
 
 class TestEndsWithoutObservation:

@@ -360,12 +360,35 @@ def test_a_run_brings_no_code(tmp_path, monkeypatch, code, run, refused):
         load_policy(tmp_path / run)
 
 
+def rewrite_newest(folder, change):
+    """Changes the state in the newest checkpoint."""
+    newest = list_checkpoints(folder)[0]
+    change(state := load_checkpoint(newest))
+    save_checkpoint(folder, int(newest.stem.split("_")[1]), state, keep=1)
+
+
 def of_other_versions(folder, **changed):
     """Makes the newest checkpoint one that other versions wrote."""
-    newest = list_checkpoints(folder)[0]
-    state = load_checkpoint(newest)
-    state["versions"] = json.dumps(json.loads(state["versions"]) | changed)
-    save_checkpoint(folder, int(newest.stem.split("_")[1]), state, keep=1)
+
+    def change(state):
+        state["versions"] = json.dumps(json.loads(state["versions"]) | changed)
+
+    rewrite_newest(folder, change)
+
+
+def test_an_unfinished_policy_is_told(trained):
+    with pytest.warns(UserWarning, match="not finished: this is its policy after 6 episodes"):
+        load_policy(trained)
+
+
+def test_a_task_whose_actions_have_changed_is_not_continued(trained):
+    """The task's code may change between two commands, which its name does not show."""
+    rewrite_newest(trained, lambda state: state.update(actions="from [-9.0] to [9.0]"))
+    told = r"actions were from \[-9.0\] to \[9.0\] in the checkpoint and are from \[-1.0\] to"
+    with pytest.raises(OtherRunError, match=told):
+        Experiment(small(), trained)
+    rewrite_newest(trained, lambda state: state.pop("actions"))  # one of an earlier release
+    assert len(Experiment(small(), trained).metrics) == 6
 
 
 def test_other_versions_are_refused_unless_they_are_allowed(trained):

@@ -20,8 +20,14 @@ PATIENCE = 50
 STANDSTILL = 1000
 """Calls of a loss at progress 0 before it warns, unless the first rollout may have as many."""
 
-LONGEST_ROLLOUT = 20 * STANDSTILL
+LONGEST_ROLLOUT = 5 * STANDSTILL
 """Calls of a loss at progress 0 before it warns in any case."""
+
+
+_ELSEWHERE = (
+    "the neighbors in the batch are of another neighborhood than {}'s, which changes its penalty: "
+    "append the transform that loss.neighbor_transform() returns."
+)
 
 
 class TermWatch:
@@ -93,10 +99,23 @@ class TermWatch:
                 stacklevel=5,
             )
 
+    def see_added(self, loss: Any, added: TensorDictBase, own: Tensor | None) -> None:
+        """Warns of policy terms without a gradient, unless the loss's own term has none either."""
+        if "gradient" in self._warned or own is None or not own.requires_grad:
+            return
+        flat = sorted(k for k in loss.policy_terms & added.keys() if not added[k].requires_grad)
+        if flat:
+            self._warned.add("gradient")
+            warnings.warn(
+                f"{flat} of {type(loss).__name__} has no gradient, so it does not train the "
+                "policy: compute it from the policy's output, without detach() and comparisons.",
+                stacklevel=4,
+            )
+
     def see_forward(self, loss: Any, terms: TensorDictBase) -> None:
         """Counts a call of a loss in training, and follows the gradients of its added terms."""
         self._forwards += 1
-        if loss.folded:
+        if loss.folded or "gradient" in self._warned:
             return
         if self.pending is None:
             self.pending = set(loss.added_terms)
@@ -175,6 +194,19 @@ class TermWatch:
                 stacklevel=5,
             )
 
+    def see_distance(self, difference: Tensor) -> None:
+        """Warns if a ``policy_distance`` of the user's own is negative, in the first call."""
+        if is_compiling() or "distance" in self._warned:
+            return
+        self._warned.add("distance")
+        if bool((difference < -1e-6).any()):
+            warnings.warn(
+                f"policy_distance returned {difference.min().item():.3g}: distances are at least "
+                "0, and a negative penalty trains the policy to change more. Return a square or an "
+                "absolute value.",
+                stacklevel=5,
+            )
+
     def see_neighbors(
         self, loss: Any, neighbors: TensorDictBase, batch: TensorDictBase, near: Neighborhood
     ) -> None:
@@ -191,6 +223,19 @@ class TermWatch:
             return
         self._warned.add("neighbors")
         distance = neighbors.get("distance", None)
+        if near.max_step is None and distance is not None and bool(distance.isinf().any()):
+            far = distance.isinf().flatten(batch.batch_dims).any(-1)
+            ends = [
+                batch.get(each, None)
+                for key in neighbors.keys(True, True)
+                if key != "distance"
+                for each in (key, next_key(key))
+            ]
+            known = [each[far].isfinite().all() for each in ends if each is not None]
+            if known and all(map(bool, known)):
+                self._warned.add("counts")
+                warnings.warn(_ELSEWHERE.format(type(loss).__name__), stacklevel=5)
+                return
         drawn, wanted = distance.shape[-1] if distance is not None else 0, loss.l2c2_num_samples
         if drawn != wanted and loss.l2c2_over_neighbors == "max":
             warnings.warn(
@@ -220,12 +265,7 @@ class TermWatch:
             if distance is None or not near.on_line:
                 continue
             if _is_elsewhere(here, successor, there, distance.movedim(-1, 0), near):
-                warnings.warn(
-                    "the neighbors in the batch are of another neighborhood than "
-                    f"{type(loss).__name__}'s, which changes its penalty: append the "
-                    "transform that loss.neighbor_transform() returns.",
-                    stacklevel=5,
-                )
+                warnings.warn(_ELSEWHERE.format(type(loss).__name__), stacklevel=5)
                 return
 
 

@@ -304,6 +304,8 @@ class L2C2Loss(RegularizedLoss):
         near = self._neighbors(tensordict)
         policies = self.policies_at(tensordict, near.states, near.rows)
         difference = compare_policies(self._l2c2_distance, *policies)
+        if self._l2c2_distance_name == "a function":
+            self._watch.see_distance(difference)
         penalty = self._penalty(difference, near, tensordict)
         terms.set("loss_l2c2_actor", self.scaled(penalty, "l2c2_coeff"))
         terms.set(self._l2c2_policy_diagnostic, self._diagnostic(difference, near, tensordict))

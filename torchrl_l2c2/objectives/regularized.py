@@ -246,6 +246,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         else:
             terms.update(added)
         if not is_compiling() and self.training and torch.is_grad_enabled():
+            self._watch.see_added(self, added, None if found is None else terms.get(found))
             self._watch.see_call(self, tensordict)
             self._watch.see_forward(self, terms)
             self._warn_of_changed_base()
@@ -489,7 +490,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             0.25
         """
         progress = as_number("progress", progress)
-        hint = "It is the share of training that is over: frames / total_frames."
+        hint = "It is frames / total_frames; above 1 only if the last rollout exceeds the total."
         check_real("progress", progress, at_least=0, at_most=2, hint=hint)
         if self._ramp is None:
             return

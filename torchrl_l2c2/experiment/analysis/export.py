@@ -179,7 +179,7 @@ def _compare(
     mean: MeanPolicy, act: Callable[[Any], Any], observations: Tensor, kind: str
 ) -> dict[str, float | int]:
     expected = mean(observations).numpy()
-    difference = float(np.abs(act(observations.numpy()) - expected).max())
+    difference = float(np.abs(np.asarray(act(observations.numpy())) - expected).max())
     largest = float(np.abs(expected).max())
     if not difference <= TOLERANCE * max(1.0, largest):
         raise UserError(

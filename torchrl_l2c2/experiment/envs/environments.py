@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 import numpy as np
 import torch
+from torchrl.data import Bounded
 from torchrl.envs import EnvBase, GymWrapper, TransformedEnv
 
 from torchrl_l2c2.experiment.envs.pictures import Drawing, PictureRecorder
@@ -183,6 +184,21 @@ def time_limit(task: TaskConfig) -> int:
             "task.max_steps, for example to 1000."
         )
     return registered
+
+
+def action_range(env: EnvBase) -> str:
+    """The bounds of an environment's actions, in words.
+
+    Examples:
+        >>> from torchrl.envs import GymEnv
+        >>> action_range(GymEnv("Pendulum-v1"))
+        'from [-2.0] to [2.0]'
+    """
+    spec = env.action_spec
+    if not isinstance(spec, Bounded):
+        return f"{type(spec).__name__} {list(spec.shape)}"
+    low, high = (bound.flatten().tolist() for bound in (spec.space.low, spec.space.high))
+    return f"from {low} to {high}"
 
 
 def untransformed(env: EnvBase) -> Any:

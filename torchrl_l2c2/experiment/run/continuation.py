@@ -44,6 +44,20 @@ def check_same_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> Non
         )
 
 
+def check_same_actions(saved: str, now: str) -> None:
+    """Checks that a task of the user's own has the actions of the checkpoint.
+
+    Raises:
+        OtherRunError: If the :func:`~.environments.action_range` has changed; states both.
+    """
+    if saved != now:
+        raise OtherRunError(
+            f"the task's actions were {saved} in the checkpoint and are {now}: its code has "
+            "changed. Use the same code, or start in another folder (on the command line, "
+            "outputs=FOLDER). Nothing was changed."
+        )
+
+
 def differing_versions(saved: Mapping[str, str], now: Mapping[str, str]) -> str:
     """Names the packages whose versions differ, which may change the numbers; empty if none do.
 

@@ -14,7 +14,7 @@ from torchrl_l2c2.experiment.agents._torchrl_internals import load_replay_state,
 from torchrl_l2c2.experiment.agents.build import make_agent
 from torchrl_l2c2.experiment.agents.optimizers import anneal
 from torchrl_l2c2.experiment.collect.player import Episode, Player, make_collector
-from torchrl_l2c2.experiment.envs.environments import TEST_SEED, make_env
+from torchrl_l2c2.experiment.envs.environments import TEST_SEED, action_range, make_env
 from torchrl_l2c2.experiment.errors import UserError
 from torchrl_l2c2.experiment.learn.compilation import compiler_available
 from torchrl_l2c2.experiment.learn.learner import Learner, untrained_reason
@@ -24,6 +24,7 @@ from torchrl_l2c2.experiment.run.checkpoints import save_checkpoint
 from torchrl_l2c2.experiment.run.continuation import (
     add_checkpoint_to_errors,
     check_length,
+    check_same_actions,
     check_same_settings,
     find_checkpoint,
 )
@@ -103,6 +104,7 @@ class Experiment:
         self._process = ProcessState(config.seed, config.threads)
         with self._process:
             env = make_env(config.task, config.seed)
+            self._actions = action_range(env)
             self.agent = make_agent(config, env)
             self.learner = Learner(
                 self.agent,
@@ -231,6 +233,7 @@ class Experiment:
         return {
             "config": json.dumps(self.config.to_dict()),
             "versions": json.dumps(versions()),
+            "actions": self._actions,
             **{name: part.state_dict() for name, part in self._parts().items()},
             "replay": replay_state(self.learner.replay),
             "collector": self.player.collector.generator_state(),
@@ -244,10 +247,11 @@ class Experiment:
         """Restores a state of :meth:`state_dict`.
 
         Raises:
-            OtherRunError: If the state belongs to a run with other settings.
+            OtherRunError: If the state belongs to a run with other settings or another task.
         """
         learner = self.learner
         check_same_settings(json.loads(state["config"]), self.config.to_dict())
+        check_same_actions(state.get("actions", self._actions), self._actions)
         for name, part in self._parts().items():
             part.load_state_dict(state[name])
         load_replay_state(learner.replay, state["replay"])

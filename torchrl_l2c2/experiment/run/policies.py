@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import importlib.util
 import io
+import json
 import math
 import sys
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -62,6 +64,9 @@ def load_policy(
         SettingError: If ``noise_scale`` is negative or not finite, or NumPy does not accept
             ``seed``.
 
+    Warns:
+        UserWarning: If the run is not finished: the policy is from its newest checkpoint.
+
     Examples:
         >>> import tempfile
         >>> from torchrl_l2c2.experiment import Experiment, ExperimentConfig, TaskConfig
@@ -95,6 +100,11 @@ def load_policy(
         )
     elif newest := load_newest(folder):
         agent.load_networks(newest[1])
+        warnings.warn(
+            f"{str(folder)!r} is not finished: this is its policy after "
+            f"{len(json.loads(newest[1]['metrics']))} episodes, from the newest checkpoint.",
+            stacklevel=2,
+        )
     else:
         raise FileNotFoundError(f"{str(folder)!r} has neither policy.pt nor a checkpoint yet.")
     return agent.policy, env, time_limit(config.task)
