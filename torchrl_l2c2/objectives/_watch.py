@@ -320,14 +320,16 @@ def _warn_of_zeros(loss: Any, batch: TensorDictBase) -> None:
     if done is None:
         return
     ends = done.reshape(*batch.batch_size, -1).any(-1)
+    if (count := int(ends.sum())) < 2:
+        return
     read = (loss._evaluation.specs[name].states for name in loss._followed)
     for key in {key for states in read for key in states}:
         here, successor = (batch.get(each, None) for each in (key, next_key(key)))
-        if here is None or successor is None or int(ends.sum()) < 2:
+        if here is None or successor is None:
             continue
         if not successor[ends].any() and here[ends].flatten(1).any(1).all():
             warnings.warn(
-                f"the next {key!r} is 0 at all {int(ends.sum())} ends of episodes in the batch, as "
+                f"the next {key!r} is 0 at all {count} ends of episodes in the batch, as "
                 "TorchRL's GymEnv(..., num_envs=2) stores it with Gymnasium 1. It then stores a "
                 "step across the reset, too. Values and penalties of both are wrong: use "
                 "ParallelEnv, or GymWrapper(gymnasium.make_vec(...)) with "
