@@ -581,9 +581,11 @@ def test_a_full_disk_names_the_file_and_the_last_good_checkpoint(tmp_path, monke
 
 
 def test_a_warning_is_a_line_in_the_log_too(tmp_path, capsys):
-    """And not Python's, with a line of its source."""
+    """And not Python's, with a line of its source; once, though filters change between."""
     with warnings_as_lines(partial(show_and_log, tmp_path)):
-        warnings.warn("hardly regularized", stacklevel=1)
+        for _ in range(2):
+            warnings.warn("hardly regularized", stacklevel=1)
+            warnings.simplefilter("always")
     assert capsys.readouterr().err == "warning: hardly regularized\n"
     assert (tmp_path / "train.log").read_text().endswith(" warning: hardly regularized\n")
 

@@ -1209,6 +1209,15 @@ class TestRelativeParts:
             smooth(sac(), policy_distance="mean", neighbors="line")
             smooth(sac(), "cats")
 
+    @pytest.mark.parametrize(
+        ("given", "named"),
+        [({"policy_distance": "menn"}, "policy_distance"), ({"neighbors": "lin"}, "neighbors")],
+    )
+    def test_an_unknown_name_is_an_error_without_advice_on_gains(self, given, named):
+        with warnings.catch_warnings(), pytest.raises(ValueError, match=named):
+            warnings.simplefilter("error")
+            smooth(sac(), **given)
+
     def test_a_neighborhood_of_other_neighbors_than_the_presets(self):
         with pytest.warns(UserWarning, match="neighbors='box' .* replaces the preset's 'line'"):
             smooth(sac(), neighborhood=Neighborhood(lambda_min=3.0, lambda_max=300.0))

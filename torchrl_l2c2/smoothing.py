@@ -108,13 +108,15 @@ def smooth(
     if "relative" in overrides:
         check_bool("relative", overrides["relative"])
     check_evaluates_states(loss)
-    chosen = _chosen(loss, method, overrides)
+    chosen, doubts = _chosen(loss, method, overrides)
     make = getattr(objectives, METHODS[method])
     arguments = _arguments(method, make, chosen.settings)
     with warnings.catch_warnings():
         if chosen.relative:  # The size of such a gain says nothing.
             warnings.filterwarnings("ignore", "gains up to .* had no measurable effect")
         regularized = make(loss, **arguments)
+    for doubt in doubts:  # After the errors.
+        warnings.warn(doubt, stacklevel=2)
     if chosen.ramp is not None:
         regularized.ramp(chosen.ramp)
     regularized.strength = strength
@@ -123,58 +125,60 @@ def smooth(
     return regularized.fold() if fold else regularized
 
 
-def _chosen(loss: LossModule, method: str, overrides: Mapping[str, Any]) -> Preset:
-    """The preset of a loss with overrides; warns if it was not tuned with this loss."""
+def _chosen(
+    loss: LossModule, method: str, overrides: Mapping[str, Any]
+) -> tuple[Preset, list[str]]:
+    """The preset of a loss with overrides, and warnings if it probably does not suit the loss."""
     name = type(loss).__name__
     kind, exact = kind_of(type(loss))
     if kind is None:
         return _of_nearest(loss, method, overrides)
     chosen = preset(method, kind)
     found_with = KINDS[kind][0][0]
+    doubts = []
     if chosen.evidence is None and GAIN_SETTING[method] not in overrides:
-        warnings.warn(
+        doubts.append(
             f"{method} takes settings that were not tuned, {_shown(chosen.shown)}: there are no "
-            f"recorded runs of it with losses like {found_with}.",
-            stacklevel=3,
+            f"recorded runs of it with losses like {found_with}."
         )
     elif not exact and chosen.evidence is not None:
-        warnings.warn(
+        doubts.append(
             f"{name} takes the preset of {found_with}, the nearest: it was found with that on "
-            f"{chosen.tasks}, and not tried with {name}.",
-            stacklevel=3,
+            f"{chosen.tasks}, and not tried with {name}."
         )
-    _warn_of_mismatch(method, chosen, overrides)
-    return chosen.overridden(overrides)
+    return chosen.overridden(overrides), doubts + _mismatches(method, chosen, overrides)
 
 
-def _warn_of_mismatch(method: str, chosen: Preset, overrides: Mapping[str, Any]) -> None:
-    """Warns of a neighborhood or a gain that probably does not suit the preset."""
+def _mismatches(method: str, chosen: Preset, overrides: Mapping[str, Any]) -> list[str]:
+    """Warnings of a neighborhood or a gain that probably does not suit the preset."""
     name, near = GAIN_SETTING[method], overrides.get("neighborhood")
     kind = getattr(near, "neighbors", None)
     usual = chosen.settings.get("neighbors", kind)
+    doubts = []
     if kind is not None and kind != usual:
-        warnings.warn(
+        doubts.append(
             f"neighbors={kind!r} of the neighborhood replaces the preset's {usual!r}, and changes "
-            f"the mean gain: give the fields, such as lambda_min=..., or neighbors={usual!r}.",
-            stacklevel=4,
+            f"the mean gain: give the fields, such as lambda_min=..., or neighbors={usual!r}."
         )
     for setting in ("policy_distance", "neighbors"):
         usual, given = chosen.settings.get(setting), overrides.get(setting)
         differs = usual is not None and given is not None and given != usual
         if differs and not overrides.keys() & {name, "neighborhood"}:
-            warnings.warn(
+            doubts.append(
                 f"{setting}={given!r} is taken with the preset's {name}={chosen.settings[name]!r}, "
-                f"which was found with {usual!r}: give {name}, too.",
-                stacklevel=4,
+                f"which was found with {usual!r}: give {name}, too."
             )
     gain = overrides.get(name, getattr(near, name, chosen.settings[name]))
     relative = overrides.get("relative", chosen.relative)
     given = {"relative", name} <= overrides.keys() or not isinstance(gain, int | float)
     if not given and (mixed := mixed_units(method, chosen, gain, relative)):
-        warnings.warn(f"{mixed}: give both {name} and relative.", stacklevel=4)
+        doubts.append(f"{mixed}: give both {name} and relative.")
+    return doubts
 
 
-def _of_nearest(loss: LossModule, method: str, overrides: Mapping[str, Any]) -> Preset:
+def _of_nearest(
+    loss: LossModule, method: str, overrides: Mapping[str, Any]
+) -> tuple[Preset, list[str]]:
     """The settings of a loss without a preset: the gain is given, others are the nearest preset's.
 
     Raises:
@@ -202,13 +206,12 @@ def _of_nearest(loss: LossModule, method: str, overrides: Mapping[str, Any]) -> 
         )
     chosen = nearest.overridden(overrides)
     kept = chosen.settings.keys() | {"ramp", "relative"}
-    if taken := {k: v for k, v in settings.items() if k in kept and k not in overrides}:
-        warnings.warn(
-            f"{name} has no preset: settings that are not given come from the preset of "
-            f"{found_with}, the nearest: {_shown(taken)}.",
-            stacklevel=4,
-        )
-    return chosen
+    taken = {k: v for k, v in settings.items() if k in kept and k not in overrides}
+    doubt = (
+        f"{name} has no preset: settings that are not given come from the preset of "
+        f"{found_with}, the nearest: {_shown(taken)}."
+    )
+    return chosen, [doubt] if taken else []
 
 
 def _nearest_kind(loss: LossModule) -> str:

@@ -73,14 +73,18 @@ def show_cause(error: Exception) -> None:
 
 @contextmanager
 def warnings_as_lines(log: Callable[[str], Any]) -> Iterator[None]:
-    """Passes warnings to a function as plain lines, without file and line number.
+    """Passes warnings to a function as plain lines, without file and line number, each once.
 
     Args:
         log (callable): Function that receives each line.
     """
+    shown: set[str] = set()
 
     def show(message: Warning | str, *_: Any, **__: Any) -> None:
-        log(f"warning: {message}")
+        # Python shows a warning again after every change of its filters.
+        if (line := f"warning: {message}") not in shown:
+            shown.add(line)
+            log(line)
 
     with warnings.catch_warnings():
         warnings.showwarning = show
