@@ -3,6 +3,7 @@
 import copy
 import math
 
+import gymnasium
 import pytest
 import torch
 from tensordict import TensorDict
@@ -277,6 +278,12 @@ def test_compiled_they_give_the_same_numbers():
         (lambda: make_actor(3, Bounded(-1.0, math.inf, (2,))), ValueError, "needs finite bounds"),
         (lambda: make_actor(3, Bounded(1.0, 1.0, (2,))), ValueError, r"got \[1.0, 1.0\] and \[1.0"),
         (lambda: make_actor(3, 1, in_keys=()), ValueError, "in_keys must name at least one"),
+        (lambda: make_actor(3, 1, in_keys=None), ValueError, "in_keys must name at least one"),
+        (
+            lambda: make_actor(3, gymnasium.spaces.Box(-1.0, 1.0, (1,))),
+            TypeError,
+            r"such as env.action_spec_unbatched, .* got Box",
+        ),
         (lambda: make_actor(3, 1, scale_mapping=3), TypeError, "must be a name, .* got 3"),
         (lambda: make_actor(3, Bounded(-1.0, 1.0, (4, 2))), ValueError, "action_spec_unbatched"),
         (lambda: make_actor(3, Categorical(4)), TypeError, "must be continuous"),

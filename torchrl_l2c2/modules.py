@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from numbers import Integral
 from typing import Literal
 
 import torch
@@ -172,6 +173,11 @@ def make_actor(
     check_choice("make_actor: squash", squash, tuple(DISTRIBUTIONS))
     spec = action
     if not isinstance(spec, TensorSpec):
+        if not isinstance(spec, Integral):
+            raise TypeError(
+                "make_actor: action must be a TorchRL spec, such as env.action_spec_unbatched, or "
+                f"the number of actions, got {spec!r}."
+            )
         check_positive_int("make_actor: the number of actions", action)
         spec = Bounded(low=-1.0, high=1.0, shape=(action,))
     size = _action_size(spec)
@@ -278,7 +284,7 @@ def _body(
 
 def _read(in_keys: str | Sequence[NestedKey]) -> list[NestedKey]:
     """A string is one key, and not its letters."""
-    keys = [in_keys] if isinstance(in_keys, str) else list(in_keys)
+    keys = [in_keys] if isinstance(in_keys, str) else list(in_keys or ())
     if not keys:
         raise ValueError("in_keys must name at least one observation, got none.")
     return keys
