@@ -61,7 +61,7 @@ def measure(number: int, gains: dict[str, Any], episodes: int) -> list[float]:
     return [statistics.fmean(float(test[key]) for test in found) for key in keys]
 
 
-def main(trials: int, episodes: int) -> None:
+def main(trials: int = 2, episodes: int = 1) -> None:
     study = open_study(episodes)
     for lost in study.get_trials(states=(TrialState.RUNNING,)):
         study.tell(lost.number, measure(lost.number, lost.params, episodes))
@@ -76,4 +76,4 @@ def main(trials: int, episodes: int) -> None:
 
 
 if __name__ == "__main__":
-    main(*(int(number) for number in sys.argv[1:] or ("2", "1")))
+    main(*map(int, sys.argv[1:]))
