@@ -292,6 +292,24 @@ class TestThePenalty:
         (message,) = (str(each.message) for each in told)
         assert message.startswith("the neighbors in the batch are of another neighborhood")
 
+    @pytest.mark.parametrize("bound", [None, 2.0])
+    def test_the_losss_max_step_counts_whatever_the_transforms_is(self, bound):
+        """As if the far transitions were not in the batch."""
+        torch.manual_seed(0)
+        batch = transitions(6)
+        batch["next", "observation"][::2] = batch["observation"][::2] + 1.0  # length sqrt(3)
+        batch["next", "observation"][1::2] = batch["observation"][1::2] + 0.1
+        stored = NeighborTransform(replace(NEAR, max_step=bound), num_samples=2)(batch)
+        near = replace(NEAR, max_step=1.0)
+        loss = L2C2Loss(DDPGLoss(deterministic_actor(), qvalue()), near, num_samples=2)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            found = loss.policy_regularizer(stored)
+        expected = loss.policy_regularizer(stored[1::2])
+        for key in ("loss_l2c2_actor", "l2c2_gain"):
+            torch.testing.assert_close(found[key], expected[key], rtol=1e-5, atol=0.0)
+        assert (found["l2c2_counted"], expected["l2c2_counted"]) == (0.5, 1.0)
+
     def test_a_maximum_over_fewer_neighbors_is_told(self):
         """It would be smaller; a mean over fewer neighbors is as large."""
         torch.manual_seed(0)
@@ -333,6 +351,44 @@ class TestThePenalty:
                 loss.policy_regularizer(own)
         loss = L2C2Loss(DDPGLoss(deterministic_actor(), qvalue()), near)
         assert loss.policy_regularizer(own[:0])["loss_l2c2_actor"].isnan()
+
+    @pytest.mark.parametrize(
+        "other",
+        [
+            {"neighbors": "line"},
+            {"lambda_max": 10.0},  # distances that are too small
+            {"lambda_max": 0.25},  # and too large
+            {"sigma": 0.25, "lambda_max": 0.25},  # the same epsilon, and a smaller box
+        ],
+    )
+    def test_neighbors_of_another_box_are_told(self, other):
+        torch.manual_seed(0)
+        near = Neighborhood(sigma=1.0, lambda_min=0.2, lambda_max=1.0)
+        loss = L2C2Loss(DDPGLoss(deterministic_actor(), qvalue()), near, num_samples=4)
+        own = loss.neighbor_transform()(transitions(6))
+        theirs = NeighborTransform(replace(near, **other), num_samples=4)(transitions(6))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            loss.policy_regularizer(own)
+        loss = L2C2Loss(DDPGLoss(deterministic_actor(), qvalue()), near, num_samples=4)
+        with pytest.warns(UserWarning, match="another neighborhood than"):
+            loss.policy_regularizer(theirs)
+
+    @pytest.mark.parametrize(
+        ("change", "named"),
+        [
+            (torch.Tensor.double, r"\(6, 3\) torch.float32 and the states \(6, 3\) torch.float64"),
+            (lambda state: state.unsqueeze(1), r"\(6, 3\) .* and the states \(6, 1, 3\)"),
+        ],
+    )
+    def test_neighbors_before_a_change_of_shape_or_dtype_are_an_error(self, change, named):
+        """And not torch's error in the network."""
+        loss = L2C2Loss(DDPGLoss(deterministic_actor(), qvalue()), NEAR)
+        batch = loss.neighbor_transform()(transitions(6))
+        for key in ("observation", ("next", "observation")):
+            batch[key] = change(batch[key])
+        with pytest.raises(ValueError, match=rf"{named}.*after all transforms"):
+            loss.policy_regularizer(batch)
 
     def test_a_nested_key_without_a_list_is_told_to_be_put_into_one(self):
         """A tuple is a sequence of names elsewhere."""

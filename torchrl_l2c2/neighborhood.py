@@ -258,14 +258,21 @@ class Neighborhood:
         distance = u.abs().reshape(*uniform.shape[: batch_dims + 1], drawn.numel()).amax(-1)
         distance = (distance + self.epsilon).masked_fill(~known.unsqueeze(-1), math.inf)
         if self.max_step is not None:
-            step = displacement.reshape(*batch, features.numel()).square().sum(-1).sqrt()
-            too_long = step > self.max_step
+            too_long = step_length(state, next_state, batch_dims) > self.max_step
             distance = distance.masked_fill(too_long.unsqueeze(-1), math.inf)
             too_long = too_long.reshape(*batch, *(1 for _ in features))
             displacement = displacement.masked_fill(too_long, 0.0)
         u = u.reshape(*u.shape, *(1 for _ in features)) if self.on_line else u
         neighbor = state.unsqueeze(batch_dims) + displacement.unsqueeze(batch_dims) * u
         return neighbor.to(dtype), distance
+
+
+def step_length(state: Tensor, next_state: Tensor, batch_dims: int) -> Tensor:
+    """The length of steps, ``[*B]``; entries that are not finite count as not having moved."""
+    if state.itemsize < 4:
+        state, next_state = state.float(), next_state.float()
+    step = torch.nan_to_num(next_state - state, nan=0.0, posinf=0.0, neginf=0.0)
+    return step.reshape(*step.shape[:batch_dims], step.shape[batch_dims:].numel()).norm(dim=-1)
 
 
 def _check_states(state: Tensor, next_state: Tensor, batch_dims: int) -> None:

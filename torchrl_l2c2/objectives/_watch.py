@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.compiler import is_compiling
 
-from torchrl_l2c2.neighborhood import Neighborhood
+from torchrl_l2c2.neighborhood import Neighborhood, step_length
 from torchrl_l2c2.objectives._batch import next_key
 
 PATIENCE = 50
@@ -212,8 +212,11 @@ class TermWatch:
     ) -> None:
         """Warns of neighbors that were drawn before a transform changed the observations.
 
-        Also of another number of them for ``over_neighbors="max"``, and on a line of neighbors of
-        another neighborhood. Observations with neighbors are floating point.
+        Also of another number of them for ``over_neighbors="max"``, and of neighbors of another
+        neighborhood. Observations with neighbors are floating point.
+
+        Raises:
+            ValueError: the neighbors have another shape or dtype than the observations.
         """
         if (
             is_compiling()
@@ -223,19 +226,10 @@ class TermWatch:
             return
         self._warned.add("neighbors")
         distance = neighbors.get("distance", None)
-        if near.max_step is None and distance is not None and bool(distance.isinf().any()):
-            far = distance.isinf().flatten(batch.batch_dims).any(-1)
-            ends = [
-                batch.get(each, None)
-                for key in neighbors.keys(True, True)
-                if key != "distance"
-                for each in (key, next_key(key))
-            ]
-            known = [each[far].isfinite().all() for each in ends if each is not None]
-            if known and all(map(bool, known)):
-                self._warned.add("counts")
-                warnings.warn(_ELSEWHERE.format(type(loss).__name__), stacklevel=5)
-                return
+        if distance is not None and _leaves_out(neighbors, distance, batch, near.max_step):
+            self._warned.add("counts")
+            warnings.warn(_ELSEWHERE.format(type(loss).__name__), stacklevel=5)
+            return
         drawn, wanted = distance.shape[-1] if distance is not None else 0, loss.l2c2_num_samples
         if drawn != wanted and loss.l2c2_over_neighbors == "max":
             warnings.warn(
@@ -248,6 +242,14 @@ class TermWatch:
             here, successor = batch.get(key, None), batch.get(next_key(key), None)
             if here is None or successor is None or here.shape != successor.shape:
                 continue
+            first = there.select(neighbors.batch_dims, 0)
+            if first.shape != here.shape or first.dtype != here.dtype:
+                raise ValueError(
+                    f"the neighbors of {key!r} in the batch are {tuple(first.shape)} {first.dtype} "
+                    f"and the states {tuple(here.shape)} {here.dtype}: append "
+                    "neighbor_transform() after all transforms that change observations, such as "
+                    "DoubleToFloat and FlattenObservation."
+                )
             # [*B, K, *F] and [*B, *F]
             there = there.movedim(neighbors.batch_dims, 0)
             span = near.radius * (successor - here).abs()
@@ -262,42 +264,76 @@ class TermWatch:
                     stacklevel=5,
                 )
                 return
-            if distance is None or not near.on_line:
-                continue
-            if _is_elsewhere(here, successor, there, distance.movedim(-1, 0), near):
+            if distance is not None and _is_elsewhere(
+                here, successor, there, distance.movedim(-1, 0), near
+            ):
                 warnings.warn(_ELSEWHERE.format(type(loss).__name__), stacklevel=5)
                 return
+
+
+def _leaves_out(
+    neighbors: TensorDictBase, distance: Tensor, batch: TensorDictBase, max_step: float | None
+) -> bool:
+    """Checks if transitions are left out whose observations are known and whose step is short."""
+    far = distance.isinf().flatten(batch.batch_dims).any(-1)
+    known = []
+    for key in neighbors.keys(include_nested=True, leaves_only=True):
+        here, successor = batch.get(key, None), batch.get(next_key(key), None)
+        if key == "distance" or here is None or successor is None:
+            continue
+        known += [here, successor]
+        if max_step is not None and here.shape == successor.shape:
+            far = far & (step_length(here, successor, batch.batch_dims) < 0.99 * max_step)
+    return (
+        bool(far.any()) and bool(known) and all(bool(each[far].isfinite().all()) for each in known)
+    )
 
 
 def _is_elsewhere(
     here: Tensor, successor: Tensor, there: Tensor, distance: Tensor, near: Neighborhood
 ) -> bool:
-    """Checks if neighbors are off the line to the successor, or have distances of another one.
+    """Checks if neighbors or their distances cannot be of a neighborhood.
 
     Args:
         here: observations, ``[*B, *F]``.
         successor: their successors.
         there: their neighbors, ``[K, *B, *F]``.
         distance: the neighbors' distances, ``[K, *B]``.
-        near: a neighborhood on a line.
+        near: the neighborhood.
     """
     rows, size = distance[0].numel(), here.shape[distance.ndim - 1 :].numel()
+    eps = torch.finfo(here.dtype).eps
+    if here.itemsize < 4:
+        here, successor, there = here.float(), successor.float(), there.float()
     here, successor = here.reshape(rows, size), successor.reshape(rows, size)
     there = there.reshape(len(distance), rows, size)
     distance = distance.reshape(len(distance), rows)
     step = successor - here
-    # Coordinates that hardly move do not tell the place on the line.
+    # Coordinates that hardly move do not tell the place in the box, nor do overflows.
     moved = step.abs() > 0.1 * step.abs().amax(-1, keepdim=True)
-    rounding = 16 * torch.finfo(here.dtype).eps * (here.abs() + successor.abs()) / step.abs()
+    moved = moved & step.isfinite() & there.isfinite().all(0)
+    rounding = 16 * eps * (here.abs() + successor.abs()) / step.abs()
     allowed = 0.02 * near.radius + torch.where(moved, rounding, 0.0).amax(-1)
     place = ((there - here) / step).abs()
     low, high = (torch.where(moved, place, end) for end in (torch.inf, -torch.inf))
     low, high = low.amin(-1), high.amax(-1)
     off_line = high - low > allowed
+    known = moved.any(-1) & distance.isfinite()
+    if not known.any():
+        return False
     # A distance is rounded relative to its size.
-    allowed = allowed + 16 * torch.finfo(distance.dtype).eps * distance
-    wrong = off_line | ((distance - near.epsilon - high).abs() > allowed)
-    return bool((wrong & moved.any(-1) & distance.isfinite()).any())
+    margin = allowed + 16 * torch.finfo(distance.dtype).eps * distance
+    drawn = distance - near.epsilon
+    wrong = (drawn < high - margin) | (drawn > near.radius + margin)
+    if near.on_line:
+        wrong = wrong | off_line | (drawn > high + margin)
+    # The probability that all draws lie so far inside is 1e-6.
+    inside = near.radius * 1e-6 ** (1 / int(known.sum()))
+    if bool((wrong & known).any()) or bool((drawn + margin)[known].max() < inside):
+        return True
+    # The draws of a box differ between coordinates.
+    told = known & (moved.sum(-1) > 1) & (allowed < 0.04 * near.radius)
+    return not near.on_line and int(told.sum()) >= 8 and not bool((told & off_line).any())
 
 
 def _warn_of_several_steps(batch: TensorDictBase) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from typing import ClassVar, Literal, NamedTuple
@@ -21,7 +23,7 @@ from torchrl_l2c2._checks import (
     read_key,
 )
 from torchrl_l2c2.distances import squared_error, squared_hellinger
-from torchrl_l2c2.neighborhood import Neighborhood
+from torchrl_l2c2.neighborhood import Neighborhood, step_length
 from torchrl_l2c2.objectives._batch import at_rows, next_key
 from torchrl_l2c2.objectives._networks import VALUE_NETWORKS
 from torchrl_l2c2.objectives.regularized import GAIN, RegularizedLoss
@@ -389,18 +391,39 @@ class L2C2Loss(RegularizedLoss):
 
     def _make_neighbors(self, tensordict: TensorDictBase) -> Neighbors:
         rows = self.sample_rows("l2c2", tensordict, self.l2c2_fraction)
-        neighbor = tensordict.get(self.l2c2_neighbor_key, None)
-        if neighbor is None:
+        neighbor = stored = tensordict.get(self.l2c2_neighbor_key, None)
+        if stored is None:
             neighbor = self._draw(tensordict, rows)
         else:
-            self._watch.see_neighbors(self, neighbor, tensordict, self.l2c2_neighborhood)
-            neighbor = at_rows(neighbor, rows)
+            self._watch.see_neighbors(self, stored, tensordict, self.l2c2_neighborhood)
+            neighbor = at_rows(stored, rows)
         states, distance = _read_neighbors(neighbor, self.l2c2_neighbor_key)
+        if stored is not None and self.l2c2_neighborhood.max_step is not None:
+            # The transform that drew the neighbors may have another bound, or none.
+            distance = distance.masked_fill(self._too_long(tensordict, states, rows), math.inf)
         counts = distance[0].isfinite()
         self._watch.see_counts(self, counts, self.l2c2_neighborhood.max_step)
         if (ends := self._ends(tensordict)) is not None:
             counts = counts & ~(ends if rows is None else ends.flatten()[rows])
         return Neighbors(states, distance, counts, rows)
+
+    def _too_long(
+        self, tensordict: TensorDictBase, states: TensorDictBase, rows: Tensor | None
+    ) -> Tensor:
+        """The mask of transitions with a step longer than ``max_step``, ``[*B]``."""
+        keys = list(states.keys(include_nested=True, leaves_only=True))
+        batch = tensordict.select(*keys, *map(next_key, keys), strict=False).detach()
+        batch = at_rows(batch, rows)
+        steps = [(batch.get(key, None), batch.get(next_key(key), None)) for key in keys]
+        lengths = [
+            step_length(here, successor, batch.batch_dims)
+            for here, successor in steps
+            if here is not None and successor is not None
+        ]
+        bound = self.l2c2_neighborhood.max_step or math.inf
+        too_long = [length > bound for length in lengths]
+        none = torch.zeros(batch.batch_size, dtype=torch.bool, device=states.device)
+        return functools.reduce(torch.logical_or, too_long, none)
 
     def _draw(self, tensordict: TensorDictBase, rows: Tensor | None) -> TensorDictBase:
         """Draws the entry that NeighborTransform would have written."""
