@@ -424,6 +424,9 @@ class TestWords:
         assert "small" not in kinds(made_up(shares={**own, "caps": TermShare(True, 0.1)}))
         by_size = said(made_up(shares={**own, "caps": TermShare(True, 5e-4)}), "small")
         assert "caps 0.05% of the loss" in by_size.text and by_size.fault
+        assert by_size.text.endswith("raise their gains.")
+        none = said(made_up(shares={"l2c2_actor": TermShare(True, 0.0, 0.0)}), "small")
+        assert "change nothing; raise max_step if" in none.text
         both = said(made_up(shares={"a": faint, "b": strong}), "small")
         assert both.text.startswith("Some") and not both.fault
 

@@ -672,8 +672,11 @@ class TestWhatIsRefused:
         batch = transitions(4)
         batch["other"] = batch["next", "other"] = torch.randn(4, 2)
         with_neighbors(batch, in_keys=["other"])
-        with pytest.raises(KeyError, match=r"inputs of actor_network.*'other'.*in_keys"):
+        message = r"inputs of actor_network.*'other'.*in_keys.*another neighbor_key"
+        with pytest.raises(KeyError, match=message):
             loss(batch)
+        batch = L2C2Loss(ddpg(), neighbor_key="own").neighbor_transform()(batch)
+        assert L2C2Loss(ddpg(), neighbor_key="own")(batch)["loss_l2c2_actor"] > 0
 
     @pytest.mark.parametrize("call", ["forward", "loss_actor", "policy_regularizer"])
     def test_a_batch_without_a_batch_size(self, call):

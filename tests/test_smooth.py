@@ -693,7 +693,7 @@ class TestPresets:
         nearest, call = re.search(
             r"The nearest is the preset of (\w+); .*: (smooth\(.*\))\.$", str(error.value)
         ).groups()
-        kind = "td3" if name == "TD3BC" else "sac" if "IQL" in name or "SAC" in name else "ppo"
+        kind = {"TD3BC": "td3", "DiscreteSAC": "sac"}.get(name, "ppo")
         assert nearest == KINDS[kind][0][0]
         with warnings.catch_warnings():
             warnings.simplefilter("error")
@@ -735,11 +735,13 @@ class TestPresets:
     def test_without_a_preset_single_settings_replace_those_of_the_nearest(self):
         """As they replace a preset's; the others are told."""
         (case,) = (case for case in CASES if case.name == "IQL")
-        with pytest.warns(UserWarning, match=r"of SACLoss, the nearest: policy_dist.*ramp=1\.0\.$"):
+        with pytest.warns(
+            UserWarning, match=r"of ClipPPOLoss, the nearest: policy_dist.*ramp=1\.0\.$"
+        ):
             loss = smooth(case.make(), lambda_min=20.0)
         near = loss.l2c2_neighborhood
-        assert (near.lambda_min, near.lambda_max, near.neighbors) == (20.0, 1000.0, "line")
-        assert loss.l2c2_policy_distance == "mean" and loss._ramp == (1.0, 1.0)
+        assert (near.lambda_min, near.lambda_max, near.neighbors) == (20.0, 100.0, "line")
+        assert loss.l2c2_policy_distance == "mse" and loss._ramp == (1.0, 1.0)
         with pytest.warns(UserWarning, match="has no preset") as told:
             loss = smooth(case.make(), neighborhood=Neighborhood(0.3, 2.0, 5.0))
         assert "lambda_max" not in str(told[0].message)

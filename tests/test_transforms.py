@@ -298,7 +298,7 @@ def test_one_name_is_a_state_of_one_part():
 def test_integer_states_have_no_neighbors():
     """Integer observations are refused."""
     data = transitions(4).apply(lambda x: x.long())
-    with pytest.raises(TypeError, match=r"torch\.int64"):
+    with pytest.raises(TypeError, match=r"torch\.int64: .* after .* such as ToTensorImage"):
         NeighborTransform(NEAR)(data)
 
 

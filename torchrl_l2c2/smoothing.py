@@ -15,7 +15,7 @@ from torchrl_l2c2._checks import as_number, check_bool, check_real, describe_no_
 from torchrl_l2c2.neighborhood import Neighborhood
 from torchrl_l2c2.objectives import RegularizedLoss
 from torchrl_l2c2.objectives._batch import check_evaluates_states
-from torchrl_l2c2.objectives._networks import POLICY_NETWORK, VALUE_NETWORKS
+from torchrl_l2c2.objectives._networks import IMITATING, POLICY_NETWORK, VALUE_NETWORKS
 from torchrl_l2c2.presets import (
     GAIN_SETTING,
     KINDS,
@@ -39,7 +39,8 @@ def smooth(
 
     The result is a loss of the same class with the same parameters. Train it as before: the penalty
     is added to ``loss_actor`` or ``loss_objective``, and a value function's to its loss, so loops
-    that sum terms by name, or all ``loss_*`` keys, need no change. The penalty is reported as
+    that sum terms by name, or all ``loss_*`` keys, need no change. (CQL has two terms of the
+    policy, each with the penalty: a loop minimizes one at a time.) The penalty is reported as
     ``penalty_*``.
 
     The presets are in ``torchrl_l2c2.presets.PRESETS``. The gain of ``"l2c2"`` and ``"cats"`` with
@@ -219,6 +220,8 @@ def _nearest_kind(loss: LossModule) -> str:
         return "ppo_rpe"  # The only preset that smooths values.
     if isinstance(loss, TD3BCLoss):
         return "td3"
+    if isinstance(loss, IMITATING):
+        return "ppo"  # Its policy term does not grow with the action values.
     return "sac" if getattr(loss, "qvalue_network", None) is not None else "ppo"
 
 

@@ -326,7 +326,8 @@ class EvaluatedNetworks:
             raise KeyError(
                 f"none of the inputs of {network}, {list(spec.inputs)}, is among the states to "
                 f"compare, {list(states.keys(True, True))}: name its observation in the in_keys "
-                "of the transform that wrote them."
+                "of the transform that wrote them. If that was another loss's transform, choose "
+                "another neighbor_key for this loss."
             )
         rows = inputs.expand(states.batch_size[0] + with_batch, *batch)
         for key, state in moved.items():

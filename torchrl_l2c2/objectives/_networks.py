@@ -18,13 +18,16 @@ from torchrl.modules import (
     LSTMModule,
     TanhDelta,
 )
-from torchrl.objectives import IQLLoss, LossModule, PPOLoss, ReinforceLoss
+from torchrl.objectives import DiscreteIQLLoss, IQLLoss, LossModule, PPOLoss, ReinforceLoss
 
 POLICY_NETWORK = "actor_network"
 """Name of a loss's attribute with the policy."""
 
 VALUE_NETWORKS = ("critic_network", "qvalue_network", "value_network", "local_value_network")
 """Names of a loss's attributes with value functions."""
+
+IMITATING = (IQLLoss, DiscreteIQLLoss)
+"""Losses whose policy imitates weighted actions of the batch: values only give the weights."""
 
 RECURRENT_KEYS = "recurrent_keys"
 """Attribute of a recurrent module with the keys of its states, from which it takes one step."""

@@ -16,7 +16,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import dispatch
 from torch import Tensor
 from torch.compiler import is_compiling
-from torchrl.objectives import DiscreteIQLLoss, IQLLoss, LossModule, REDQLoss
+from torchrl.objectives import LossModule, REDQLoss
 
 from torchrl_l2c2._checks import as_number, check_of_each, check_real
 from torchrl_l2c2.objectives._batch import (
@@ -42,6 +42,7 @@ from torchrl_l2c2.objectives._fold import (
     penalty_key,
 )
 from torchrl_l2c2.objectives._networks import (
+    IMITATING,
     POLICY_NETWORK,
     VALUE_NETWORKS,
     NetworkSpec,
@@ -407,8 +408,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             >>> loss = CATSLoss(loss, lambda_temporal=0.04).relative()
         """
         values = set(self.value_networks()) - {"critic_network"}
-        imitates = isinstance(self, IQLLoss | DiscreteIQLLoss)  # weighs actions of the batch
-        if not self.policy_networks() or not values or imitates:
+        if not self.policy_networks() or not values or isinstance(self, IMITATING):
             raise TypeError(
                 "a penalty can be relative to action values that train a policy, as in SAC, TD3 "
                 f"and DDPG, and {type(self).__name__} has none: leave relative out."

@@ -124,7 +124,8 @@ def _transitions(tensordict: TensorDictBase, in_keys: Sequence[NestedKey]) -> Tr
                 raise TypeError(
                     f"only floating-point numbers have neighbors, and {name!r} is {entry.dtype}: "
                     "name the observations to move in in_keys (or moved_keys), such as "
-                    "loss.neighbor_transform(in_keys=['observation'])."
+                    "loss.neighbor_transform(in_keys=['observation']), or append it after the "
+                    "transform that converts them, such as ToTensorImage."
                 )
     return transitions
 

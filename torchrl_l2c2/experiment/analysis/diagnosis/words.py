@@ -433,9 +433,15 @@ def _training(diagnosis: Diagnosis) -> Iterator[Finding]:
         if small:
             every = len(small) == len(shares)
             each = ", ".join(f"{name} {100 * share:.2g}%" for name, share in small.items())
+            advice = (
+                "They change little; raise their gains."
+                if any(small.values())
+                else "They change nothing; raise max_step if it leaves out every transition, or "
+                "else their gains."
+            )
             text = (
                 f"{'All' if every else 'Some'} of the regularizer's terms are small: {each} {of}. "
-                "They change little; raise their gains."
+                f"{advice}"
             )
             yield Finding("small", text, fault=every)
         if shares:
