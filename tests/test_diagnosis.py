@@ -13,7 +13,8 @@ from tensordict import TensorDict
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch import nn
 from torchrl.envs import GymEnv, GymWrapper, SerialEnv
-from torchrl.modules import ProbabilisticActor
+from torchrl.modules import Actor, ProbabilisticActor
+from torchrl.objectives import BCLoss
 
 from torchrl_l2c2 import Neighborhood
 from torchrl_l2c2.experiment import (
@@ -1237,3 +1238,6 @@ def test_a_policy_that_is_no_actor_is_refused():
     """Before anything is played."""
     with pytest.raises(TypeError, match=r"policy must be an actor of TorchRL, got None"):
         diagnose(None, GymEnv("Pendulum-v1"))
+    loss = BCLoss(Actor(torch.nn.Linear(3, 1)))
+    with pytest.raises(TypeError, match="got BCLoss, a loss: give the actor"):
+        diagnose(loss, GymEnv("Pendulum-v1"))

@@ -16,6 +16,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
+from torchrl.objectives import LossModule
 from tqdm import tqdm
 
 from torchrl_l2c2.experiment.collect.episodes import EpisodeCollector, play_episodes
@@ -224,6 +225,11 @@ def observation_key(policy: TensorDictModule, env: EnvBase) -> NestedKey:
         ValueError: If the environment is a batch of several, or the policy reads several entries,
             or an entry that the environment lacks.
     """
+    if isinstance(policy, LossModule):
+        raise TypeError(
+            f"policy must be an actor of TorchRL, got {type(policy).__name__}, a loss: give the "
+            "actor that it was made with."
+        )
     if not isinstance(policy, TensorDictModuleBase):
         raise TypeError(
             f"policy must be an actor of TorchRL, got {policy!r}: torchrl.modules.Actor(network) "
