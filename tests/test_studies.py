@@ -608,8 +608,7 @@ class TestProse:
         assert beyond["action_variation", True, False] == 14
         assert beyond["action_variation", False, True] == 0
         assert (
-            "was higher in eight and lower in twelve. Beyond seed noise, runs return more"
-            in readme
+            "was higher in eight and lower in twelve. Beyond seed noise, runs return more" in readme
         )
         assert "more in five benchmarks and less in one" in readme
         assert beyond["return", True, False] == 5 and beyond["return", False, True] == 1
