@@ -843,9 +843,11 @@ def test_a_teacher_that_was_trained_with_it_is_distilled(
     config = runner_config()
     network = config.pop("actor")
     del config["critic"]
-    config |= {"algorithm": {"class_name": "Distillation"}, "student": network, "teacher": network}
+    # The runner takes entries out of them.
+    config |= {"student": network, "teacher": copy.deepcopy(network)}
+    config |= {"algorithm": {"class_name": "Distillation"}}
     config["obs_groups"] = {"student": ["policy"], "teacher": ["policy"]}
-    distilled = DistillationRunner(NoisyPoints(2), copy.deepcopy(config))
+    distilled = DistillationRunner(NoisyPoints(2), config)
     distilled.load(str(path))
     trained, loaded = (part.state_dict() for part in (runner.alg.actor, distilled.alg.teacher))
     assert trained.keys() == loaded.keys()
