@@ -894,7 +894,7 @@ class TestProse:
         assert (decided["last_mean_action_variation"] > 0.2).to_list().count(True) == 1
         assert "one of five runs with the preset shakes" in start and len(decided) == 5
         most = math.ceil(100 * found.max()["cats, relative"]) / 100
-        assert f"With CATS it changes by at most {most}." in start
+        assert f"With the preset of CATS it changes by at most {most}." in start
         returned = runs["last_mean_return"]
         assert (
             f"costs at most {1 - returned[shakes].min() / returned.max():.1%} of the return"

@@ -89,7 +89,8 @@ def _by_kind(choices: Any) -> Iterator[tuple[str, Any, Any]]:
 
 def _about(name: str, chosen: Any, first: Any) -> str:
     names = [n for n in describe(type(chosen)) if getattr(chosen, n) != getattr(first, n)]
-    differing = _together({name: getattr(chosen, name) for name in names})
+    _, own = BEGIN_WITH_PRESET.get(name, (name, {}))
+    differing = _together({**own, **{name: getattr(chosen, name) for name in names}})
     doc = (chosen.__doc__ or "").splitlines()[0]
     presets = {}
     for kind in KINDS if name in BEGIN_WITH_PRESET else ():

@@ -61,9 +61,9 @@ class GainConfig(RegularizerConfig):
     )
     gain: Literal["constant", "ramp", "target"] = Field(
         default="constant",
-        description="schedule of the gain, applied after every episode: constant, ramp (linear "
-        "from 0 to 1), or target (keeps the action variation of training episodes at or below "
-        "gain_target)",
+        description="schedule of the gain, applied after every episode (or rollout): constant, "
+        "ramp (linear from 0 to 1), or target (keeps the action variation of training episodes at "
+        "or below gain_target)",
         json_schema_extra=neutral("constant"),
     )
     gain_target: float | None = Field(
