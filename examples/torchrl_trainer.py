@@ -16,7 +16,7 @@ from torchrl.modules import MLP, ValueOperator
 from torchrl.objectives import SACLoss
 from torchrl.trainers.algorithms import SACTrainer
 
-from torchrl_l2c2 import TSoftUpdate, action_variation, make_actor, smooth
+from torchrl_l2c2 import ProgressHook, TSoftUpdate, action_variation, make_actor, smooth
 
 FRAMES = 200
 FRAMES_PER_BATCH = 50
@@ -53,12 +53,7 @@ def main(frames: int) -> None:
         enable_logging=False,
         progress_bar=False,
     )
-
-    def set_progress() -> None:
-        loss.set_progress(trainer.collected_frames / trainer.total_frames)
-
-    loss.set_progress(0.0)  # before the first batch; the penalty grows from 0
-    trainer.register_op("post_steps", set_progress)
+    ProgressHook().register(trainer)  # the penalty grows from 0
     trainer.train()
 
     test_env = GymEnv("Pendulum-v1")

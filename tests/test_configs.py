@@ -33,6 +33,7 @@ from torchrl_l2c2 import (
     NeighborTransform,
     ObservationNoise,
     PPORPELoss,
+    ProgressHook,
     TSoftUpdate,
     make_actor,
     make_critic,
@@ -414,7 +415,9 @@ def documented(number: int, folder: Path, *overrides: str) -> DictConfig:
 def test_documented_smooth_composes(tmp_path):
     """The page's first YAML is SAC's preset, with what its shell command changes."""
     changes = ["loss.strength=2", "+loss.overrides.lambda_max=500"]
-    loss = instantiate(documented(0, tmp_path, *changes).loss)
+    cfg = documented(0, tmp_path, *changes)
+    loss = instantiate(cfg.loss)
+    assert [type(hook) for hook in instantiate(cfg.trainer.hooks)] == [ProgressHook]
     assert isinstance(loss, SACLoss) and isinstance(loss, L2C2Loss)
     assert loss.l2c2_neighborhood == Neighborhood(lambda_min=10, lambda_max=500, neighbors="line")
     assert loss.regularizer_gain == 2.0 and loss.folded

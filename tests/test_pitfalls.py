@@ -37,7 +37,7 @@ from torchrl.modules import (
     ProbabilisticActor,
 )
 from torchrl.modules.models.exploration import gSDEModule
-from torchrl.objectives import BCLoss, CrossQLoss, DDPGLoss, PPOLoss, TD3Loss
+from torchrl.objectives import BCLoss, CrossQLoss, DDPGLoss, PPOLoss, SACLoss, TD3Loss
 
 from torchrl_l2c2 import (
     ASAPLoss,
@@ -55,6 +55,7 @@ from torchrl_l2c2.gains import gradient_shares
 from torchrl_l2c2.policy_distances import mean_distance
 
 NEAR = Neighborhood(sigma=1.0, lambda_min=2.0, lambda_max=20.0)
+TD3_GAIN = {"lambda_min": 0.04, "relative": True}
 
 
 def seeded(make, *args, seed=0, **kwargs):
@@ -825,6 +826,37 @@ class TestTermsThatTrainNothing:
         assert not self.told(mean_distance, fold)
         assert not self.told(mean_distance, freeze=True)
 
+    def test_a_term_of_the_loss_without_gradient_is_told_once(self):
+        """In the loss and in its parts: the penalty alone would flatten the policy."""
+
+        class Cut(DDPGLoss):
+            def loss_actor(self, tensordict):
+                value, metadata = super().loss_actor(tensordict)
+                return value.detach(), metadata
+
+        networks, batch = (seeded(deterministic_actor), seeded(qvalue)), batch_of(8)
+        for part in ("forward", "loss_actor"):
+            loss = smooth(Cut(*networks), **TD3_GAIN)
+            messages = told_by(
+                lambda loss=loss, part=part: [getattr(loss, part)(batch.copy()) for _ in range(3)]
+            )
+            (message,) = (each for each in messages if "gradient" in each)
+            assert message.startswith("the policy's own term of L2C2Loss[Cut] has no gradient")
+        for parameter in loss.actor_network_params.values(True, True):
+            parameter.requires_grad_(False)
+        loss = smooth(Cut(*networks), **TD3_GAIN)
+        assert not [each for each in told_by(lambda: loss(batch.copy())) if "gradient" in each]
+
+    def test_a_part_without_gradient_is_told(self):
+        def still(p, q):
+            return mean_distance(p, q).detach()
+
+        base = SACLoss(seeded(gaussian_actor), seeded(qvalue), target_entropy=-1.0)
+        loss = smooth(base, lambda_min=1.0, lambda_max=9.0, policy_distance=still, ramp=None)
+        messages = told_by(lambda: [loss.actor_loss(batch_of(8)) for _ in range(3)])
+        (message,) = (each for each in messages if "gradient" in each)
+        assert message.startswith("['loss_l2c2_actor'] of L2C2Loss[SACLoss] has no gradient")
+
     def test_negative_numbers_are_told_once(self):
         (message,) = self.told(lambda p, q: -mean_distance(p, q))
         assert message.startswith("policy_distance returned -") and "at least 0" in message
@@ -846,12 +878,38 @@ class TestEndsWithoutObservation:
 
     def test_is_told_once(self):
         (message,) = self.warned(self.batch())
-        assert message.startswith("the next 'observation' is 0 at all 2 ends of episodes")
+        assert message.startswith("the next observation is 0 at all 2 ends of episodes until now")
+
+    def test_ends_of_several_batches_are_counted(self):
+        """Minibatches rarely hold two."""
+        batch = self.batch()
+        batch["next", "done"][2] = False
+        assert self.warned(batch)
+        batch["next", "observation"][5, 0] = 0.1
+        assert not self.warned(batch)
+
+    def test_ends_that_are_left_out_are_not_told(self):
+        loss = smooth(base_loss(), skip_ends=True)
+        assert not [each for each in told_by(lambda: loss(self.batch())) if "ends of" in each]
+
+    def test_an_entry_that_ends_at_0_is_not_told(self):
+        """Such as the time that is left, next to the observation."""
+        keys = ["observation", "time_left"]
+        actor = Actor(nn.Bilinear(OBSERVATION, 1, ACTION), in_keys=keys)
+        loss = CATSLoss(DDPGLoss(actor, qvalue()), 1.0)
+        for moves in (True, False):
+            batch = self.batch()
+            if moves:
+                batch["next", "observation"][[2, 5]] = 1.0
+            batch["time_left"], batch["next", "time_left"] = torch.ones(8, 1), torch.ones(8, 1)
+            batch["next", "time_left"][[2, 5]] = 0.0
+            loss = CATSLoss(DDPGLoss(actor, qvalue()), 1.0)
+            told = told_by(lambda loss=loss, batch=batch: loss(batch))
+            assert any("ends of episodes" in each for each in told) != moves
 
     def test_other_zeros_are_not(self):
-        """Of one end only, of some ends, of rows that do not end, of states that are 0."""
+        """Of some ends, of rows that do not end, of states that are 0."""
         changes = {
-            "one": lambda batch: batch["next", "done"][2:3].fill_(False),
             "some": lambda batch: batch["next", "observation"][5, 0].fill_(0.1),
             "within": lambda batch: batch["next", "done"].fill_(False),
             "still": lambda batch: batch["observation"][2].fill_(0.0),
@@ -962,3 +1020,36 @@ class TestLCPOfTheMean:
                 )
         assert found["mean"][0] == pytest.approx(found["mean"][1])
         assert found["log_prob"][0] != pytest.approx(found["log_prob"][1], rel=0.1)
+
+
+def test_a_warning_points_to_the_loop():
+    """Not into TorchRL, whose wrapper of forward calls the loss."""
+    loss, batch = L2C2Loss(base_loss(), NEAR), batch_of(8)
+    batch["next", "observation"][0] = math.nan
+    with pytest.warns(UserWarning, match="without a finite entry") as told:
+        loss(batch)
+    assert [each.filename for each in told if "finite" in str(each.message)] == [__file__]
+
+
+class TestImagesOfWholeNumbers:
+    """They stay still in L2C2's neighborhood, also if the policy reads a vector, too."""
+
+    class Policy(nn.Module):
+        def forward(self, pixels, observation):
+            return (observation + pixels.flatten(-2).float().mean(-1, keepdim=True))[..., :ACTION]
+
+    def told(self, method="l2c2", dtype=torch.uint8, changes=True, **settings):
+        module = TensorDictModule(self.Policy(), ["pixels", "observation"], ["action"])
+        loss = smooth(DDPGLoss(module, qvalue()), method, **settings)
+        batch = batch_of(4)
+        batch["pixels"] = torch.zeros(4, 3, 3, dtype=dtype)
+        batch["next", "pixels"] = torch.full((4, 3, 3), int(changes), dtype=dtype)
+        return [each for each in told_by(lambda: loss(batch)) if "pixels" in each]
+
+    def test_it_is_told(self):
+        (message,) = self.told()
+        assert message.startswith("'pixels' is torch.uint8, and stays the same in all neighbors")
+
+    def test_what_moves_or_is_meant_to_stay_is_not(self):
+        assert not self.told(dtype=torch.float32) and not self.told(changes=False)
+        assert not self.told(moved_keys=["observation"]) and not self.told("cats")

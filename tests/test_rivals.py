@@ -34,6 +34,7 @@ from torchrl.modules import (
     NormalParamExtractor,
     ProbabilisticActor,
     TanhDelta,
+    ValueOperator,
 )
 from torchrl.objectives import BCLoss, DDPGLoss, DQNLoss, PPOLoss, SACLoss
 
@@ -244,6 +245,57 @@ class TestCATS:
             expected = 2 * caps.policy_regularizer(batch)["loss_caps_temporal"]
             found = CATSLoss(base, 1.0, mean=mean).policy_regularizer(batch)["loss_cats"]
             torch.testing.assert_close(found, expected)
+
+
+class TestMovedKeys:
+    """Commands stay as they are in the state, and the rest is taken from the next state."""
+
+    def loss(self, make, **kwargs):
+        """A policy x + 10 c of an observation x and a command c."""
+
+        class Policy(nn.Module):
+            def forward(self, observation, command):
+                return observation + 10.0 * command
+
+        module = TensorDictModule(Policy(), ["observation", "command"], ["action"])
+        value = ValueOperator(nn.Bilinear(1, 1, 1), in_keys=["observation", "action"])
+        return make(DDPGLoss(module, value), **kwargs)
+
+    def batch(self):
+        zero, one = torch.zeros(4, 1), torch.ones(4, 1)
+        later = {"observation": 3.0 * one, "command": one}
+        return TensorDict({"observation": zero, "command": zero, "next": later}, [4])
+
+    def test_of_cats(self):
+        """3 without the change of the command, which adds 10."""
+        loss = self.loss(CATSLoss, lambda_temporal=1.0)
+        assert loss.policy_regularizer(self.batch())["loss_cats"].item() == 169.0
+        loss = self.loss(CATSLoss, lambda_temporal=1.0, moved_keys=["observation"])
+        assert loss.policy_regularizer(self.batch())["loss_cats"].item() == 9.0
+        batch = self.batch()
+        batch["next", "command"][:] = math.nan  # Not read.
+        assert loss.policy_regularizer(batch)["cats_counted"].item() == 1.0
+        assert "cats_moved_keys=['observation']" in str(loss)
+
+    def test_of_caps(self, monkeypatch):
+        """Neither do commands get noise."""
+        monkeypatch.setattr(torch, "randn_like", torch.ones_like)
+        settings = {"sigma": 2.0, "lambda_temporal": 1.0, "lambda_spatial": 1.0}
+        terms = ("loss_caps_temporal", "loss_caps_spatial")
+        for keys, expected in ((None, [169 / 2, 22.0**2 / 2]), ("observation", [9 / 2, 2.0])):
+            found = self.loss(CAPSLoss, moved_keys=keys, **settings).policy_regularizer(
+                self.batch()
+            )
+            assert [found[term].item() for term in terms] == expected
+
+    @pytest.mark.parametrize("make", [CATSLoss, CAPSLoss])
+    def test_wrong_names_are_refused(self, make):
+        with pytest.raises(ValueError, match=r"moved_keys names \['speed'\]"):
+            self.loss(make, moved_keys=["speed"])
+        loss, batch = self.loss(make, moved_keys=["command"]), self.batch()
+        batch["command"], batch["next", "command"] = torch.ones(2, 4, 1, dtype=torch.long)
+        with pytest.raises(TypeError, match="no floating-point observation with a successor"):
+            loss.policy_regularizer(batch)
 
 
 class TestGradCAPS:

@@ -64,6 +64,29 @@ def seeded(make, *args, seed=0, **kwargs):
     return make(*args, **kwargs)
 
 
+class OwnDDPG(LossModule):
+    """In the form of TorchRL's tutorial, whose terms are reduced in forward."""
+
+    def __init__(self, actor_network, value_network):
+        super().__init__()
+        self.convert_to_functional(actor_network, "actor_network", create_target_params=True)
+        self.convert_to_functional(value_network, "value_network", create_target_params=True)
+
+    def loss_actor(self, tensordict):
+        tensordict = tensordict.select(*self.actor_network.in_keys)
+        with self.actor_network_params.to_module(self.actor_network):
+            tensordict = self.actor_network(tensordict)
+        with self.value_network_params.detach().to_module(self.value_network):
+            return -self.value_network(tensordict)["state_action_value"]
+
+    def forward(self, tensordict):
+        return TensorDict({"loss_actor": self.loss_actor(tensordict).mean()})
+
+
+def own_ddpg():
+    return OwnDDPG(deterministic_actor(), qvalue())
+
+
 def updated(loss, loop, batch, loss_seed=2):
     """How a loop changes each parameter; the optimizers are SGD with a rate of 1."""
     before = {name: p.detach().clone() for name, p in loss.named_parameters()}
@@ -683,6 +706,11 @@ class TestPresets:
         assert told[0].filename == __file__
         assert loss.l2c2_neighborhood.lambda_max in (4.0, 100.0, 1000.0)
 
+    def test_the_nearest_of_an_action_value_is_not_ppos(self):
+        """A loss that grows with the action values, whatever their network is called."""
+        with pytest.raises(TypeError, match=r"nearest is the preset of TD3Loss; .*relative=True"):
+            smooth(own_ddpg())
+
     @pytest.mark.parametrize("method", METHODS)
     @pytest.mark.parametrize("name", WITHOUT)
     def test_the_error_of_others_shows_a_call_that_works(self, name, method):
@@ -800,9 +828,12 @@ class TestPresets:
         """Not with settings to pass."""
         with pytest.raises(TypeError, match=r"a loss without a regularizer, got a L2C2Loss\[SAC"):
             smooth(smooth(sac()), "cats")
-        for module in (torch.compile(sac(), backend="eager"), sac().actor_network):
-            with pytest.raises(TypeError, match=r"Regularize the loss, such as SACLoss.*before"):
-                smooth(module)
+        with pytest.raises(TypeError, match=r"Regularize the loss, such as SACLoss.*before it is"):
+            smooth(torch.compile(sac(), backend="eager"))
+        with pytest.raises(TypeError, match=r"Regularize the loss, such as SACLoss.*\)\.$"):
+            smooth(sac().actor_network)
+        with pytest.raises(ValueError, match=r"got 'L2C2'\. Did you mean 'l2c2'\?$"):
+            smooth(sac(), "L2C2")
         with pytest.raises(
             TypeError, match=r"the class SACLoss: make the loss first, SACLoss\(\.\."
         ):
@@ -1031,6 +1062,21 @@ class TestRelativeParts:
         plain = smooth(seeded(make), **GIVEN, fold=False, relative=False)
         plain = seeded(plain, batch.copy(), seed=2)
         assert metadata["penalty_l2c2_actor"] != plain["loss_l2c2_actor"]
+
+    def test_an_own_loss_has_the_same_in_both(self):
+        """The mean of absolute values, also where the loss reduces them without TorchRL."""
+        loss = smooth(seeded(own_ddpg), **GIVEN, ramp=None, relative=True)
+        batch = loss.neighbor_transform()(seeded(transitions, 12, seed=1))
+        values = loss.loss_actor(batch.copy())
+        penalty = loss(batch.copy())["penalty_l2c2_actor"]
+        assert values.shape == (12, 1)
+        with torch.no_grad():
+            own = loss.loss_actor(batch.copy())
+        torch.testing.assert_close(values - own, penalty.expand(12, 1))
+        loss._relative = False
+        plain = loss(batch.copy())["penalty_l2c2_actor"]
+        torch.testing.assert_close(penalty, plain * own.abs().mean())
+        assert own.abs().mean() > 1.1 * own.mean().abs()
 
     def test_a_loss_that_reduces_its_terms_together(self):
         """REDQ: values of both signs do not cancel in the size."""
@@ -1425,6 +1471,26 @@ class TestProgress:
         with pytest.raises(TypeError):
             loss.set_progress("half")
         loss.set_progress(torch.tensor(0.5))
+
+    @pytest.mark.parametrize("make", [sac, td3])
+    def test_it_never_stops_a_training(self, make):
+        """Frames in another unit than their total: told once, at the second value above 1."""
+        loss, resumed = smooth(make()), smooth(make())
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            for progress in (0.0, 0.8, 1.6, 1.6):
+                loss.set_progress(progress)
+            assert not told
+            resumed.load_state_dict(loss.state_dict())
+            for progress in (2.4, 3.2):
+                loss.set_progress(progress)
+        assert loss.regularizer_gain.item() == 1.0
+        messages = [str(each.message) for each in told]
+        assert len(messages) == (make is sac)
+        if make is sac:
+            assert "is 2.4, and still rises: the gain of L2C2Loss[SACLoss]" in messages[0]
+            resumed.set_progress(2.4)
+            assert resumed.regularizer_gain.item() == 1.0
 
     def train(self, loss, updates=60):
         batch = seeded(transitions, 4)

@@ -46,6 +46,7 @@ from torchrl_l2c2 import (
     L2C2Loss,
     Neighborhood,
     NeighborTransform,
+    ProgressHook,
     TSoftUpdate,
     make_actor,
     smooth,
@@ -141,6 +142,19 @@ def snapshot(module: nn.Module) -> dict[str, torch.Tensor]:
         for name, value in module.state_dict().items()
         if isinstance(value, torch.Tensor)
     }
+
+
+def test_a_hook_sets_the_progress():
+    """Before the first batch, and after each."""
+    loss, seen = smooth(sac(regularized=False)), []
+    trainer = sac_trainer(loss, batches=4)
+    ProgressHook().register(trainer)
+    assert loss.regularizer_gain.item() == 0.0
+    trainer.register_op("post_steps", lambda: seen.append(loss.regularizer_gain.item()))
+    trainer.train()
+    assert seen == [0.25, 0.5, 0.75, 1.0]
+    with pytest.raises(TypeError, match=r"the trainer's SACLoss has none: wrap it, smooth\(loss\)"):
+        ProgressHook().register(sac_trainer(sac(regularized=False)))
 
 
 @pytest.mark.parametrize("updater", [TSoftUpdate, SoftUpdate])

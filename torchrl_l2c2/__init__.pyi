@@ -3,6 +3,7 @@
 from ._version import __version__
 from .affinities import register_hellinger
 from .distances import squared_error, squared_hellinger
+from .hooks import ProgressHook
 from .metrics import action_variation, local_lipschitz
 from .modules import Squish, make_actor, make_critic
 from .neighborhood import Neighborhood
@@ -34,6 +35,7 @@ __all__ = [
     "Neighborhood",
     "ObservationNoise",
     "PPORPELoss",
+    "ProgressHook",
     "RegularizedLoss",
     "SR2LLoss",
     "Squish",

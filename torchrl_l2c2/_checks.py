@@ -180,5 +180,8 @@ def describe_no_loss(given: object) -> str:
     """
     if isinstance(given, type):
         return f"the class {given.__name__}: make the loss first, {given.__name__}(...)"
-    hint = ". Regularize the loss, such as SACLoss(policy, ...), before it is compiled"
-    return f"a {type(given).__name__}{hint if isinstance(given, torch.nn.Module) else ''}"
+    hint = ""
+    if isinstance(given, torch.nn.Module):
+        compiled = ", before it is compiled" if hasattr(given, "_orig_mod") else ""
+        hint = f". Regularize the loss, such as SACLoss(policy, ...){compiled}"
+    return f"a {type(given).__name__}{hint}"

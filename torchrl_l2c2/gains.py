@@ -12,7 +12,6 @@ A gain that rises with the progress of training is part of the loss: ``loss.ramp
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Iterable
 from copy import deepcopy
 from numbers import Real
@@ -25,6 +24,7 @@ from torch.linalg import vector_norm
 from torchrl.objectives import LossModule
 
 from torchrl_l2c2._checks import as_number, check_real, check_takes_gradients
+from torchrl_l2c2._warnings import warn
 
 
 class TargetGain:
@@ -177,10 +177,9 @@ def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]
         return {}
     check_takes_gradients("gradient_shares")
     if hasattr(loss, "_watch") and (unused := loss._watch.unused()):
-        warnings.warn(
+        warn(
             f"{sorted(unused)} were never differentiated: the training loop does not add them to "
             "the loss that is minimized. Add them, or call loss.fold() after making it.",
-            stacklevel=3,
         )
     # A copy, because some losses keep statistics of their batches.
     devices = {parameter.device for parameter in loss.parameters() if parameter.is_cuda}

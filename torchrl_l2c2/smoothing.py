@@ -12,6 +12,7 @@ from torchrl.objectives import LossModule, TD3BCLoss
 
 from torchrl_l2c2 import objectives
 from torchrl_l2c2._checks import as_number, check_bool, check_real, describe_no_loss
+from torchrl_l2c2._warnings import warn
 from torchrl_l2c2.neighborhood import Neighborhood
 from torchrl_l2c2.objectives import RegularizedLoss
 from torchrl_l2c2.objectives._batch import check_evaluates_states
@@ -100,6 +101,8 @@ def smooth(
         )
     if not isinstance(method, str) or method not in METHODS:
         hint = f" For a strength: strength={method!r}." if isinstance(method, int | float) else ""
+        if isinstance(method, str) and (near := get_close_matches(method.lower(), METHODS, 1)):
+            hint = f" Did you mean {near[0]!r}?"
         raise ValueError(f"Expected method to be one of {list(METHODS)}, got {method!r}.{hint}")
     strength = as_number("strength", strength)
     check_real("strength", strength, at_least=0)
@@ -117,7 +120,7 @@ def smooth(
             warnings.filterwarnings("ignore", "gains up to .* had no measurable effect")
         regularized = make(loss, **arguments)
     for doubt in doubts:  # After the errors.
-        warnings.warn(doubt, stacklevel=2)
+        warn(doubt)
     if chosen.ramp is not None:
         regularized.ramp(chosen.ramp)
     regularized.strength = strength
@@ -222,7 +225,10 @@ def _nearest_kind(loss: LossModule) -> str:
         return "td3"
     if isinstance(loss, IMITATING):
         return "ppo"  # Its policy term does not grow with the action values.
-    return "sac" if getattr(loss, "qvalue_network", None) is not None else "ppo"
+    if getattr(loss, "qvalue_network", None) is not None:
+        return "sac"
+    value = getattr(loss, "value_network", None)  # DDPG's has this name.
+    return "td3" if "action" in getattr(value, "in_keys", ()) else "ppo"
 
 
 def _shown(settings: Mapping[str, Any]) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
@@ -20,6 +20,8 @@ from torchrl.objectives import (
     LossModule,
     OnlineDTLoss,
 )
+
+from torchrl_l2c2._checks import read_key
 
 IMAGINING = (
     DreamerActorLoss,
@@ -285,6 +287,46 @@ def read_taken(tensordict: TensorDictBase, key: NestedKey, otherwise: str = "") 
     if (entry := tensordict.get(key, None)) is None:
         raise KeyError(f"the batch has no {key!r}: keep it{otherwise}.")
     return entry.detach()
+
+
+def read_moved_keys(
+    moved_keys: str | Sequence[NestedKey], read: Mapping[str, Sequence[NestedKey]]
+) -> list[NestedKey]:
+    """The observations in which neighbors differ from the state.
+
+    Args:
+        moved_keys (str or sequence of NestedKey): the names; a string is a single name, as in
+            TorchRL's transforms.
+        read (Mapping): the inputs of each network, by the network's name.
+
+    Raises:
+        TypeError: an entry is not a name.
+        ValueError: the list is empty, no network reads a name, or a network reads no name at all.
+    """
+    if not isinstance(moved_keys, Sequence):
+        raise TypeError(f"moved_keys must be a list of entries, got {moved_keys!r}.")
+    names = [moved_keys] if isinstance(moved_keys, str) else moved_keys
+    keys = [read_key("an entry of moved_keys", key) for key in names]
+    if not keys:
+        raise ValueError(
+            "moved_keys must name at least one observation, got none: leave it at None for all "
+            "that can be moved, or pass coeff=0 for no regularization."
+        )
+    there = sorted({key for states in read.values() for key in states}, key=str)
+    if unread := [key for key in keys if key not in there]:
+        hint = f"name one or several of {there}."
+        if tuple(keys) in there:
+            hint = f"put the nested key into a list, [{tuple(keys)!r}]."
+        elif any(str(key).startswith("_") for key in unread):
+            hint = "an entry that begins with '_' is TorchRL's own, and no observation."
+        raise ValueError(f"moved_keys names {unread}, and the networks read {there}: {hint}")
+    if still := [name for name, states in read.items() if not set(keys) & set(states)]:
+        raise ValueError(
+            f"moved_keys names {keys}, but {still[0]} reads only {list(read[still[0]])}, which "
+            "would not move: name one of these, too, or leave out its term (beta=0 for value "
+            "functions)."
+        )
+    return keys
 
 
 def draw_rows(

@@ -142,6 +142,8 @@ def make_part(
                 "loss(batch) instead, or make the loss with relative=False and a gain."
             )
         added = self._terms_of(kind, tensordict)
+        if kind == "policy" and not is_compiling() and self.training:
+            self._watch.see_added(self, added, value)
         if self._relative and kind == "policy":
             self._make_relative(added, size, value, tensordict)
         for key, term in list(added.items()):
@@ -159,6 +161,10 @@ def make_part(
         # Within forward, or another part, the penalty is added there.
         if (shared := self._evaluation.forward_pass) is not None:
             out, size = measured(self, *args, **kwargs)
+            if self._relative and is_measured and size is None:
+                # The mean of absolute values, as where the method is called by itself.
+                value = out[0] if isinstance(out, tuple) else out
+                size = value.detach().abs().mean() if value.ndim else None
             shared.policy_size = shared.policy_size if size is None else size
             return out
         if not torch.is_grad_enabled():

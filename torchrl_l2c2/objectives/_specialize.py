@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import functools
 import types
-import warnings
 import weakref
 from typing import Any, SupportsIndex
 from weakref import WeakKeyDictionary
@@ -17,6 +16,7 @@ from torch import nn
 from torchrl.objectives import LossModule
 
 from torchrl_l2c2._checks import describe_no_loss
+from torchrl_l2c2._warnings import warn
 
 # The losses that each was made of, while they live, with their keys and value estimators of then.
 _ORIGINALS: WeakKeyDictionary[SpecializedLoss, list[tuple[weakref.ref[LossModule], Any, Any]]] = (
@@ -124,11 +124,10 @@ class SpecializedLoss(LossMixin):
                 changed.append("make_value_estimator")
             if changed:
                 del _ORIGINALS[self]
-                warnings.warn(
+                warn(
                     f"{' and '.join(changed)} of the {type(loss).__name__} was called after it was "
                     f"wrapped, which does not reach the {type(self).__name__}: call it on the "
                     "wrapped loss, or before wrapping.",
-                    stacklevel=3,
                 )
                 return
 

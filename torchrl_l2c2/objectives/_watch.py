@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import functools
-import warnings
+from collections.abc import Iterator
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torch.compiler import is_compiling
 
+from torchrl_l2c2._warnings import warn
 from torchrl_l2c2.neighborhood import Neighborhood, step_length
 from torchrl_l2c2.objectives._batch import next_key
 
@@ -34,55 +35,96 @@ class TermWatch:
     """Warns, once each and in eager calls, of mistakes in a training loop.
 
     Attributes:
-        progress_set: whether the progress of a ramp was set.
+        progress: the last progress that was set; -1 before the first.
         standing: how often in a row it was set to 0.
         pending: added terms that were never differentiated; ``None`` before the first call.
     """
 
     def __init__(self) -> None:
-        self.progress_set = False
+        self.progress = -1.0
         self.standing = 0
         self.pending: set[str] | None = None
         self._calls = 0
         self._forwards = 0
         self._parts = 0
         self._counted = 0
+        self._zero_ends = 0
         self._sums: list[list[float]] = []
         self._warned: set[str] = set()
 
+    @torch.compiler.disable  # Otherwise Dynamo tries to compile it where the loss breaks the graph.
     def see_call(self, loss: Any, batch: TensorDictBase) -> None:
         """Counts a call of a loss, or of its ``actor_loss``, in training."""
         self._calls += 1
-        if self._calls == 1 and loss._followed:
-            _warn_of_several_steps(batch)
-            _warn_of_zeros(loss, batch)
+        if loss._followed:
+            if self._calls == 1:
+                _warn_of_several_steps(batch)
+                _warn_of_still_images(loss, batch)
+            self._see_ends(loss, batch)
         if self._calls in (1, PATIENCE) and hasattr(loss, "asap_predictor"):
             self._see_predictor(loss)
-        if self._calls == PATIENCE and loss._ramp is not None and not self.progress_set:
-            warnings.warn(
+        if self._calls == PATIENCE and loss._ramp is not None and self.progress < 0:
+            warn(
                 f"the gain of {type(loss).__name__} follows the progress of training, and "
                 f"set_progress was not called in {PATIENCE} updates: it stays at "
                 f"{loss.regularizer_gain.item():g}. Call "
                 "loss.set_progress(frames / total_frames) before the updates on every rollout, "
                 "first with 0, or choose ramp=None.",
-                stacklevel=4,
             )
         if self._calls % STANDSTILL == 0 and "standing" not in self._warned and loss.strength > 0:
             # Twice at the first rollout, if it was also set before training.
             stands = self.standing > 2 or (self.standing and self._calls >= LONGEST_ROLLOUT)
             if stands and not loss.regularizer_gain:
                 self._warned.add("standing")
-                warnings.warn(
+                warn(
                     f"the penalty of {type(loss).__name__} was 0 until now, because the progress "
                     f"of training is still 0 after {self._calls} updates. Call "
                     "loss.set_progress(frames / total_frames) before the updates on every "
                     "rollout, with / and not //.",
-                    stacklevel=4,
                 )
 
-    def see_progress(self, progress: float) -> None:
-        """Records that the progress of a ramp was set."""
-        self.progress_set = True
+    def _see_ends(self, loss: Any, batch: TensorDictBase) -> None:
+        """Warns if all that is read is 0 after the ends of episodes, as with some data."""
+        done = batch.get(next_key(getattr(loss.tensor_keys, "done", "done")), None)
+        if loss.skip_ends or done is None or "ends" in self._warned:
+            return
+        if done.is_cuda and self._calls % 100 != 1:
+            return
+        ends = done.reshape(*batch.batch_size, -1).any(-1)
+        if not (count := int(ends.sum())):
+            return
+        pairs = [
+            (here[ends].reshape(count, -1), successor[ends])
+            for _, here, successor in _read_pairs(loss, batch)
+        ]
+        before = [here.any(-1) for here, _ in pairs]
+        if not pairs or not bool(torch.stack(before).any(0).all()):
+            return
+        if any(bool(successor.any()) for _, successor in pairs):
+            self._warned.add("ends")
+            return
+        self._zero_ends += count
+        if self._zero_ends < 2:
+            return
+        self._warned.add("ends")
+        warn(
+            f"the next observation is 0 at all {self._zero_ends} ends of episodes until now. "
+            "TorchRL's D4RL and Atari data are stored like this: pass skip_ends=True. With "
+            "Gymnasium 1, so are the steps of GymEnv(..., num_envs=2), together with steps across "
+            "resets, and their values are wrong: use ParallelEnv, or "
+            "GymWrapper(gymnasium.make_vec(...)) with AutoresetMode.SAME_STEP."
+        )
+
+    def see_progress(self, loss: Any, progress: float) -> None:
+        """Records that the progress was set; warns if a ramp has ended long before training."""
+        if loss._ramp is not None and 1 < self.progress < progress and "late" not in self._warned:
+            self._warned.add("late")
+            warn(
+                f"the progress of training is {progress:.3g}, and still rises: the gain of "
+                f"{type(loss).__name__} was full too early. Give frames and total_frames in the "
+                "same unit, both with or both without skipped frames."
+            )
+        self.progress = progress
         self.standing = 0 if progress else self.standing + 1
 
     def _see_predictor(self, loss: Any) -> None:
@@ -92,24 +134,30 @@ class TermWatch:
         for parameter in loss.parameters():
             self._sums[id(parameter) in predictor].append(parameter.detach().sum().item())
         if before and before[1] == self._sums[1] and before[0] != self._sums[0]:
-            warnings.warn(
+            warn(
                 f"the predictor of {type(loss).__name__} did not change in {PATIENCE} updates: the "
                 "penalty pulls the policy back to its initial actions. Make the optimizer with "
                 "loss.parameters(), or give it loss.asap_predictor.parameters(), too.",
-                stacklevel=5,
             )
 
     def see_added(self, loss: Any, added: TensorDictBase, own: Tensor | None) -> None:
-        """Warns of policy terms without a gradient, unless the loss's own term has none either."""
-        if "gradient" in self._warned or own is None or not own.requires_grad:
+        """Warns if either policy terms or the loss's own term have no gradient."""
+        terms = sorted(loss.policy_terms & added.keys())
+        flat = [key for key in terms if not added[key].requires_grad]
+        if "gradient" in self._warned or own is None:
             return
-        flat = sorted(k for k in loss.policy_terms & added.keys() if not added[k].requires_grad)
-        if flat:
+        if not own.requires_grad and len(flat) < len(terms):
             self._warned.add("gradient")
-            warnings.warn(
+            warn(
+                f"the policy's own term of {type(loss).__name__} has no gradient, so only the "
+                "penalty would train the policy: compute it from the policy's output. Actions that "
+                "are drawn without reparameterization have no gradient."
+            )
+        elif own.requires_grad and flat:
+            self._warned.add("gradient")
+            warn(
                 f"{flat} of {type(loss).__name__} has no gradient, so it does not train the "
                 "policy: compute it from the policy's output, without detach() and comparisons.",
-                stacklevel=4,
             )
 
     def see_forward(self, loss: Any, terms: TensorDictBase) -> None:
@@ -124,12 +172,11 @@ class TermWatch:
             if isinstance(term, Tensor) and term.requires_grad:
                 term.register_hook(functools.partial(_forget, self.pending, key))
         if self._forwards == PATIENCE and self.pending:
-            warnings.warn(
+            warn(
                 f"{sorted(self.pending)} of {type(loss).__name__} were not differentiated in "
                 f"{PATIENCE} calls: the training loop does not add them, so the regularizer has no "
                 "effect. Add them to the loss that is minimized, or call loss.fold() after making "
                 "it (as smooth(loss) does), which adds them to the loss's own terms.",
-                stacklevel=4,
             )
 
     def unused(self) -> set[str]:
@@ -143,12 +190,11 @@ class TermWatch:
         self._warned.add("parts")
         if of_policy and loss._relative and "size" not in self._warned:
             self._warned.add("size")
-            warnings.warn(
+            warn(
                 f"policy_regularizer of {type(loss).__name__} does not know the size of the action "
                 "values, to which the penalty is relative: its terms are too small or too large. "
                 "Call loss(batch) or loss.actor_loss(batch), or make the loss with relative=False "
                 "and a gain.",
-                stacklevel=5,
             )
 
     def see_part(self, loss: Any, kind: str) -> None:
@@ -160,11 +206,10 @@ class TermWatch:
         self._parts += 1
         if self._parts == PATIENCE:
             self._warned.add("parts")
-            warnings.warn(
+            warn(
                 f"actor_loss and value_loss of {type(loss).__name__} were called {PATIENCE} times "
                 "without its terms: add policy_regularizer(batch) and value_regularizer(batch), or "
                 "call loss.fold() after making it (as smooth(loss) does).",
-                stacklevel=4,
             )
 
     def see_counts(self, loss: Any, counts: Tensor, max_step: float | None = None) -> None:
@@ -177,21 +222,19 @@ class TermWatch:
         if max_step is not None:
             if not bool(counts.any()):
                 self._warned.add("counts")
-                warnings.warn(
+                warn(
                     f"all transitions of the batch are longer than max_step={max_step:g} or not "
                     f"finite, so the penalty of {type(loss).__name__} is 0: raise max_step, or "
                     "choose max_step=None.",
-                    stacklevel=4,
                 )
         elif not bool(counts.all()):
             self._warned.add("counts")
             share = 1.0 - counts.float().mean().item()
-            warnings.warn(
+            warn(
                 f"{share:.2%} of the transitions in the batch have an observation or a next "
                 "observation without a finite entry, as some environments give at resets: the "
                 f"terms of {type(loss).__name__} that compare the two leave these transitions out, "
                 "and have no effect if all are left out: keep the true next observations.",
-                stacklevel=5,
             )
 
     def see_distance(self, difference: Tensor) -> None:
@@ -200,11 +243,10 @@ class TermWatch:
             return
         self._warned.add("distance")
         if bool((difference < -1e-6).any()):
-            warnings.warn(
+            warn(
                 f"policy_distance returned {difference.min().item():.3g}: distances are at least "
                 "0, and a negative penalty trains the policy to change more. Return a square or an "
                 "absolute value.",
-                stacklevel=5,
             )
 
     def see_neighbors(
@@ -228,15 +270,14 @@ class TermWatch:
         distance = neighbors.get("distance", None)
         if distance is not None and _leaves_out(neighbors, distance, batch, near.max_step):
             self._warned.add("counts")
-            warnings.warn(_ELSEWHERE.format(type(loss).__name__), stacklevel=5)
+            warn(_ELSEWHERE.format(type(loss).__name__))
             return
         drawn, wanted = distance.shape[-1] if distance is not None else 0, loss.l2c2_num_samples
         if drawn != wanted and loss.l2c2_over_neighbors == "max":
-            warnings.warn(
+            warn(
                 f"the neighbors in the batch were drawn with num_samples={drawn}, and "
                 f"{type(loss).__name__} takes the largest penalty of {wanted}: append the "
                 "transform that loss.neighbor_transform() returns.",
-                stacklevel=5,
             )
         for key, there in neighbors.items(include_nested=True, leaves_only=True):
             here, successor = batch.get(key, None), batch.get(next_key(key), None)
@@ -255,19 +296,18 @@ class TermWatch:
             span = near.radius * (successor - here).abs()
             rounding = 16 * torch.finfo(here.dtype).eps * (here.abs() + successor.abs())
             if bool(((there - here).abs() > 1.01 * span + rounding).any()):
-                warnings.warn(
+                warn(
                     f"the neighbors in the batch are not near its {key!r}, so the penalty of "
                     f"{type(loss).__name__} is wrong: append neighbor_transform() after all "
                     "transforms that change observations, such as ObservationNorm. In a buffer "
                     "that relabels goals after its transforms, leave it out: then the loss draws "
                     "the neighbors.",
-                    stacklevel=5,
                 )
                 return
             if distance is not None and _is_elsewhere(
                 here, successor, there, distance.movedim(-1, 0), near
             ):
-                warnings.warn(_ELSEWHERE.format(type(loss).__name__), stacklevel=5)
+                warn(_ELSEWHERE.format(type(loss).__name__))
                 return
 
 
@@ -341,38 +381,35 @@ def _warn_of_several_steps(batch: TensorDictBase) -> None:
     steps = batch.get("steps_to_next_obs", None)
     most = 1 if steps is None or not steps.numel() else int(steps.max())
     if most > 1:
-        warnings.warn(
+        warn(
             f"the next observations of the batch are up to {most} steps ahead of their states "
             "(n-step returns): the neighborhoods are larger than with single transitions, and so "
             "is the penalty. The presets were found with single transitions: choose a smaller "
             "strength.",
-            stacklevel=5,
         )
 
 
-def _warn_of_zeros(loss: Any, batch: TensorDictBase) -> None:
-    """Warns if the last next observation of every episode is 0, as with ``GymEnv(num_envs=2)``."""
-    done = batch.get(next_key(getattr(loss.tensor_keys, "done", "done")), None)
-    if done is None:
+def _warn_of_still_images(loss: Any, batch: TensorDictBase) -> None:
+    """Warns if images of whole numbers stay still in the neighborhood of L2C2."""
+    if getattr(loss, "l2c2_moved_keys", ()) is not None:
         return
-    ends = done.reshape(*batch.batch_size, -1).any(-1)
-    if (count := int(ends.sum())) < 2:
-        return
-    read = (loss._evaluation.specs[name].states for name in loss._followed)
-    for key in {key for states in read for key in states}:
-        here, successor = (batch.get(each, None) for each in (key, next_key(key)))
-        if here is None or successor is None:
-            continue
-        if not successor[ends].any() and here[ends].flatten(1).any(1).all():
-            warnings.warn(
-                f"the next {key!r} is 0 at all {count} ends of episodes in the batch, as "
-                "TorchRL's GymEnv(..., num_envs=2) stores it with Gymnasium 1. It then stores a "
-                "step across the reset, too. Values and penalties of both are wrong: use "
-                "ParallelEnv, or GymWrapper(gymnasium.make_vec(...)) with "
-                "AutoresetMode.SAME_STEP.",
-                stacklevel=5,
+    for key, state, successor in _read_pairs(loss, batch):
+        is_image = state.dtype == torch.uint8 and state.ndim > batch.batch_dims + 1
+        if is_image and not torch.equal(state, successor):
+            warn(
+                f"{key!r} is {state.dtype}, and stays the same in all neighbors of "
+                f"{type(loss).__name__}: cast it, as ToTensorImage does, or name the observations "
+                "that move in moved_keys."
             )
-            return
+
+
+def _read_pairs(loss: Any, batch: TensorDictBase) -> Iterator[tuple[NestedKey, Tensor, Tensor]]:
+    """Yields the states that are compared with a successor: key, state, successor."""
+    read = (loss._evaluation.specs[name].states for name in loss._followed)
+    for key in dict.fromkeys(key for states in read for key in states):
+        here, successor = batch.get(key, None), batch.get(next_key(key), None)
+        if isinstance(here, Tensor) and isinstance(successor, Tensor):
+            yield key, here, successor
 
 
 def _forget(pending: set[str], key: str, gradient: Tensor) -> None:

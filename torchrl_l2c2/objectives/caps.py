@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import ClassVar, Literal
 
 import torch
@@ -12,7 +12,12 @@ from torchrl.objectives import LossModule
 
 from torchrl_l2c2._checks import check_bool, check_choice, check_real
 from torchrl_l2c2.distances import squared_error
-from torchrl_l2c2.objectives._batch import at_rows, finite_successor, is_floating_point
+from torchrl_l2c2.objectives._batch import (
+    at_rows,
+    finite_successor,
+    is_floating_point,
+    read_moved_keys,
+)
 from torchrl_l2c2.objectives._networks import POLICY_NETWORK
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
 from torchrl_l2c2.policy_distances import policy_mean
@@ -64,6 +69,9 @@ class CAPSLoss(RegularizedLoss):
             new rows with torch's global generator. Smaller values save time and memory in large
             batches and make the terms noisier; their expectation does not change. Defaults to
             ``1.0``.
+        moved_keys (str or sequence of NestedKey, optional): observations that are taken from the
+            next state, and get noise; the others, such as commands and
+            previous actions, stay as they are in the state. Defaults to ``None``, all inputs.
         skip_ends (bool): whether to leave transitions that end an episode out of the temporal term.
             Use it for environments that store the reset state as the last next observation.
             Defaults to ``False``.
@@ -90,7 +98,12 @@ class CAPSLoss(RegularizedLoss):
         0.0
     """
 
-    _settings: ClassVar[tuple[str, ...]] = ("caps_sigma", "caps_mean", "caps_fraction")
+    _settings: ClassVar[tuple[str, ...]] = (
+        "caps_sigma",
+        "caps_mean",
+        "caps_fraction",
+        "caps_moved_keys",
+    )
 
     def __init__(
         self,
@@ -101,6 +114,7 @@ class CAPSLoss(RegularizedLoss):
         *,
         mean: Literal["loc", "action"] = "loc",
         fraction: float = 1.0,
+        moved_keys: str | Sequence[NestedKey] | None = None,
         skip_ends: bool = False,
     ) -> None:
         check_choice("mean", mean, ("loc", "action"))
@@ -114,6 +128,8 @@ class CAPSLoss(RegularizedLoss):
         self.register_coefficient("caps_lambda_temporal", lambda_temporal)
         self.register_coefficient("caps_lambda_spatial", lambda_spatial)
         self.declare_policy()
+        read = {POLICY_NETWORK: self.networks[POLICY_NETWORK].states}
+        self.caps_moved_keys = None if moved_keys is None else read_moved_keys(moved_keys, read)
         self.declare_terms(
             policy=["loss_caps_temporal", "loss_caps_spatial"], diagnostics=["caps_counted"]
         )
@@ -122,7 +138,9 @@ class CAPSLoss(RegularizedLoss):
         terms = super().policy_regularizer(tensordict)
         rows = self.sample_rows("caps", tensordict, self.caps_fraction)
         batch = at_rows(tensordict, rows)
-        transitions = self.transitions(batch, self.policy_networks(), all_inputs=True)
+        transitions = self.transitions(
+            batch, self.policy_networks(), all_inputs=True, moved_keys=self.caps_moved_keys
+        )
         counts = self.counted(batch, transitions)
         policies = self.policies_at(tensordict, self._states(batch, transitions), rows)
         squashed = self.caps_mean == "action"

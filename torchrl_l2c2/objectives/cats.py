@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import ClassVar, Literal
 
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_l2c2._checks import check_bool, check_choice, check_real
 from torchrl_l2c2.distances import squared_error
-from torchrl_l2c2.objectives._batch import at_rows, finite_successor
+from torchrl_l2c2.objectives._batch import at_rows, finite_successor, read_moved_keys
+from torchrl_l2c2.objectives._networks import POLICY_NETWORK
 from torchrl_l2c2.objectives.regularized import RegularizedLoss
 from torchrl_l2c2.policy_distances import policy_mean
 
@@ -45,6 +47,9 @@ class CATSLoss(RegularizedLoss):
         fraction (float): share of the batch, in (0, 1], whose states are compared. Each call draws
             new rows with torch's global generator. Smaller values save time and memory in large
             batches and make the term noisier; its expectation does not change. Defaults to ``1.0``.
+        moved_keys (str or sequence of NestedKey, optional): observations that are taken from the
+            next state; the others, such as commands and
+            previous actions, stay as they are in the state. Defaults to ``None``, all inputs.
         skip_ends (bool): whether to leave out transitions that end an episode. Use it for
             environments that store the reset state as the last next observation. Defaults to
             ``False``.
@@ -68,7 +73,7 @@ class CATSLoss(RegularizedLoss):
         0.0
     """
 
-    _settings: ClassVar[tuple[str, ...]] = ("cats_mean", "cats_fraction")
+    _settings: ClassVar[tuple[str, ...]] = ("cats_mean", "cats_fraction", "cats_moved_keys")
 
     def __init__(
         self,
@@ -77,6 +82,7 @@ class CATSLoss(RegularizedLoss):
         *,
         mean: Literal["loc", "action"] = "loc",
         fraction: float = 1.0,
+        moved_keys: str | Sequence[NestedKey] | None = None,
         skip_ends: bool = False,
     ) -> None:
         check_choice("mean", mean, ("loc", "action"))
@@ -87,13 +93,17 @@ class CATSLoss(RegularizedLoss):
         self.skip_ends = self.skip_ends or skip_ends
         self.register_coefficient("cats_lambda_temporal", lambda_temporal)
         self.declare_policy()
+        read = {POLICY_NETWORK: self.networks[POLICY_NETWORK].states}
+        self.cats_moved_keys = None if moved_keys is None else read_moved_keys(moved_keys, read)
         self.declare_terms(policy=["loss_cats"], diagnostics=["cats_counted"])
 
     def policy_regularizer(self, tensordict: TensorDictBase) -> TensorDictBase:
         terms = super().policy_regularizer(tensordict)
         rows = self.sample_rows("cats", tensordict, self.cats_fraction)
         batch = at_rows(tensordict, rows)
-        transitions = self.transitions(batch, self.policy_networks(), all_inputs=True)
+        transitions = self.transitions(
+            batch, self.policy_networks(), all_inputs=True, moved_keys=self.cats_moved_keys
+        )
         counts = self.counted(batch, transitions)
         later = {key: finite_successor(*pair)[None] for key, pair in transitions.items()}
         states = TensorDict(later, batch_size=[1, *batch.batch_size])

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import ClassVar, Literal, NamedTuple
 
 import torch
@@ -22,9 +21,10 @@ from torchrl_l2c2._checks import (
     check_real,
     read_key,
 )
+from torchrl_l2c2._warnings import warn
 from torchrl_l2c2.distances import squared_error, squared_hellinger
 from torchrl_l2c2.neighborhood import Neighborhood, step_length
-from torchrl_l2c2.objectives._batch import at_rows, next_key
+from torchrl_l2c2.objectives._batch import at_rows, next_key, read_moved_keys
 from torchrl_l2c2.objectives._networks import VALUE_NETWORKS
 from torchrl_l2c2.objectives.regularized import GAIN, RegularizedLoss
 from torchrl_l2c2.policy_distances import (
@@ -270,7 +270,7 @@ class L2C2Loss(RegularizedLoss):
         _check_terms(type(base_loss).__name__, policies, values, beta, own)
         self.declare_networks([*policies, *values])
         read = {name: self.networks[name].states for name in [*policies, *values]}
-        self.l2c2_moved_keys = None if moved_keys is None else _read_moved_keys(moved_keys, read)
+        self.l2c2_moved_keys = None if moved_keys is None else read_moved_keys(moved_keys, read)
         if policies:
             name = distance_name(policy_distance, self.has_stochastic_policy(), hellinger_samples)
             self._l2c2_policy_diagnostic = f"l2c2_{name}"
@@ -286,12 +286,11 @@ class L2C2Loss(RegularizedLoss):
             ],
         )
         if without_effect(type(base_loss), neighborhood.lambda_max):
-            warnings.warn(
+            warn(
                 f"gains up to {neighborhood.lambda_max:g}, such as the paper's gains, had no "
                 f"measurable effect with losses like {type(base_loss).__name__}, unless they were "
                 "relative to action values. Take the preset (smooth(loss), regularizer=l2c2 in "
                 "train.py), or raise lambda_min and lambda_max.",
-                stacklevel=2,
             )
 
     @property
@@ -482,46 +481,6 @@ def _read_neighbors(neighbor: TensorDictBase, key: NestedKey) -> tuple[TensorDic
     return TensorDict(entries, batch_size=distance.shape), distance
 
 
-def _read_moved_keys(
-    moved_keys: str | Sequence[NestedKey], read: Mapping[str, Sequence[NestedKey]]
-) -> list[NestedKey]:
-    """The observations in which neighbors differ from the state.
-
-    Args:
-        moved_keys (str or sequence of NestedKey): the names; a string is a single name, as in
-            TorchRL's transforms.
-        read (Mapping): the inputs of each network, by the network's name.
-
-    Raises:
-        TypeError: an entry is not a name.
-        ValueError: the list is empty, no network reads a name, or a network reads no name at all.
-    """
-    if not isinstance(moved_keys, Sequence):
-        raise TypeError(f"moved_keys must be a list of entries, got {moved_keys!r}.")
-    names = [moved_keys] if isinstance(moved_keys, str) else moved_keys
-    keys = [read_key("an entry of moved_keys", key) for key in names]
-    if not keys:
-        raise ValueError(
-            "moved_keys must name at least one observation, got none: leave it at None for all "
-            "that can be moved, or pass coeff=0 for no regularization."
-        )
-    there = sorted({key for states in read.values() for key in states}, key=str)
-    if unread := [key for key in keys if key not in there]:
-        hint = f"name one or several of {there}."
-        if tuple(keys) in there:
-            hint = f"put the nested key into a list, [{tuple(keys)!r}]."
-        elif any(str(key).startswith("_") for key in unread):
-            hint = "an entry that begins with '_' is TorchRL's own, and no observation."
-        raise ValueError(f"moved_keys names {unread}, and the networks read {there}: {hint}")
-    if still := [name for name, states in read.items() if not set(keys) & set(states)]:
-        raise ValueError(
-            f"moved_keys names {keys}, but {still[0]} reads only {list(read[still[0]])}, which "
-            "would not move: name one of these, too, or leave out its term (beta=0 for value "
-            "functions)."
-        )
-    return keys
-
-
 def _check_terms(loss: str, policies: list[str], values: list[str], beta: float, own: bool) -> None:
     if not (policies or values):
         what = "trained value function" if beta else "value function to regularize, with beta=0,"
@@ -533,14 +492,12 @@ def _check_terms(loss: str, policies: list[str], values: list[str], beta: float,
         usual = "policy_distance='hellinger' and hellinger_samples=None"
         raise TypeError(f"{loss} has no policy to compare: leave {usual}.")
     if not policies:
-        warnings.warn(
+        warn(
             f"{loss} has no policy network: L2C2Loss leaves out the policy term and regularizes "
             f"only {', '.join(values)}.",
-            stacklevel=3,
         )
     if beta and not values:
-        warnings.warn(
+        warn(
             f"{loss} trains no value function: L2C2Loss leaves out the value term and regularizes "
             "only the policy. Pass beta=0 to silence this warning.",
-            stacklevel=3,
         )

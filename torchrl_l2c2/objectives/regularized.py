@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-import warnings
-from collections.abc import Callable, Iterable, Mapping, Set
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from difflib import get_close_matches
 from inspect import signature
 from textwrap import indent
@@ -19,6 +18,7 @@ from torch.compiler import is_compiling
 from torchrl.objectives import LossModule, REDQLoss
 
 from torchrl_l2c2._checks import as_number, check_of_each, check_real
+from torchrl_l2c2._warnings import warn
 from torchrl_l2c2.objectives._batch import (
     as_masked,
     check_batch_size,
@@ -28,6 +28,7 @@ from torchrl_l2c2.objectives._batch import (
     find_recurrent,
     find_states,
     find_transitions,
+    is_floating_point,
     next_key,
     spread_rows,
 )
@@ -234,8 +235,8 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             # Updates of the policy may be delayed: its term is missing in some calls.
             delayed = found is None and find_policy_term(self.out_keys_source) is not None
             added = TensorDict() if delayed else self._terms_of("policy", given)
+            own = None if found is None else terms.get(found)
             if self._relative and not delayed:
-                own = None if found is None else terms.get(found)
                 self._make_relative(added, size, own, given)
             added.update(self._terms_of("value", given))
         finally:
@@ -247,7 +248,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         else:
             terms.update(added)
         if not is_compiling() and self.training and torch.is_grad_enabled():
-            self._watch.see_added(self, added, None if found is None else terms.get(found))
+            self._watch.see_added(self, added, own)
             self._watch.see_call(self, tensordict)
             self._watch.see_forward(self, terms)
             self._warn_of_changed_base()
@@ -471,12 +472,16 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         ramp. It works between calls of a compiled loss. The ``state_dict`` contains the progress.
 
         Args:
-            progress (float): completed share of training, from 0 to 1. Values from 1 to 2 count as
-                1, because the last rollout may exceed the total.
+            progress (float): completed share of training, from 0 to 1. Larger values count as 1,
+                because the last rollout may exceed the total.
 
         Raises:
             TypeError: the progress is not a number.
-            ValueError: the progress is below 0 or above 2 (such as a number of frames).
+            ValueError: the progress is below 0, or above 2 before any progress was made (such as a
+                number of frames).
+
+        Warns:
+            UserWarning: once, if a ramp's progress rises further after it has exceeded 1.
 
         Examples:
             >>> import torch
@@ -491,10 +496,12 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         """
         progress = as_number("progress", progress)
         hint = "It is frames / total_frames; above 1 only if the last rollout exceeds the total."
-        check_real("progress", progress, at_least=0, at_most=2, hint=hint)
+        # An error in the middle of a training would cost more than a wrong unit.
+        runs = self._watch.progress > 0 or (self._ramp is not None and self._buffers[PROGRESS] > 0)
+        check_real("progress", progress, at_least=0, at_most=None if runs else 2, hint=hint)
+        self._watch.see_progress(self, progress)
         if self._ramp is None:
             return
-        self._watch.see_progress(progress)
         self._buffers[PROGRESS].fill_(min(1.0, progress))
         self._follow_progress()
 
@@ -586,28 +593,24 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         setting = name.removeprefix("l2c2_")  # Other settings with this prefix are attributes.
         setting = setting if setting in NEIGHBORHOOD_FIELDS else name
         if knobs := get_close_matches(name.lower(), KNOBS, 1, cutoff=0.85):
-            warnings.warn(
+            warn(
                 f"{name!r} has no effect on a {type(self).__name__}: {KNOBS[knobs[0]]}.",
-                stacklevel=3,
             )
             return
         gains = [gain for gain in self._coefficients if gain.endswith(f"_{name}")]
         gains = gains or get_close_matches(name, self._coefficients, 1, cutoff=0.85)
         if gains:
-            warnings.warn(
+            warn(
                 f"{name!r} scales nothing in a {type(self).__name__}: the gain is {gains[0]!r}.",
-                stacklevel=3,
             )
         elif setting in self._made_with():
-            warnings.warn(
+            warn(
                 f"{setting!r} is read when a {type(self).__name__} is made: assigning to it has no "
                 f"effect. Make the loss with {setting}={value!r}.",
-                stacklevel=3,
             )
         elif absent := self._absent_method(name):
-            warnings.warn(
+            warn(
                 f"{name!r} has no effect on a {type(self).__name__}: it is a setting of {absent}.",
-                stacklevel=3,
             )
 
     def _absent_method(self, name: str) -> str | None:
@@ -803,7 +806,12 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
     # Computations, for the two methods of a regularizer.
 
     def transitions(
-        self, tensordict: TensorDictBase, networks: Iterable[str], *, all_inputs: bool = False
+        self,
+        tensordict: TensorDictBase,
+        networks: Iterable[str],
+        *,
+        all_inputs: bool = False,
+        moved_keys: Sequence[NestedKey] | None = None,
     ) -> dict[NestedKey, tuple[Tensor, Tensor]]:
         """Finds the states that networks read, and their successors.
 
@@ -814,6 +822,7 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
             networks: names of declared networks.
             all_inputs: whether to include all inputs that an evaluation at the next step needs:
                 also masks, other inputs that are not floating point, and recurrent states.
+            moved_keys: observations to which the result is limited; recurrent states are kept.
 
         Returns:
             Pairs of state and successor by key, ``[*B, *F]`` each, detached.
@@ -826,6 +835,13 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         specs = {name: self.networks[name] for name in networks}
         read = {name: spec.states for name, spec in specs.items()}
         found = find_transitions(tensordict, read, all_inputs=all_inputs)
+        if moved_keys is not None:
+            found = {key: found[key] for key in moved_keys if key in found}
+            if not any(is_floating_point(state) for state, _ in found.values()):
+                raise TypeError(
+                    f"moved_keys names {list(moved_keys)}, and the batch has no floating-point "
+                    "observation with a successor among them: name one, or cast it."
+                )
         recurrent = dict.fromkeys(key for spec in specs.values() for key in spec.recurrent)
         return {**found, **find_recurrent(tensordict, recurrent)} if all_inputs else found
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any
 
 import torch
@@ -13,6 +12,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_l2c2._checks import check_positive_int
+from torchrl_l2c2._warnings import warn
 from torchrl_l2c2.gains import is_loss
 from torchrl_l2c2.objectives import RegularizedLoss
 from torchrl_l2c2.rsl_rl.networks import VALID, write_parameters
@@ -119,12 +119,11 @@ class Regularization:
         self._set_progress()
         length = state.get("ramp_updates", self.ramp_updates)
         if length != self.ramp_updates:
-            warnings.warn(
+            warn(
                 f"the checkpoint was trained with ramp_updates={length}, and this run has "
                 f"ramp_updates={self.ramp_updates}: the gain continues at "
                 f"{float(self.loss.regularizer_gain):g}. To continue as before, set ramp_updates "
-                f"to {length} in regularizer_cfg.",
-                stacklevel=2,
+                f"to {length} in regularizer_cfg."
             )
         generator = None if self.neighbors is None else self.neighbors.generator
         # A generator of another kind of device has another state: do not restore it.

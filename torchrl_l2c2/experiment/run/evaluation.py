@@ -242,8 +242,8 @@ def observation_key(policy: TensorDictModule, env: EnvBase) -> NestedKey:
         )
     if env.batch_size:
         raise UserError(
-            f"env must be a single environment, got a batch of {tuple(env.batch_size)}: pass one "
-            "of these."
+            f"env must be a single environment, got a batch of {tuple(env.batch_size)}: make "
+            "it without ParallelEnv, SerialEnv and num_envs."
         )
     if len(keys := list(policy.in_keys)) != 1:
         if "is_init" in keys:
