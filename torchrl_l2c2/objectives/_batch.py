@@ -292,7 +292,7 @@ def read_taken(tensordict: TensorDictBase, key: NestedKey, otherwise: str = "") 
 def read_moved_keys(
     moved_keys: str | Sequence[NestedKey], read: Mapping[str, Sequence[NestedKey]]
 ) -> list[NestedKey]:
-    """The observations in which neighbors differ from the state.
+    """The observations that a regularizer moves: to neighbors, or to the next state.
 
     Args:
         moved_keys (str or sequence of NestedKey): the names; a string is a single name, as in
@@ -310,7 +310,7 @@ def read_moved_keys(
     if not keys:
         raise ValueError(
             "moved_keys must name at least one observation, got none: leave it at None for all "
-            "that can be moved, or pass coeff=0 for no regularization."
+            "that can be moved."
         )
     there = sorted({key for states in read.values() for key in states}, key=str)
     if unread := [key for key in keys if key not in there]:

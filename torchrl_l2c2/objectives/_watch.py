@@ -69,7 +69,7 @@ class TermWatch:
                 f"set_progress was not called in {PATIENCE} updates: it stays at "
                 f"{loss.regularizer_gain.item():g}. Call "
                 "loss.set_progress(frames / total_frames) before the updates on every rollout, "
-                "first with 0, or choose ramp=None.",
+                "first with 0, as ProgressHook does in TorchRL's trainers, or choose ramp=None.",
             )
         if self._calls % STANDSTILL == 0 and "standing" not in self._warned and loss.strength > 0:
             # Twice at the first rollout, if it was also set before training.

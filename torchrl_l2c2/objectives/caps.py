@@ -70,8 +70,8 @@ class CAPSLoss(RegularizedLoss):
             batches and make the terms noisier; their expectation does not change. Defaults to
             ``1.0``.
         moved_keys (str or sequence of NestedKey, optional): observations that are taken from the
-            next state, and get noise; the others, such as commands and
-            previous actions, stay as they are in the state. Defaults to ``None``, all inputs.
+            next state, and get noise; the others, such as commands and previous actions, stay as
+            they are in the state. Defaults to ``None``, all inputs.
         skip_ends (bool): whether to leave transitions that end an episode out of the temporal term.
             Use it for environments that store the reset state as the last next observation.
             Defaults to ``False``.

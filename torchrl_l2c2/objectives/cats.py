@@ -48,8 +48,8 @@ class CATSLoss(RegularizedLoss):
             new rows with torch's global generator. Smaller values save time and memory in large
             batches and make the term noisier; its expectation does not change. Defaults to ``1.0``.
         moved_keys (str or sequence of NestedKey, optional): observations that are taken from the
-            next state; the others, such as commands and
-            previous actions, stay as they are in the state. Defaults to ``None``, all inputs.
+            next state; the others, such as commands and previous actions, stay as they are in the
+            state. Defaults to ``None``, all inputs.
         skip_ends (bool): whether to leave out transitions that end an episode. Use it for
             environments that store the reset state as the last next observation. Defaults to
             ``False``.
