@@ -182,6 +182,7 @@ def describe_no_loss(given: object) -> str:
         return f"the class {given.__name__}: make the loss first, {given.__name__}(...)"
     hint = ""
     if isinstance(given, torch.nn.Module):
-        compiled = ", before it is compiled" if hasattr(given, "_orig_mod") else ""
+        is_compiled = type(given).__name__ == "OptimizedModule"
+        compiled = ", before it is compiled" if is_compiled else ""
         hint = f". Regularize the loss, such as SACLoss(policy, ...){compiled}"
     return f"a {type(given).__name__}{hint}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import sys
+import inspect
 import warnings
 
 _INNER = {"contextlib", "tensordict", "torch", "torchrl", "torchrl_l2c2"}
@@ -10,10 +10,12 @@ _INNER = {"contextlib", "tensordict", "torch", "torchrl", "torchrl_l2c2"}
 
 def warn(message: str) -> None:
     """Warns at the innermost line outside torch, TensorDict, TorchRL and this package."""
-    frame, level = sys._getframe(1), 2
-    while frame.f_globals.get("__name__", "").partition(".")[0] in _INNER:
-        if frame.f_back is None:  # As in a thread of TorchRL's.
-            level = 2
-            break
+    frame, level = inspect.currentframe(), 1
+    while frame is not None and _package(frame.f_globals) in _INNER:
         frame, level = frame.f_back, level + 1
-    warnings.warn(message, stacklevel=level)
+    # A thread of TorchRL's has no frame of the user's.
+    warnings.warn(message, stacklevel=2 if frame is None else level)
+
+
+def _package(names: dict[str, object]) -> str:
+    return str(names.get("__name__", "")).partition(".")[0]
