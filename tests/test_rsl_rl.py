@@ -727,6 +727,16 @@ def test_the_groups_that_move_can_be_chosen() -> None:
         make(rsl.L2C2PPO, regularizer_cfg={"moved_keys": ["nonsense"], "beta": 0.5})
 
 
+def test_commands_can_stay_still_with_cats(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The chosen groups are taken from the next state."""
+    monkeypatch.setitem(GROUPS, "actor", ["policy", "privileged"])
+    terms = []
+    for keys in ({}, {"moved_keys": ["policy"]}, {"moved_keys": ["privileged"]}):
+        ppo = make(rsl.RegularizedPPO, regularizer_cfg={"method": "cats", **keys})
+        terms.append(update(collected(ppo))["cats"])
+    assert terms[0] > max(terms[1:]) > min(terms[1:]) > 0
+
+
 EXAMPLE = Path(__file__).parents[1] / "examples" / "rsl_rl_l2c2.py"
 
 
