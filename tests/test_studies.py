@@ -618,6 +618,21 @@ class TestProse:
         assert f"by {1 - returned[0] / returned[1]:.1%} on rsl_rl's noisy points" in readme
         assert td3.failures(benchmarks()["Pendulum", "TD3"][0]) == 2
 
+    def test_swingup_again(self):
+        """Returns of the six runs with newer code, next to the recorded ones."""
+        page = " ".join((ROOT / "results" / "paper.md").read_text().split())
+        (new,) = group_records(records("swingup_again"))
+        (old,) = (group for group in group_records(records("runs")) if group.kind == new.kind)
+        last, late, sampled = (
+            [f"{group.scores(kind, 'return').mean():.0f}" for group in (new, old)]
+            for kind in ("last_mean", "late_mean", "late_sampled")
+        )
+        assert "return {} with mean actions, and the recorded {}.".format(*last) in page
+        assert "{} and {} with mean actions, {} and {} with sampled".format(*late, *sampled) in page
+        better = improvement([new], [old], "last_mean", "return")
+        assert f"with a probability of {better.text()}, beyond seed noise" in page
+        assert better.interval[1] < 0.5
+
     def test_cats_on_the_benchmarks_that_have_it(self):
         """How many are smoother in the mean, and how probable a better run is."""
         pairs = with_cats()
