@@ -896,7 +896,6 @@ class TestEndsWithoutObservation:
         """Such as the time that is left, next to the observation."""
         keys = ["observation", "time_left"]
         actor = Actor(nn.Bilinear(OBSERVATION, 1, ACTION), in_keys=keys)
-        loss = CATSLoss(DDPGLoss(actor, qvalue()), 1.0)
         for moves in (True, False):
             batch = self.batch()
             if moves:

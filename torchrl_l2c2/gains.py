@@ -179,7 +179,7 @@ def gradient_shares(loss: LossModule, batch: TensorDictBase) -> dict[str, float]
     if hasattr(loss, "_watch") and (unused := loss._watch.unused()):
         warn(
             f"{sorted(unused)} were never differentiated: the training loop does not add them to "
-            "the loss that is minimized. Add them, or call loss.fold() after making it.",
+            "the loss that is minimized. Add them, or call loss.fold() after making it."
         )
     # A copy, because some losses keep statistics of their batches.
     devices = {parameter.device for parameter in loss.parameters() if parameter.is_cuda}

@@ -161,7 +161,7 @@ def make_part(
         # Within forward, or another part, the penalty is added there.
         if (shared := self._evaluation.forward_pass) is not None:
             out, size = measured(self, *args, **kwargs)
-            if self._relative and is_measured and size is None:
+            if self._relative and is_measured and size is None and shared.policy_size is None:
                 # The mean of absolute values, as where the method is called by itself.
                 value = out[0] if isinstance(out, tuple) else out
                 size = value.detach().abs().mean() if value.ndim else None

@@ -127,7 +127,7 @@ class SpecializedLoss(LossMixin):
                 warn(
                     f"{' and '.join(changed)} of the {type(loss).__name__} was called after it was "
                     f"wrapped, which does not reach the {type(self).__name__}: call it on the "
-                    "wrapped loss, or before wrapping.",
+                    "wrapped loss, or before wrapping."
                 )
                 return
 

@@ -69,7 +69,7 @@ class TermWatch:
                 f"set_progress was not called in {PATIENCE} updates: it stays at "
                 f"{loss.regularizer_gain.item():g}. Call "
                 "loss.set_progress(frames / total_frames) before the updates on every rollout, "
-                "first with 0, as ProgressHook does in TorchRL's trainers, or choose ramp=None.",
+                "first with 0, as ProgressHook does in TorchRL's trainers, or choose ramp=None."
             )
         if self._calls % STANDSTILL == 0 and "standing" not in self._warned and loss.strength > 0:
             # Twice at the first rollout, if it was also set before training.
@@ -80,7 +80,7 @@ class TermWatch:
                     f"the penalty of {type(loss).__name__} was 0 until now, because the progress "
                     f"of training is still 0 after {self._calls} updates. Call "
                     "loss.set_progress(frames / total_frames) before the updates on every "
-                    "rollout, with / and not //.",
+                    "rollout, with / and not //."
                 )
 
     def _see_ends(self, loss: Any, batch: TensorDictBase) -> None:
@@ -137,7 +137,7 @@ class TermWatch:
             warn(
                 f"the predictor of {type(loss).__name__} did not change in {PATIENCE} updates: the "
                 "penalty pulls the policy back to its initial actions. Make the optimizer with "
-                "loss.parameters(), or give it loss.asap_predictor.parameters(), too.",
+                "loss.parameters(), or give it loss.asap_predictor.parameters(), too."
             )
 
     def see_added(self, loss: Any, added: TensorDictBase, own: Tensor | None) -> None:
@@ -157,7 +157,7 @@ class TermWatch:
             self._warned.add("gradient")
             warn(
                 f"{flat} of {type(loss).__name__} has no gradient, so it does not train the "
-                "policy: compute it from the policy's output, without detach() and comparisons.",
+                "policy: compute it from the policy's output, without detach() and comparisons."
             )
 
     def see_forward(self, loss: Any, terms: TensorDictBase) -> None:
@@ -176,7 +176,7 @@ class TermWatch:
                 f"{sorted(self.pending)} of {type(loss).__name__} were not differentiated in "
                 f"{PATIENCE} calls: the training loop does not add them, so the regularizer has no "
                 "effect. Add them to the loss that is minimized, or call loss.fold() after making "
-                "it (as smooth(loss) does), which adds them to the loss's own terms.",
+                "it (as smooth(loss) does), which adds them to the loss's own terms."
             )
 
     def unused(self) -> set[str]:
@@ -194,7 +194,7 @@ class TermWatch:
                 f"policy_regularizer of {type(loss).__name__} does not know the size of the action "
                 "values, to which the penalty is relative: its terms are too small or too large. "
                 "Call loss(batch) or loss.actor_loss(batch), or make the loss with relative=False "
-                "and a gain.",
+                "and a gain."
             )
 
     def see_part(self, loss: Any, kind: str) -> None:
@@ -209,7 +209,7 @@ class TermWatch:
             warn(
                 f"actor_loss and value_loss of {type(loss).__name__} were called {PATIENCE} times "
                 "without its terms: add policy_regularizer(batch) and value_regularizer(batch), or "
-                "call loss.fold() after making it (as smooth(loss) does).",
+                "call loss.fold() after making it (as smooth(loss) does)."
             )
 
     def see_counts(self, loss: Any, counts: Tensor, max_step: float | None = None) -> None:
@@ -225,7 +225,7 @@ class TermWatch:
                 warn(
                     f"all transitions of the batch are longer than max_step={max_step:g} or not "
                     f"finite, so the penalty of {type(loss).__name__} is 0: raise max_step, or "
-                    "choose max_step=None.",
+                    "choose max_step=None."
                 )
         elif not bool(counts.all()):
             self._warned.add("counts")
@@ -234,7 +234,7 @@ class TermWatch:
                 f"{share:.2%} of the transitions in the batch have an observation or a next "
                 "observation without a finite entry, as some environments give at resets: the "
                 f"terms of {type(loss).__name__} that compare the two leave these transitions out, "
-                "and have no effect if all are left out: keep the true next observations.",
+                "and have no effect if all are left out: keep the true next observations."
             )
 
     def see_distance(self, difference: Tensor) -> None:
@@ -246,7 +246,7 @@ class TermWatch:
             warn(
                 f"policy_distance returned {difference.min().item():.3g}: distances are at least "
                 "0, and a negative penalty trains the policy to change more. Return a square or an "
-                "absolute value.",
+                "absolute value."
             )
 
     def see_neighbors(
@@ -277,7 +277,7 @@ class TermWatch:
             warn(
                 f"the neighbors in the batch were drawn with num_samples={drawn}, and "
                 f"{type(loss).__name__} takes the largest penalty of {wanted}: append the "
-                "transform that loss.neighbor_transform() returns.",
+                "transform that loss.neighbor_transform() returns."
             )
         for key, there in neighbors.items(include_nested=True, leaves_only=True):
             here, successor = batch.get(key, None), batch.get(next_key(key), None)
@@ -301,7 +301,7 @@ class TermWatch:
                     f"{type(loss).__name__} is wrong: append neighbor_transform() after all "
                     "transforms that change observations, such as ObservationNorm. In a buffer "
                     "that relabels goals after its transforms, leave it out: then the loss draws "
-                    "the neighbors.",
+                    "the neighbors."
                 )
                 return
             if distance is not None and _is_elsewhere(
@@ -385,7 +385,7 @@ def _warn_of_several_steps(batch: TensorDictBase) -> None:
             f"the next observations of the batch are up to {most} steps ahead of their states "
             "(n-step returns): the neighborhoods are larger than with single transitions, and so "
             "is the penalty. The presets were found with single transitions: choose a smaller "
-            "strength.",
+            "strength."
         )
 
 

@@ -290,7 +290,7 @@ class L2C2Loss(RegularizedLoss):
                 f"gains up to {neighborhood.lambda_max:g}, such as the paper's gains, had no "
                 f"measurable effect with losses like {type(base_loss).__name__}, unless they were "
                 "relative to action values. Take the preset (smooth(loss), regularizer=l2c2 in "
-                "train.py), or raise lambda_min and lambda_max.",
+                "train.py), or raise lambda_min and lambda_max."
             )
 
     @property
@@ -494,10 +494,10 @@ def _check_terms(loss: str, policies: list[str], values: list[str], beta: float,
     if not policies:
         warn(
             f"{loss} has no policy network: L2C2Loss leaves out the policy term and regularizes "
-            f"only {', '.join(values)}.",
+            f"only {', '.join(values)}."
         )
     if beta and not values:
         warn(
             f"{loss} trains no value function: L2C2Loss leaves out the value term and regularizes "
-            "only the policy. Pass beta=0 to silence this warning.",
+            "only the policy. Pass beta=0 to silence this warning."
         )

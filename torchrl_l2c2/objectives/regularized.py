@@ -593,25 +593,19 @@ class RegularizedLoss(SpecializedLoss, SharedEvaluation):
         setting = name.removeprefix("l2c2_")  # Other settings with this prefix are attributes.
         setting = setting if setting in NEIGHBORHOOD_FIELDS else name
         if knobs := get_close_matches(name.lower(), KNOBS, 1, cutoff=0.85):
-            warn(
-                f"{name!r} has no effect on a {type(self).__name__}: {KNOBS[knobs[0]]}.",
-            )
+            warn(f"{name!r} has no effect on a {type(self).__name__}: {KNOBS[knobs[0]]}.")
             return
         gains = [gain for gain in self._coefficients if gain.endswith(f"_{name}")]
         gains = gains or get_close_matches(name, self._coefficients, 1, cutoff=0.85)
         if gains:
-            warn(
-                f"{name!r} scales nothing in a {type(self).__name__}: the gain is {gains[0]!r}.",
-            )
+            warn(f"{name!r} scales nothing in a {type(self).__name__}: the gain is {gains[0]!r}.")
         elif setting in self._made_with():
             warn(
                 f"{setting!r} is read when a {type(self).__name__} is made: assigning to it has no "
-                f"effect. Make the loss with {setting}={value!r}.",
+                f"effect. Make the loss with {setting}={value!r}."
             )
         elif absent := self._absent_method(name):
-            warn(
-                f"{name!r} has no effect on a {type(self).__name__}: it is a setting of {absent}.",
-            )
+            warn(f"{name!r} has no effect on a {type(self).__name__}: it is a setting of {absent}.")
 
     def _absent_method(self, name: str) -> str | None:
         """The class of this package that an attribute's prefix names, if the loss is none."""
